@@ -10,7 +10,7 @@ from typing import Literal
 import msgspec
 
 from catstream.box import Box
-from catstream.messages.kinds import Answer
+from catstream.messages.kinds import Answer, ObjectPosition, Position
 
 #: The two channels on which no message is lost.
 DataChannel = Literal["features", "results"]
@@ -23,22 +23,23 @@ class Action(msgspec.Struct, frozen=True, tag=True):
 class Continue(Action, frozen=True):
     """Continue the detector of an object, with the newest model.
 
-    receiver  number of the position that has its state, or its last box
-    first     first box of the object, in frame `began`
-    model     name of the saved model by which the object is still searched for; empty if it is not
+    at     its state, or its last box
+    first  first box of the object, in frame `began`
+    model  name of the saved model by which the object is still searched for; empty if it is not
     """
 
     name: str
-    receiver: int
+    at: ObjectPosition
     first: Box
     began: int
     model: str = ""
 
 
 class Resume(Action, frozen=True):
-    """Continue all channels after message `seq`. Answered by `Resumed`."""
+    """Continue all channels after message `seq`; the receivers are at these positions. Answered by `Resumed`."""
 
     seq: int
+    positions: tuple[Position, ...]
 
 
 class SetBox(Action, frozen=True):

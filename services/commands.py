@@ -17,6 +17,7 @@ from catstream.messages.names import UNNAMED, check_count, check_name, listed
 from catstream.run.learned import check_sizes
 from catstream.services.actions import Action, Conclude, SetBox
 from catstream.services.core_state import STOPPED, Known, Phase, Request, State
+from catstream.services.desired import DesiredObject
 
 __all__ = ["begun", "carried_out", "concluded", "next_box", "rejected_boxes", "waited"]
 
@@ -97,7 +98,7 @@ def begun(state: State, command: Command, name: str, known: Known | None, error:
         effect = f"the same object{of_name} continues {at}"
     else:
         effect = f"{'another' if name in state.desired.objects else 'the'} object{of_name} begins {at}"
-        state = replace(state, desired=state.desired.begun(name, command.box, state.seq + 1))
+        state = replace(state, desired=state.desired.begun(name, DesiredObject(command.box, state.seq + 1)))
     state = replace(state, given=(*state.given, name), known=state.known | {name: known})
     return state, [_answer(state, command, True, effect, name, state.seq)]
 
@@ -132,12 +133,10 @@ def _search(state: State, request: Request) -> tuple[State, Answer]:
         check_count(len(state.desired.objects) + 1, state.rules.objects_most)
     if saved is None:
         return state, _answer(state, command, False, request.error)
-    desired, sizes = state.desired.begun(name, saved.box, seq + 1, saved.name), state.sizes | {saved.name: saved.size}
-    begins = {name: each.model for name, each in desired.objects.items() if each.begins > seq and each.model}
-    check_sizes({name: sizes.get(model, 0) for name, model in begins.items()})
-    state = replace(state, desired=desired, sizes={model: sizes.get(model, 0) for model in begins.values()})
+    desired = state.desired.begun(name, DesiredObject(saved.box, seq + 1, saved.name, saved.size))
+    check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
     effect = f"{listed([name])} is searched for from frame {seq} on, by model {saved.version}"
-    return state, _answer(state, command, True, effect, name)
+    return replace(state, desired=desired), _answer(state, command, True, effect, name)
 
 
 def _forget(state: State, request: Request) -> tuple[State, Answer]:

@@ -13,9 +13,9 @@ from catstream.messages.kinds import End, Features
 from catstream.run.learned import begun
 from catstream.run.state import TREES, locked
 from catstream.services.loop import Process
-from catstream.services.progress import Progress
 from catstream.services.recorder import Recorder
 from catstream.services.saved_models import SavedModels
+from catstream.services.stored_part import StoredPart
 from catstream.services.timing import (
     LOCK_SECONDS,
     MESSAGE_SECONDS,
@@ -70,7 +70,7 @@ class CompressorLoop:
             self._checkpoints = CheckpointStore(stack.enter_context(locked(job.state / TREES, LOCK_SECONDS)))
         self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
         position = self._forest.position
-        self._progress = Progress(position, position.seq, time.monotonic())
+        self._stored = StoredPart(position, position.seq, time.monotonic())
         self._recorder = None
         if job.record is not None:
             writer = stack.enter_context(RecordingWriter(job.record, process.run, resume=True))
@@ -86,7 +86,8 @@ class CompressorLoop:
     @property
     def must_stop(self) -> bool:
         """Whether the process was asked to end, and a connected detector did not send its end in time."""
-        return self._process.seconds_since_stop >= (SENDER_SECONDS if self._features.has_sender else 0)
+        window = self._features.window
+        return self._process.seconds_since_stop >= (SENDER_SECONDS if window.connected and not window.ended else 0)
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
@@ -101,7 +102,7 @@ class CompressorLoop:
             self._recorder.write(features)
         before = self._forest.compressors.keys()
         if any(part.model for part in features.objects.values()):
-            self._process.allow(MODEL_SECONDS)
+            self._process.watchdog.allow(MODEL_SECONDS)
         for sample in self._forest.take(features, begun(features, self._process.settings)):
             self._samples.send(sample)
         if self._forest.compressors.keys() != before:
@@ -109,24 +110,24 @@ class CompressorLoop:
 
     def store_and_acknowledge(self, message: Features | End | None) -> None:
         """Write a checkpoint if one is due, then answer position requests and acknowledge the message."""
-        before, seq, run = self._progress, self._forest.seq, self._process.settings.run
+        before, seq, run = self._stored, self._forest.seq, self._process.settings.run
         end = message if isinstance(message, End) else None
         urgent = self._checkpoints is None or end is not None or before.is_urgent(seq, run.unstored_frames)
-        urgent = urgent or self._features.position_requested
+        urgent = urgent or self._features.window.position_requested
         if (urgent and seq > before.stored) or before.is_due(seq, time.monotonic(), run.checkpoint_seconds):
             self._store(urgent)
-        if self._features.position_requested:
-            self._features.answer(self._progress.position)
-        if message is not None or self._progress.position is not before.position:
-            self._features.acknowledge(self._progress.acknowledgement(self._forest.position, end))
+        if self._features.window.position_requested:
+            self._features.answer(self._stored.position)
+        if message is not None or self._stored.position is not before.position:
+            self._features.acknowledge(self._stored.acknowledgement(self._forest.position, end))
 
     def _store(self, urgent: bool) -> None:
         """Write a checkpoint, or count all messages as stored if there are none (started by hand without --state)."""
-        self._process.allow(STORE_SECONDS)
+        self._process.watchdog.allow(STORE_SECONDS)
         began = time.monotonic()
         saved = self._checkpoints is None or self._checkpoints.save(self._forest)
         now = time.monotonic()
-        self._progress = self._progress.after(self._forest.position, began, now, saved=saved, urgent=urgent)
+        self._stored = self._stored.after(self._forest.position, began, now, saved=saved, urgent=urgent)
 
     def publish_health(self, *, last: bool = False) -> None:
         """Serve late joiners, send the trees to subscribers, and publish the health."""
@@ -146,7 +147,7 @@ class CompressorLoop:
         self._samples.send(end)
         deadline = time.monotonic() + TRACKS_END_SECONDS
         while self._recorder is not None and self._recorder.end is None and time.monotonic() < deadline:
-            if self._features.is_connected and not self._process.stop_requested:
+            if self._features.window.connected and not self._process.stop_requested:
                 deadline = time.monotonic() + TRACKS_END_SECONDS
             self._features.receive(TURN_SECONDS)  # a detector that did not receive the last acknowledgement asks again
             self._recorder.receive()
@@ -154,9 +155,9 @@ class CompressorLoop:
 
     def stop(self) -> None:
         """Store all received messages; the sender continues with the next compressor."""
-        if self._forest.seq > self._progress.stored:
+        if self._forest.seq > self._stored.stored:
             self._store(urgent=False)
-            self._features.acknowledge(self._progress.position)
+            self._features.acknowledge(self._stored.position)
 
     def _check(self, message: Features | End) -> None:
         """Raise ProtocolError for features of another stream."""
@@ -165,7 +166,7 @@ class CompressorLoop:
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        own: dict[str, float] = {"stored": self._progress.stored}
+        own: dict[str, float] = {"stored": self._stored.stored}
         if self._recorder is not None:
             own |= {"recorded": self._recorder.written, "unrecorded": float(self._recorder.failed != "")}
         return self._forest.counters() | own

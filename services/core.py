@@ -3,8 +3,8 @@
     handle(state, event) -> state, actions
 
 The process (`catstream.services.detector`) tells what has happened as an event, and carries out the actions in their
-order. An event is a small value that can be written as a line of JSON: frames, models and the states of detectors are
-not in it, only what a decision depends on. A frame of a file passes through these phases, and waits in few of them:
+order. An event is a small value that can be written as a line of JSON: frames and models are not in it, only what a
+decision depends on. A frame of a file passes through these phases, and waits in few of them:
 
     FRAME ─> READY ─> STEP ─> RESULTS ─> OWNER ─> FEATURES ─> TAKEN ─> MODEL ─> FRAME
              │   ^
@@ -25,9 +25,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
-from catstream.box import Box
+from catstream.messages.kinds import ObjectPosition, Position
 from catstream.services import actions, commands
 from catstream.services.actions import Action
 from catstream.services.core_state import Known, Phase, Progress, Request, State
@@ -98,33 +99,11 @@ class Subscribed(_Event, frozen=True):
         return replace(state, phase=Phase.POSITIONS if state.rules.resumes else Phase.FRAME), []
 
 
-class PlaceOfObject(msgspec.Struct, frozen=True):
-    """An object in the position of a receiver.
-
-    version  of its newest sample, 0 before the first
-    box      box in which it was last found
-    state    whether there is a state of its detector
-    sought   whether the object of a saved model was not found yet, in that state
-    """
-
-    version: int = 0
-    box: Box | None = None
-    state: bool = False
-    sought: bool = False
-
-
-class Place(msgspec.Struct, frozen=True):
-    """The position of a receiver: the last message that it has stored, and the objects in it."""
-
-    seq: int
-    objects: dict[str, PlaceOfObject] = {}
-
-
 class Positions(_Event, frozen=True):
     """All receivers have answered: the compressor, then the owner of the run if it has one."""
 
     only_in = Phase.POSITIONS
-    places: tuple[Place, ...]
+    positions: tuple[Position, ...]
 
     def change(self, state: State) -> Moved:
         """Continue after the last message that every receiver has stored, once compressor and trainer agree.
@@ -137,35 +116,35 @@ class Positions(_Event, frozen=True):
         was learned of one of several objects, which takes long with the paper's first tracker only, it begins again
         where it was last. An object of a saved model, of which the compressor has no trees, begins again too.
         """
-        desired, learned = state.desired, self.places[0].objects
-        receiver, last = min(enumerate(self.places), key=lambda each: each[1].seq)
+        desired, learned = state.desired, self.positions[0].objects
+        last = min(self.positions, key=lambda each: each.seq)
         versions = {name: each.version for name, each in learned.items() if each.version}
         objects, seq = _continuing(last, desired), last.seq
         if any(state.arrived.get(name) != versions[name] for name in versions.keys() & objects.keys()):
             return state, []
         for name, each in objects.items():
             if each.model and name not in learned and desired.objects.get(name) == each:
-                desired = desired.begun(name, each.box, seq + 1, each.model)
+                desired = desired.begun(name, with_fields(each, begins=seq + 1))
         objects = _continuing(last, desired)
         if not versions:
             seq, objects = min((each.begins - 1 for each in objects.values()), default=seq), {}
         found: dict[str, Action] = {}
         for name, each in objects.items():
-            at = last.objects.get(name, PlaceOfObject())
-            if name in versions and (at.state or at.box is not None):
-                model = each.model if at.sought else ""
-                found[name] = actions.Continue(name, receiver, each.box, each.begins - 1, model)
+            at = last.objects.get(name, ObjectPosition())
+            if name in versions and (at.detector is not None or at.box is not None):
+                model = each.model if at.detector is not None and at.detector.is_sought else ""
+                found[name] = actions.Continue(name, at, each.box, each.begins - 1, model)
             elif not each.model and desired.objects.get(name) == each:
-                desired = desired.begun(name, at.box or each.box, seq + 1)
+                desired = desired.begun(name, DesiredObject(at.box or each.box, seq + 1))
         for name, each in desired.objects_at(seq).items():
             if each.model and name not in found:  # its state is not known: it counts as not found
                 found[name] = actions.Seek(name, each.model, each.begins - 1, again=True)
-        repeats = max(place.seq for place in self.places)
+        repeats = max(position.seq for position in self.positions)
         state = replace(state, phase=Phase.RESUME, seq=seq, desired=desired, repeats=repeats, arrived={})
-        return state, [*found.values(), actions.Resume(seq), *commands.concluded(state, [])]
+        return state, [*found.values(), actions.Resume(seq, self.positions), *commands.concluded(state, [])]
 
 
-def _continuing(last: Place, desired: DesiredState) -> dict[str, DesiredObject]:
+def _continuing(last: Position, desired: DesiredState) -> dict[str, DesiredObject]:
     """The objects that began before a position and have a track in the message after it, in the order of the trees."""
     objects = {name: each for name, each in desired.objects_at(last.seq + 1).items() if each.begins <= last.seq}
     return {name: objects[name] for name in last.objects if name in objects} | objects
@@ -460,6 +439,9 @@ class _Line(msgspec.Struct):
     actions: list[Any]
 
 
+_ENCODER = msgspec.json.Encoder(enc_hook=np.ndarray.tolist)  # the arrays in the states of detectors
+
+
 class History:
     """A state, and the last events that led to it.
 
@@ -484,11 +466,11 @@ class History:
         """Write the state before the last events, then each of them with its actions: a line of JSON each."""
         before = self._last[0][0] if self._last else self.state
         lines = [before, *(_Line(event, found) for _, event, found in self._last)]
-        file.write_bytes(b"".join(msgspec.json.encode(line) + b"\n" for line in lines))
+        file.write_bytes(b"".join(_ENCODER.encode(line) + b"\n" for line in lines))
 
     @staticmethod
     def read(file: Path) -> tuple[State, list[tuple[Event, list[Any]]]]:
         """Read what `write` wrote: with `handle`, the same events lead to the same actions."""
         first, *lines = file.read_bytes().splitlines()
-        read = [msgspec.json.decode(line, type=_Line) for line in lines]
+        read = [msgspec.json.decode(line, type=_Line, dec_hook=lambda _, numbers: np.array(numbers)) for line in lines]
         return msgspec.json.decode(first, type=State), [(line.event, line.actions) for line in read]

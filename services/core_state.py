@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import StrEnum
 
 import msgspec
@@ -124,7 +123,6 @@ class State(msgspec.Struct, frozen=True):
     boxes     commands that wait for a frame
     box       the one of them that is carried out, for the object `named`
     waiting   commands that wait until all frames of an earlier detector are repeated
-    sizes     bytes of the saved models that objects begin with, by their names
     progress  of the receivers
     arrived   version of the newest model of each object, before the positions agree
     given_up  the channels on which a message was given up
@@ -146,7 +144,6 @@ class State(msgspec.Struct, frozen=True):
     box: Command | None = None
     named: str = ""
     waiting: tuple[Request, ...] = ()
-    sizes: dict[str, int] = {}
     progress: Progress = Progress()
     arrived: dict[str, int] = {}
     given_up: tuple[str, ...] = ()
@@ -155,10 +152,10 @@ class State(msgspec.Struct, frozen=True):
     stopping: float = -1.0
 
     @classmethod
-    def at_start(cls, rules: Rules, desired: DesiredState, sizes: Mapping[str, int]) -> State:
-        """The state before the first event; `sizes` are those of the saved models of the job."""
+    def at_start(cls, rules: Rules, desired: DesiredState) -> State:
+        """The state before the first event."""
         repeats, ending = _ALL if rules.resumes else 0, STOPPED if desired.stopped else ""
-        return cls(rules, desired=desired, sizes=dict(sizes), repeats=repeats, ending=ending)
+        return cls(rules, desired=desired, repeats=repeats, ending=ending)
 
     @property
     def end_reason(self) -> str:

@@ -24,11 +24,13 @@ class DesiredObject:
     box     the object in its first frame; the last box in the saved model if the object begins with one
     begins  seq of the message of its first frame
     model   name of the saved model that it begins with, see `catstream.services.model_files`; empty if it has none
+    size    bytes of the saved model
     """
 
     box: Box
     begins: int
     model: str = ""
+    size: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +67,10 @@ class DesiredState:
         """Whether no frames are tracked: the run is paused, or waits for a box."""
         return self.paused or not self.objects
 
-    def begun(self, name: str, box: Box, seq: int, model: str = "") -> DesiredState:
-        """The state after an object has begun in message `seq`, in the place of another one of its name."""
-        before = self.without(name, seq - 1) if name in self.objects else self
-        return replace(before, objects=before.objects | {name: DesiredObject(box, seq, model)})
+    def begun(self, name: str, each: DesiredObject) -> DesiredState:
+        """The state after an object has begun, in the place of another one of its name."""
+        before = self.without(name, each.begins - 1) if name in self.objects else self
+        return replace(before, objects=before.objects | {name: each})
 
     def without(self, name: str, last: int) -> DesiredState:
         """The state after an object was forgotten; message `last` is the last one that may have a track of it."""

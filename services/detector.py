@@ -32,7 +32,7 @@ from catstream.run.state import SEARCHED
 from catstream.services import actions, core
 from catstream.services.actions import Action
 from catstream.services.core import Event, History
-from catstream.services.core_state import Known, Phase, Progress, Request, Rules, Saved, State
+from catstream.services.core_state import Known, Phase, Progress, Request, Rules, State
 from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
@@ -113,7 +113,7 @@ class DetectorLoop:
             recorded=job.record is not None,
             resumes=job.resume,
         )
-        self._core = History(State.at_start(rules, desired, self._models_of_job.sizes))
+        self._core = History(State.at_start(rules, desired))
         stack.push(self._write_events)
         self._detectors = Detectors(settings)
         self._control: Responder[Command, Any] = stack.enter_context(
@@ -197,8 +197,8 @@ class DetectorLoop:
         job, settings = self._process.job, self._process.settings
         first = max(self.state.seq - 1, 0)
         once, each = opening_seconds(job.part, first)
-        self._process.allow(once)
-        self._process.allow_each(each)
+        self._process.watchdog.allow(once)
+        self._process.watchdog.allow_each(each)
         self._source = stack.enter_context(
             open_source(
                 job.source,
@@ -245,15 +245,14 @@ class DetectorLoop:
         """A command without the saved model, which is kept here."""
         if (data := command.model) is None:
             return Request(command)
-        self._process.allow(MODEL_SECONDS)
+        self._process.watchdog.allow(MODEL_SECONDS)
         command = replace(command, model=b"")
         try:
             learned = Learned.from_bytes(data, "the file")
             learned.check_fits(self._process.settings)
         except CatstreamError as error:
             return Request(command, error=str(error))
-        name = self._models_of_job.add(learned)
-        return Request(command, Saved(name, learned.box, learned.model.version, self._models_of_job.sizes[name]))
+        return Request(command, self._models_of_job.add(learned))
 
     def _ask_positions(self) -> None:
         """Ask the receivers for their positions, and receive the models that belong to them."""
@@ -263,7 +262,7 @@ class DetectorLoop:
                 self._positions[name] = position
         if self._positions.keys() < senders.keys():
             return
-        self.tell(core.Positions(tuple(_place(self._positions[name]) for name in senders)))
+        self.tell(core.Positions(tuple(self._positions[name] for name in senders)))
         if self.state.phase is Phase.POSITIONS:  # they do not agree yet
             self._positions.clear()
             self._receive_models(TURN_SECONDS)
@@ -296,11 +295,9 @@ class DetectorLoop:
     # What the core orders
 
     def _continue(self, order: actions.Continue) -> None:
-        position = self._positions[[*self._outputs.senders][order.receiver]]
-        found, detector = position.objects[order.name], self._detectors.add(order.name)
-        state = found.detector
-        if state is None and found.box is not None:
-            state = detector.state_at(found.box, order.first, order.began)
+        detector, state, box = self._detectors.add(order.name), order.at.detector, order.at.box
+        if state is None and box is not None:
+            state = detector.state_at(box, order.first, order.began)
         if state is not None:
             detector.resume(state, self._arrived[order.name])
         if order.model and (learned := self._models_of_job.get(order.model)) is not None:
@@ -308,13 +305,13 @@ class DetectorLoop:
 
     def _resume(self, order: actions.Resume) -> Event:
         self._detectors.seq = order.seq
-        for name, sender in self._outputs.senders.items():
-            sender.resume(order.seq, self._positions[name])
+        for sender, position in zip(self._outputs.senders.values(), order.positions, strict=True):
+            sender.window.resume(order.seq, position)
         self._arrived.clear()
         return core.Resumed(self._known())
 
     def _set_box(self, order: actions.SetBox) -> Event:
-        self._process.allow(OPEN_SECONDS)
+        self._process.watchdog.allow(OPEN_SECONDS)
         detectors, time_ = self._detectors, self._frame.time
         act = detectors.correct if order.keep else detectors.begin
         try:
@@ -324,11 +321,11 @@ class DetectorLoop:
         return core.Begun(_known(detectors.detectors[order.name]))
 
     def _begin(self, order: actions.Begin) -> None:
-        self._process.allow(OPEN_SECONDS)
+        self._process.watchdog.allow(OPEN_SECONDS)
         self._given[order.name] = self._detectors.begin(order.name, self._pyramid, order.box, self._frame.time)
 
     def _seek(self, order: actions.Seek) -> None:
-        self._process.allow(OPEN_SECONDS)
+        self._process.watchdog.allow(OPEN_SECONDS)
         learned, name = self._models_of_job.get(order.model), order.name
         if learned is None:  # its file cannot be read
             if name in self._detectors.detectors:
@@ -449,18 +446,7 @@ def _known(detector: Detector) -> Known:
     """A detector as the core sees it."""
     if (state := detector.state) is None:
         raise ValueError(f"the detector of {detector.name!r} has no object yet")
-    version, sought = detector.model.version, state.first_window is None
-    return Known(version, detector.newest_version, state.first_frame, sought, state.window)
-
-
-def _place(position: Position) -> core.Place:
-    """A position as the core sees it."""
-    found = {}
-    for name, each in position.objects.items():
-        state = each.detector
-        sought = state is not None and state.first_window is None
-        found[name] = core.PlaceOfObject(each.version, each.box, state is not None, sought)
-    return core.Place(position.seq, found)
+    return Known(detector.model.version, detector.newest_version, state.first_frame, state.is_sought, state.window)
 
 
 def opening_seconds(part: slice, first: int) -> tuple[float, float]:
@@ -479,8 +465,8 @@ def _desired(process: Process, models: ModelFiles) -> DesiredState:
             process.trouble = str(error)
             _log.warning("%s", error)
     boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
-    learned = {name: Learned.load(file) for name, file in job.models.items()}
-    sought = {name: DesiredObject(each.box, begins=1, model=models.add(each)) for name, each in learned.items()}
+    saved = {name: models.add(Learned.load(file)) for name, file in job.models.items()}
+    sought = {name: DesiredObject(each.box, 1, each.name, each.size) for name, each in saved.items()}
     return DesiredState(boxes | sought)
 
 

@@ -71,6 +71,7 @@ class Process:
     settings, endpoint : settings and endpoint of the job
     trouble, source : description of a current problem, and the source; both are published with the health
     source_failed : whether the stream ended because the source failed
+    watchdog : counts the turns of the loop
     """
 
     def __init__(self, name: str, job: Job, watchdog: int | None = None) -> None:
@@ -82,7 +83,7 @@ class Process:
         self.source_failed = False
         # One turn of the compressor or the trainer takes a time that grows with the coreset size.
         factor = 1.0 if name == "detector" else max(1.0, (job.settings.coreset.size / _QUICK_SIZE) ** 2)
-        self._watchdog = Watchdog(watchdog, STUCK_SECONDS * factor)
+        self.watchdog = Watchdog(watchdog, STUCK_SECONDS * factor)
         self._stop_moment = float("inf")  # at which a signal asked the process to end
         self._health = Publisher(HEALTH, self.endpoint, sender=name)
         self._reported = 0.0
@@ -116,23 +117,15 @@ class Process:
         ----------
         counters, objects : return the counters of the process, and those of each object
         """
-        self._watchdog.beat()
+        self.watchdog.beat()
         if now:  # this may be the last turn, and closing the sockets may take long
-            self._watchdog.allow(CLOSE_SECONDS)
+            self.watchdog.allow(CLOSE_SECONDS)
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own = counters() | rejects()
             self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects()))
         else:
             self._health.serve_late_joiners()
-
-    def allow(self, seconds: float) -> None:
-        """Extend the watchdog's deadline for this turn of the loop."""
-        self._watchdog.allow(seconds)
-
-    def allow_each(self, seconds: float) -> None:
-        """Extend the watchdog's deadline for every turn from now on."""
-        self._watchdog.allow_each(seconds)
 
     def close(self) -> None:
         """Close the channel `health`, after its last message was sent."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from catstream.errors import CatstreamError
 from catstream.messages import storage
 from catstream.run.learned import Learned
+from catstream.services.core_state import Saved
 
 __all__ = ["ModelFiles"]
 
@@ -21,23 +22,18 @@ class ModelFiles:
     Parameters
     ----------
     folder : folder of the files; None if they are kept in memory only
-
-    Attributes
-    ----------
-    sizes : bytes of each saved model that was added, by its name
     """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self._models: dict[str, Learned] = {}
-        self.sizes: dict[str, int] = {}
 
-    def add(self, learned: Learned) -> str:
-        """Keep a saved model in memory; return its name."""
+    def add(self, learned: Learned) -> Saved:
+        """Keep a saved model in memory, under the name that is returned."""
         data = learned.to_bytes()
         name = blake2b(data, digest_size=16).hexdigest()
-        self._models[name], self.sizes[name] = learned, len(data)
-        return name
+        self._models[name] = learned
+        return Saved(name, learned.box, learned.model.version, len(data))
 
     def get(self, name: str) -> Learned | None:
         """The saved model of a name, None if its file cannot be read."""
@@ -64,7 +60,6 @@ class ModelFiles:
     def keep_only(self, names: set[str]) -> None:
         """Remove all saved models but those of these names, from memory and from the folder."""
         self._models = {name: learned for name, learned in self._models.items() if name in names}
-        self.sizes = {name: size for name, size in self.sizes.items() if name in names}
         for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
             if file.stem not in names:
                 file.unlink(missing_ok=True)

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 from catstream.messages.kinds import End, Position
 
-__all__ = ["Progress"]
+__all__ = ["StoredPart"]
 
 _REST = 9.0  # from one checkpoint to the next, times the duration of the last one
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
-    """The progress of a receiver that stores what it receives.
+class StoredPart:
+    """What a receiver has stored of a stream, and when it tried to store more.
 
     position  the answer to a sender: messages up to it need not be retransmitted
     stored    seq of the newest message that is in a checkpoint
@@ -37,8 +37,8 @@ class Progress:
         """
         return seq > self.stored and now - self.tried >= max(interval, _REST * self.took)
 
-    def after(self, position: Position, began: float, now: float, *, saved: bool, urgent: bool) -> Progress:
-        """The progress after an attempt to write a checkpoint.
+    def after(self, position: Position, began: float, now: float, *, saved: bool, urgent: bool) -> StoredPart:
+        """The stored part after an attempt to write a checkpoint.
 
         If the disk is full, an urgent checkpoint is acknowledged although it is only in memory: training continues.
 
@@ -52,7 +52,7 @@ class Progress:
         stored = position.seq if saved else self.stored
         if not saved and not urgent:
             return replace(self, tried=now, took=now - began)
-        return Progress(replace(position, unsaved=position.seq - stored), stored, now, now - began)
+        return StoredPart(replace(position, unsaved=position.seq - stored), stored, now, now - began)
 
     def acknowledgement(self, now: Position, end: End | None) -> Position:
         """The position to acknowledge.

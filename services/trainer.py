@@ -33,7 +33,7 @@ def main(process: Process) -> None:
                 return
             # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
             if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
-                process.allow(TRAIN_SECONDS)
+                process.watchdog.allow(TRAIN_SECONDS)
                 models.send(trainer.train(message))
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}

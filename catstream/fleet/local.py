@@ -107,7 +107,7 @@ class LocalCluster:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.folder.chmod(0o700)
         if not (self.folder / "token").exists():
-            write_atomically(self.folder / "token", secrets.token_hex(32).encode(), 0o600)
+            write_atomically(self.folder / "token", secrets.token_hex(32).encode(), mode=0o600)
         (self.folder / "address").unlink(missing_ok=True)
         cores = math.ceil(len(os.sched_getaffinity(0)) / nodes) if cores is None else cores
         command = start.python_command(
@@ -192,7 +192,7 @@ def _keep(folder: Path, count: int, cores: int, ends: threading.Event) -> None:
     cluster: Any = Cluster(initialize_head=True, head_node_args=options(1) | {"include_dashboard": False})
     try:
         nodes = {number: cluster.add_node(**options(number)) for number in range(2, count + 1)}
-        write_atomically(folder / "address", cluster.address.encode(), 0o600)
+        write_atomically(folder / "address", cluster.address.encode(), mode=0o600)
         while not ends.wait(NODES_SECONDS) and not _has_died(cluster.head_node):
             for number, node in nodes.items():
                 if _has_died(node):

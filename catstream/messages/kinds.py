@@ -126,6 +126,11 @@ class DetectorState:
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
     colour_centroid: Annotated[np.ndarray, Array("float64", (6,))] | None = None
 
+    @property
+    def is_sought(self) -> bool:
+        """Whether the object of a saved model has not been found yet."""
+        return self.first_window is None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingRows:

@@ -51,11 +51,12 @@ _ABANDONED_SECONDS = 600.0  # after which nothing writes a part of a file any mo
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
-def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
+def write_atomically(path: str | os.PathLike[str], *data: bytes | memoryview, mode: int = 0o666) -> None:
     """Replace a file atomically. After the return, the new content survives a power cut.
 
     Parameters
     ----------
+    data : the content, in parts
     mode : permissions of the file, reduced by the umask
 
     Raises
@@ -63,14 +64,9 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
     OSError
         If the file cannot be written. The old file stays unchanged.
     """
-    _write_atomically(path, [data], mode)
-
-
-def _write_atomically(path: str | os.PathLike[str], parts: Sequence[bytes | memoryview], mode: int) -> None:
-    """Replace a file atomically by parts, one after the other."""
     path = Path(path)
     remove_parts(path.parent, _ABANDONED_SECONDS, path.name)
-    with _written_beside(path, parts, mode) as part:
+    with _written_beside(path, data, mode) as part:
         part.replace(path)
 
 
@@ -193,7 +189,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode
     OSError
         If the file cannot be written, as in `write_atomically`.
     """
-    _write_atomically(path, _parts(arrays, metadata), mode)
+    write_atomically(path, *_parts(arrays, metadata), mode=mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:

@@ -107,7 +107,7 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
             raise ServiceError(f"{name!r} is not a file of the state of a pipeline")
         try:
             (folder / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            storage.write_atomically(folder / name, data, 0o600)
+            storage.write_atomically(folder / name, data, mode=0o600)
         except OSError as error:
             raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 

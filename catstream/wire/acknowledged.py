@@ -61,10 +61,6 @@ class Sender(ChannelSocket[Message]):
             return answer if isinstance(answer, Position) else None
         return None
 
-    def resume(self, seq: int, position: Position) -> None:
-        """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
-        self.window.resume(seq, position)
-
     def send(self, message: Message) -> bool:
         """Send the message with the next seq, without waiting; False if the window is full."""
         self.poll(0)
@@ -113,11 +109,11 @@ class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
     Receiving stores nothing. If a sender asks for the position while more was received than is stored,
-    `position_requested` becomes true; the owner then stores what it has, and calls `answer`. In a loop:
+    `window.position_requested` becomes true; the owner then stores what it has, and calls `answer`. In a loop:
 
         message = receiver.receive(0.1)
         ...                                     # process the message
-        if receiver.position_requested:
+        if receiver.window.position_requested:
             receiver.answer(store())
         elif message is not None:
             receiver.acknowledge(position)
@@ -144,21 +140,6 @@ class Receiver(ChannelSocket[Message]):
         super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=window + 1)
         self.window, self._check = ReceiveWindow(position, window), check
         self._bind()
-
-    @property
-    def position_requested(self) -> bool:
-        """Whether a sender waits for `answer`."""
-        return self.window.position_requested
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether the sender was connected when `receive` was last called."""
-        return self.window.connected
-
-    @property
-    def has_sender(self) -> bool:
-        """Whether the sender was connected when `receive` was last called, and has not sent its end."""
-        return self.window.connected and not self.window.ended
 
     def receive(self, seconds: float) -> Message | None:
         """The next message in order, None if none arrived in time."""

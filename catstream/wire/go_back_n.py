@@ -204,7 +204,7 @@ class ReceiveWindow:
     ----------
     taken : newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
     ended : whether the sender has sent the end of the stream
-    connected : whether the sender of the newest message is still connected
+    connected : whether the sender of the newest message was still connected when a message was last awaited
     """
 
     def __init__(self, position: Position, size: int) -> None:

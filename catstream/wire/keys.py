@@ -224,7 +224,7 @@ def synchronise(folder: Path, wanted: Mapping[str, Client]) -> None:
             client, path = wanted[name], folder / _CLIENTS / name
             text = _text(role=client.role.encode(), public=client.public.encode())
             if name not in known or path.read_bytes() != text:
-                write_atomically(path, text, 0o600)
+                write_atomically(path, text, mode=0o600)
     except OSError as error:
         raise ServiceError(f"cannot write the clients in {folder} ({error.strerror})") from None
 

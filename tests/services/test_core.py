@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from msgspec.structs import replace
 
 from catstream.box import Box, Window
-from catstream.messages.kinds import Command
+from catstream.messages.kinds import Command, DetectorState, ObjectPosition, Position
 from catstream.services import actions, core
 from catstream.services.core import History, handle
 from catstream.services.core_state import STOPPED, Known, Phase, Progress, Request, Rules, Saved, State
@@ -24,6 +25,12 @@ SAVED = Saved("digest", BOX, version=5, size=1000)
 NAMES = ["", "anna", "ben", "carl"]
 RULES = Rules(window=3, lag_frames=2, lockstep=False, objects_most=2, context=1.0)
 ANNA = DesiredState({"anna": DesiredObject(FIRST, 1)})
+
+
+def at(version, box=None, has_state=False, is_sought=False):
+    """The part of a position for one object, with a state of its detector or without."""
+    state = DetectorState(0, "weak", PLACE, PLACE, None if is_sought else PLACE, centre=np.eye(5, 4))
+    return ObjectPosition(box, version, state if has_state else None)
 
 
 class Receiver:
@@ -57,7 +64,7 @@ class World:
         self.receivers = {"features": Receiver(), "results": Receiver()}
         self.messages = {}  # the objects of each message
         self.samples = []  # message that led to it, object, version; the newest last
-        self.answers, self.history = {}, History(State.at_start(rules, desired, {}))
+        self.answers, self.history = {}, History(State.at_start(rules, desired))
         self.detectors, self.given, self.given_up = {}, set(), []
         self.begun, self.finished = {}, False
         self.tell(core.Subscribed(False, True, 0.0))
@@ -115,7 +122,7 @@ class World:
 
     def kill(self):
         """The process is killed, and another one continues; the receivers answer it, and the newest models arrive."""
-        self.history = History(State.at_start(replace(self.rules, resumes=True), self.stored, {}))
+        self.history = History(State.at_start(replace(self.rules, resumes=True), self.stored))
         self.detectors, self.given, self.finished = {}, set(), False
         self.tell(core.Subscribed(False, True, 0.0))
         newest = {name: version for _, name, version in self.samples}
@@ -123,8 +130,8 @@ class World:
         places = []
         for receiver in map(self.receivers.__getitem__, names):
             seq = receiver.taken - bool(receiver.ended)
-            of = {name: core.PlaceOfObject(newest.get(name, 0), BOX, True) for name in self.messages.get(seq, ())}
-            places.append(core.Place(seq, of))
+            of = {name: at(newest.get(name, 0), BOX, True) for name in self.messages.get(seq, ())}
+            places.append(Position(seq, seq, of))
         for name, version in newest.items():
             self.tell(core.Positions(tuple(places)))
             if self.state.phase is Phase.POSITIONS:
@@ -277,7 +284,7 @@ class Anything(RuleBasedStateMachine):
         assert answer.done == (room and not damaged and not self.stopped and not self.ended)
         if answer.done:
             self.objects.pop(meant, None)
-            self.objects[meant] = DesiredObject(BOX, seq + 1, SAVED.name)
+            self.objects[meant] = DesiredObject(BOX, seq + 1, SAVED.name, SAVED.size)
 
     @precondition(lambda self: not self.repeats)
     @rule(name=names)
@@ -547,13 +554,13 @@ def test_a_stop_takes_effect_once_all_frames_of_an_earlier_detector_are_repeated
 
 
 def test_a_repeated_frame_reports_an_object_as_absent_that_was_forgotten_later_and_of_which_nothing_is_known():
-    desired = ANNA.begun("ben", BOX, 1).without("ben", 3)
+    desired = ANNA.begun("ben", DesiredObject(BOX, 1)).without("ben", 3)
     world = World(desired=desired)
-    world.history = History(State.at_start(replace(RULES, resumes=True), desired, {}))
+    world.history = History(State.at_start(replace(RULES, resumes=True), desired))
     world.tell(core.Subscribed(False, True, 0.0))
     world.tell(core.ModelArrived("anna", 1))
     world.samples.append((1, "anna", 1))
-    world.tell(core.Positions((core.Place(1, {"anna": core.PlaceOfObject(1, BOX, True)}),)))
+    world.tell(core.Positions((Position(1, 0, {"anna": at(1, BOX, True)}),)))
     for _ in range(3):
         world.frame()
         world.receivers["features"].acknowledged = world.receivers["features"].taken = world.state.seq
@@ -604,8 +611,8 @@ def test_the_end_is_given_up_only_after_the_process_was_asked_to_end_and_its_pat
 # The position at which a process continues
 
 seqs, versions = st.integers(0, 50), st.integers(0, 9)
-parts = st.builds(core.PlaceOfObject, versions, st.none() | st.just(BOX), st.booleans(), st.booleans())
-places = st.lists(st.builds(core.Place, seqs, st.dictionaries(names, parts)), min_size=1, max_size=2)
+parts = st.builds(at, versions, st.none() | st.just(BOX), st.booleans(), st.booleans())
+places = st.lists(st.builds(Position, seqs, seqs, st.dictionaries(names, parts)), min_size=1, max_size=2)
 objects = st.builds(DesiredObject, st.just(BOX), seqs.filter(bool), st.sampled_from(["", "a saved model"]))
 states = st.builds(DesiredState, st.dictionaries(names, objects))
 
@@ -636,10 +643,9 @@ def test_no_receiver_misses_a_message(desired, positions):
 def test_a_detector_continues_only_if_something_was_learned_and_after_its_object_has_begun(desired, positions):
     state, found = resumed(desired, positions)
     for name, order in of_kind(found, actions.Continue).items():
-        place = positions[order.receiver]
-        assert place.seq == state.seq
+        assert any(place.seq == state.seq and place.objects[name] is order.at for place in positions)
         assert positions[0].objects[name].version
-        assert place.objects[name].state or place.objects[name].box
+        assert order.at.detector or order.at.box
         assert order.began < desired.objects[name].begins <= state.seq
 
 
@@ -675,15 +681,16 @@ def test_compressor_and_trainer_agree_once_the_model_of_every_sample_is_here(des
 
 def test_an_object_that_had_learned_nothing_beside_another_begins_anew_where_it_was_last():
     last = Box(5, 6, 30, 40)
-    place = core.Place(5, {"anna": core.PlaceOfObject(1, BOX, True), "ben": core.PlaceOfObject(0, last)})
+    place = Position(5, 4, {"anna": at(1, BOX, True), "ben": at(0, last)})
     state, found = resumed(DesiredState({name: DesiredObject(BOX, 2) for name in ("anna", "ben")}), [place])
     assert list(of_kind(found, actions.Continue)) == ["anna"]
     assert state.desired.objects["ben"] == DesiredObject(last, begins=6)
 
 
 def test_an_object_that_was_forgotten_later_continues_until_then_in_the_order_of_the_trees():
-    place = core.Place(5, dict.fromkeys(["anna", "ben"], core.PlaceOfObject(1, BOX, True)))
-    desired = DesiredState().begun("anna", BOX, 1).begun("ben", BOX, 2).without("anna", 8).begun("anna", BOX, 9)
+    place = Position(5, 4, dict.fromkeys(["anna", "ben"], at(1, BOX, True)))
+    first, ben, second = (DesiredObject(BOX, begins) for begins in (1, 2, 9))
+    desired = DesiredState().begun("anna", first).begun("ben", ben).without("anna", 8).begun("anna", second)
     state, found = resumed(desired, [place])
     assert list(of_kind(found, actions.Continue)) == ["anna", "ben"]
     assert state.desired == desired
@@ -691,8 +698,8 @@ def test_an_object_that_was_forgotten_later_continues_until_then_in_the_order_of
 
 def test_the_object_of_a_saved_model_is_still_searched_for_unless_it_was_found():
     desired = DesiredState({name: DesiredObject(BOX, 1, "a saved model") for name in ("anna", "ben", "carl")})
-    found_and_sought = {"anna": core.PlaceOfObject(1, BOX, True), "ben": core.PlaceOfObject(1, None, True, sought=True)}
-    position = core.Place(5, found_and_sought | {"carl": core.PlaceOfObject(1)})
+    found_and_sought = {"anna": at(1, BOX, True), "ben": at(1, None, True, is_sought=True)}
+    position = Position(5, 4, found_and_sought | {"carl": at(1)})
     _, found = resumed(desired, [position])
     models = {name: order.model for name, order in of_kind(found, actions.Continue).items()}
     assert models == {"anna": "", "ben": "a saved model"}
@@ -716,6 +723,15 @@ def test_the_last_events_are_written_and_lead_to_the_same_actions_again(two, tmp
         state, found = handle(state, event)
         assert msgspec.json.decode(msgspec.json.encode(found)) == orders
     assert state == two.state
+
+
+def test_the_positions_of_the_receivers_are_written_with_the_states_of_the_detectors(repeating, tmp_path):
+    repeating.history.write(tmp_path / "events.ndjson")
+    state, steps = History.read(tmp_path / "events.ndjson")
+    for event, orders in steps:
+        state, found = handle(state, event)
+        assert msgspec.json.decode(msgspec.json.encode(found, enc_hook=np.ndarray.tolist)) == orders
+    assert state == repeating.state
 
 
 def test_an_event_that_leads_to_an_error_is_written_too(two, tmp_path):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box
-from catstream.services.desired import DesiredState
+from catstream.services.desired import DesiredObject, DesiredState
 
 BOX = Box(1.0, 2.0, 30.0, 40.0)
 names = st.sampled_from(["", "anna", "ben"])
@@ -41,7 +41,7 @@ def after(events, state=DesiredState()):  # noqa: B008
     """The state after objects have begun, with a saved model or without, or were forgotten, one event a message."""
     for seq, (name, model) in enumerate(events, start=1):
         if model is not None:
-            state = state.begun(name, BOX, seq, model)
+            state = state.begun(name, DesiredObject(BOX, seq, model))
         elif name in state.objects:
             state = state.without(name, seq - 1)
     return state

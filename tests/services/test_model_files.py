@@ -24,7 +24,7 @@ def learned():
 
 def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_path):
     files = ModelFiles(tmp_path / "models")
-    name = files.add(learned)
+    name = files.add(learned).name
     files.store()
     (file,) = (tmp_path / "models").iterdir()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -33,7 +33,7 @@ def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_p
 
 def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, caplog):
     files = ModelFiles(tmp_path)
-    name = files.add(learned)
+    name = files.add(learned).name
     files.store()
     (tmp_path / f"{name}.safetensors").write_bytes(b"torn")
     assert ModelFiles(tmp_path).get(name) is None
@@ -45,7 +45,7 @@ def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, ca
 
 def test_without_a_folder_models_are_kept_in_memory(learned):
     files = ModelFiles(None)
-    name = files.add(learned)
+    name = files.add(learned).name
     files.store()
     files.keep_only({name})
     assert files.get(name) is learned

@@ -58,7 +58,7 @@ def take(receiver, taken, *, store):
     if message is not None:
         taken.append(message.seq)
         receiver.acknowledge(Position(message.seq if store else 0))
-    if receiver.position_requested:
+    if receiver.window.position_requested:
         receiver.answer(Position(receiver.window.taken if store else 0))
 
 
@@ -214,7 +214,7 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
 
             until(lambda: found and found[-1] is not None, ask)
             assert found[-1].seq == 5
-            sender.resume(3, found[-1])  # another receiver had less
+            sender.window.resume(3, found[-1])  # another receiver had less
 
             def on():
                 if sender.window.sent < 9:
@@ -238,7 +238,7 @@ def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(e
                 lambda: found and found[-1] is not None,
                 lambda: (found.append(sender.ask_position()), take(receiver, taken, store=False)),
             )
-            sender.resume(0, found[-1])
+            sender.window.resume(0, found[-1])
             receiver.acknowledge(Position(5))
 
             def on():
@@ -258,9 +258,9 @@ def test_a_receiver_stores_its_messages_in_a_separate_step_if_the_position_is_re
         def turn():
             found.append(sender.ask_position())
             assert receiver.receive(0) is None
-            if receiver.position_requested:
+            if receiver.window.position_requested:
                 receiver.answer(Position(len(taken), objects=made(7)))
-                assert not receiver.position_requested
+                assert not receiver.window.position_requested
 
         with Sender(RESULTS, endpoint, 10) as sender:
             for seq in range(1, 6):

@@ -135,7 +135,7 @@ def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(en
         def turn():
             if (message := receiver.receive(0.01)) is not None:
                 taken.append(message.seq)
-            if receiver.position_requested:
+            if receiver.window.position_requested:
                 receiver.answer(Position())
             sender.poll(0)
 
