@@ -18,14 +18,14 @@ from typing import Self
 from uuid import uuid4
 
 from catstream.box import Box
-from catstream.client.registry import follow, locate
+from catstream.client.registry import follow
 from catstream.errors import CommandRejectedError, SilenceError
 from catstream.messages.kinds import Answer, Command, SavedModel
 from catstream.messages.names import UNNAMED, check_name
 from catstream.run.learned import Learned
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Endpoint, is_deserted
+from catstream.wire.endpoint import Endpoint, find, is_deserted
 from catstream.wire.newest import Subscriber
 from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
 
@@ -59,7 +59,7 @@ class Control:
         self, endpoint: str | Endpoint = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = ""
     ) -> None:
         self._stream = follow(endpoint, keys)
-        self._place = self._stream.endpoint if self._stream is not None else locate(endpoint, keys, source)
+        self._place = self._stream.endpoint if self._stream is not None else find(endpoint, keys, source)
         self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
         self._commands = Requester[Command, Answer](CONTROL, self._place)
 

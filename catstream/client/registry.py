@@ -487,10 +487,8 @@ def described(status: StreamStatus) -> str:
     return f"its state is {status.state}{': ' if status.trouble else ''}{status.trouble}"
 
 
-def locate(endpoint: str | Endpoint, keys: str = "", source: str = "") -> Endpoint:
+def locate(endpoint: str | Endpoint, keys: str = "") -> Endpoint:
     """The endpoint of a running pipeline, as `find` returns it; for the address of a stream, that of its pipeline now.
-
-    What is an `Endpoint` already is returned.
 
     Raises
     ------
@@ -499,9 +497,7 @@ def locate(endpoint: str | Endpoint, keys: str = "", source: str = "") -> Endpoi
     SilenceError
         If the controller of the fleet does not answer.
     """
-    if isinstance(endpoint, Endpoint):
-        return endpoint
     if (stream := follow(endpoint, keys)) is None:
-        return find(endpoint, keys, source)
+        return find(endpoint, keys)
     with contextlib.closing(stream):
         return stream.endpoint

@@ -19,12 +19,12 @@ from collections.abc import Generator
 from time import monotonic
 from typing import Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
 
-from catstream.client.registry import FollowedStream, described, follow, locate
+from catstream.client.registry import FollowedStream, described, follow
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.messages.names import check_name
 from catstream.wire.channels import CHANNELS, TRACKS, Channel
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import GapCounter, Subscriber
 from catstream.wire.readable import Wait, finish, finish_async
 from catstream.wire.timing import CHECK_SECONDS, DRAIN_SECONDS, REPORT_SECONDS
@@ -141,13 +141,14 @@ class Subscription(Generic[Message]):
         self._close_time = float("inf")  # until which messages may still arrive after the end
         self._rejected = 0  # by the connections before this one
         self._connection: _Connection | None = None
-        self._had_sockets = False  # whether those of the pipeline were in its folder
+        self._has_run = False  # whether the pipeline was there before
         self._stream = follow(endpoint, keys)
         if self._stream is not None:
             self._follow()
         else:
-            place = locate(endpoint, keys)
+            place = find(endpoint, keys)
             self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
+            self._has_run = not place.lacks_sockets()
             early = self._channel.keeps == "every"
             self._connection = _Connection(self._channel, place, self._only, self._about, early)
 
@@ -224,6 +225,7 @@ class Subscription(Generic[Message]):
             if self.end is None and self._stream is None:
                 self._look_for_sockets()
             yield Wait(self._sockets(), self._wait_seconds(deadline))
+        self._has_run = True
         return message
 
     @property
@@ -280,9 +282,10 @@ class Subscription(Generic[Message]):
 
     def _look_for_sockets(self) -> None:
         """End if the pipeline has removed its sockets from its folder, which it does once it has ended."""
-        had, self._had_sockets = self._had_sockets, self.place is not None and self.place.has_sockets()
-        if had and not self._had_sockets:
+        lacks_sockets = self.place is not None and self.place.lacks_sockets()
+        if lacks_sockets and self._has_run:
             self._pipeline_ended(End(0, _GONE), monotonic() + DRAIN_SECONDS)
+        self._has_run = self._has_run or not lacks_sockets
 
     def _disconnect(self) -> None:
         if self._connection is not None:

@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from catstream.errors import FleetError, StoreError, require_extra
-from catstream.fleet.timing import ABANDONED_SECONDS, CONNECT_SECONDS, READ_SECONDS, STORE_SECONDS
+from catstream.fleet.timing import CONNECT_SECONDS, READ_SECONDS, STORE_SECONDS
 from catstream.messages import storage
 
 __all__ = ["Objects"]
@@ -89,7 +89,7 @@ class Objects:
         if self._local:
             with self._path(folder, "tidied") as path:
                 for each in {found.parent for found in Path(path).rglob(".*.part")}:
-                    storage.remove_parts(each, ABANDONED_SECONDS)
+                    storage.remove_parts(each)
 
     def _check(self) -> None:
         """Raise StoreError if the store is not there, or does not create objects exclusively."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from catstream.messages.storage import ABANDONED_SECONDS
 from catstream.services.timing import SHUTDOWN_SECONDS
 from catstream.wire.timing import RETRY_SECONDS
 
@@ -30,7 +31,6 @@ BEGIN_SECONDS = 2.0  #: from the claim of a stream to its first frame; they coun
 STORE_SECONDS = 10.0  #: limit of a whole call
 CONNECT_SECONDS = 3.0  #: limit to connect to the server
 READ_SECONDS = 5.0  #: without any byte from the server
-ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 
 # Commands.
 REACH_SECONDS = 3.0  #: limit to connect to the head

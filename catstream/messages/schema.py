@@ -134,9 +134,13 @@ class Field:
         return next((limit for limit in self.limits if isinstance(limit, kind)), None)
 
 
-@cache
 def fields(kind: type) -> tuple[Field, ...]:
     """The fields of a message, in their order."""
+    return _fields(kind)
+
+
+@cache
+def _fields(kind: type) -> tuple[Field, ...]:
     hints = get_type_hints(kind, include_extras=True)
     return tuple(_field(field.name, hints[field.name]) for field in dataclasses.fields(kind))
 

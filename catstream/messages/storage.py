@@ -20,6 +20,7 @@ import numpy as np
 from catstream.errors import ProtocolError
 
 __all__ = [
+    "ABANDONED_SECONDS",
     "Arrays",
     "Metadata",
     "create_atomically",
@@ -47,7 +48,7 @@ _VERSION = 1  # version of the metadata's format
 #: Names of the types of arrays in the format.
 _TYPES = {"float64": "F64", "float32": "F32", "int64": "I64", "int32": "I32", "uint8": "U8", "bool": "BOOL"}
 _MOST_BYTES_BESIDE = len("..part") + 16  # that the name of an unfinished file is longer than that of the file
-_ABANDONED_SECONDS = 600.0  # after which nothing writes a part of a file any more
+ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
@@ -65,7 +66,7 @@ def write_atomically(path: str | os.PathLike[str], *data: bytes | memoryview, mo
         If the file cannot be written. The old file stays unchanged.
     """
     path = Path(path)
-    remove_parts(path.parent, _ABANDONED_SECONDS, path.name)
+    remove_parts(path.parent, path.name)
     with _written_beside(path, data, mode) as part:
         part.replace(path)
 
@@ -108,17 +109,16 @@ def _written_beside(path: Path, parts: Sequence[bytes | memoryview], mode: int) 
             part.unlink(missing_ok=True)
 
 
-def remove_parts(folder: Path, seconds: float, name: str = "") -> None:
+def remove_parts(folder: Path, name: str = "") -> None:
     """Remove the unfinished files that processes left in a folder when they were killed while they wrote.
 
     Parameters
     ----------
-    seconds : age of a file from which it is removed
     name : of the file that was to be written; "" for any
     """
     for part in folder.glob(f".{glob.escape(name)}{'.' if name else ''}*.part"):
         with contextlib.suppress(OSError):
-            if part.stat().st_mtime < time.time() - seconds:
+            if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
                 part.unlink()
 
 

@@ -146,9 +146,9 @@ class Endpoint:
         with socket.socket(socket.AF_UNIX) as probe:
             return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
-    def has_sockets(self) -> bool:
-        """Whether it is a folder with a socket of a pipeline, which removes all of them at its end."""
-        return self.folder is not None and any(file.exists() for file in _files(self.folder))
+    def lacks_sockets(self) -> bool:
+        """Whether it is a folder without any socket: a pipeline removes all of its own at its end."""
+        return self.folder is not None and not any(file.exists() for file in _files(self.folder))
 
 
 #: Processes that listen, the name of `hosts`.
@@ -285,12 +285,13 @@ def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, s
                     raise
 
 
-def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
+def find(text: str | Endpoint = "", keys: str = "", source: str = "") -> Endpoint:
     """The endpoint of a running pipeline: the given one, the one with this source, or the user's only one.
 
     Parameters
     ----------
-    text, keys : the settings `endpoint` and `keys`; the keys of this user's pipelines are known
+    text, keys : the settings `endpoint` and `keys`; the keys of this user's pipelines are known. What is an `Endpoint`
+        already is returned
     source : of a pipeline of this user, as it was given, or its file name
 
     Raises
@@ -298,6 +299,8 @@ def find(text: str = "", keys: str = "", source: str = "") -> Endpoint:
     ServiceError
         If there is none, or more than one.
     """
+    if isinstance(text, Endpoint):
+        return text
     if text:
         given = Endpoint.parse(text, keys)
         return replace(given, source=_source_at(given))
