@@ -64,6 +64,18 @@ def test_no_process_is_started_again_because_the_owner_is_slow(video, tmp_path, 
     assert tuple(started) == NAMES
 
 
+def test_tracks_that_have_arrived_are_returned_although_a_signal_has_ended_the_detector(video, until):
+    """It does not wait for its owner any longer."""
+    with Pipeline(video[0], video[1][0]) as pipeline:
+        tracks, detector = list(islice(pipeline, 1)), pipeline.pids["detector"]
+        time.sleep(2)  # until all of them are on their way
+        os.kill(detector, signal.SIGTERM)
+        until(lambda: "detector" not in pipeline.pids)
+        tracks.extend(pipeline)
+    assert [track.frame for track in tracks] == list(range(len(tracks)))
+    assert pipeline.totals["sent"] == len(tracks)
+
+
 @pytest.mark.parametrize("stays", [False, True], ids=["private folder", "folder of the user"])
 def test_a_subscriber_that_reads_nothing_from_a_restart_to_the_end_does_not_wait_for_ever(video, folder, stays):
     """Its subscription is sent to the restarted detector only once it reads."""

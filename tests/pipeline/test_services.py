@@ -19,6 +19,7 @@ from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.run.job import Job
 from catstream.run.state import TREES
+from catstream.services.child import Child
 from catstream.services.start import environment, python_command
 from catstream.services.start_server import NAMES, start_server
 from catstream.services.supervisor import Supervisor
@@ -145,6 +146,22 @@ def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(fold
         assert supervisor.restarts == 0
     finally:
         supervisor.stop()
+
+
+def test_processes_that_have_started_end_if_one_after_them_cannot_start(video, folder, monkeypatch, alive):
+    start, pids = Child.start, []
+
+    def start_two(child):
+        if child.name == "trainer":
+            raise OSError(24, "Too many open files")
+        start(child)
+        pids.append(child.pid)
+
+    monkeypatch.setattr(Child, "start", start_two)
+    with pytest.raises(OSError, match="Too many open files"):
+        Supervisor(Job(video[0], {"": video[1][0]}, endpoint=str(folder)), folder)
+    assert len(pids) == 2
+    assert not any(map(alive, pids))
 
 
 def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder):

@@ -317,6 +317,17 @@ def test_a_pipeline_waits_for_a_subscriber_that_started_first(endpoint, until, c
         assert not names_of_early_subscribers(row, endpoint), "it has heard the pipeline: no other one waits for it"
 
 
+def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_folder(folder, until):
+    place = Endpoint.parse(str(folder))
+    with catstream.subscribe(str(folder), "tracks", timeout=20) as subscription:
+        with Publisher(TRACKS, place) as publisher:
+            until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
+            publisher.send(track(1))
+            assert next(subscription).seq == 1
+        assert list(subscription) == []
+        assert "did not receive its end" in subscription.end.reason
+
+
 def test_subscribers_that_are_not_awaited_do_not_count_for_those_that_are(endpoint, until):
     with (
         catstream.subscribe(str(endpoint), "models"),  # it subscribes to the end of the tracks, too
