@@ -199,8 +199,8 @@ class StartServer:
     Attributes
     ----------
     pid : its process id
-    log : what it logged: that kernels are compiled, that it cannot fork; a shared one logs to the program that has
-        started it
+    log : what it logged: that kernels are compiled, that it cannot fork; a shared one logs to the standard error of the
+        program that has started it
 
     Raises
     ------
@@ -219,7 +219,7 @@ class StartServer:
                 self._process = _start(theirs, self._program, self.log.fileno())
             self.pid = self._process.pid
         else:
-            self._requests = _connected(shared_with, self.log.fileno())
+            self._requests = _connected(shared_with)
             self.pid = _other_end(self._requests)[0]
 
     @property
@@ -277,13 +277,15 @@ def _imports() -> tuple[list[str], dict[str, str]]:
     return import_path(), {name: value for name, value in environment().items() if name.startswith(_READ_BY_IMPORTS)}
 
 
-def _start(requests: socket.socket, program: int, log: int, first: str = "") -> subprocess.Popen[bytes]:
+def _start(requests: socket.socket, program: int, log: int | None, first: str = "") -> subprocess.Popen[bytes]:
     """Start the process of a server, which runs the statement `first` before anything else."""
     main = f"{first}from catstream.services.start_server import main; main({requests.fileno()}, {program})"
     return _run(python_command(main), requests.fileno(), log, "/", environment())
 
 
-def _run(command: list[str], passed: int, log: int, folder: str, variables: dict[str, str]) -> subprocess.Popen[bytes]:
+def _run(
+    command: list[str], passed: int, log: int | None, folder: str, variables: dict[str, str]
+) -> subprocess.Popen[bytes]:
     """Run a command that inherits one descriptor and the log."""
     return subprocess.Popen(
         command,
@@ -297,7 +299,7 @@ def _run(command: list[str], passed: int, log: int, folder: str, variables: dict
     )
 
 
-def _connected(program: int, log: int) -> socket.socket:
+def _connected(program: int) -> socket.socket:
     """A connection to the server that ends with a program and has imported what this process would; it may be new."""
     os.close(os.pidfd_open(program))  # it lives, and the server will see its end
     began = process_fields(program)[_BEGAN]
@@ -328,7 +330,7 @@ def _connected(program: int, log: int) -> socket.socket:
                 time.sleep(LOOK_SECONDS)
                 continue
             # The server is no child of this process, whose end may be that of all its children.
-            _start(listener, program, log, "import os; os.fork() and os._exit(0); ").wait()
+            _start(listener, program, None, "import os; os.fork() and os._exit(0); ").wait()
 
 
 def _other_end(channel: socket.socket) -> tuple[int, int]:

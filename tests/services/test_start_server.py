@@ -367,7 +367,7 @@ def test_a_start_server_of_another_user_is_not_used(monkeypatch):
     with subprocess.Popen(["sleep", "600"]) as node:
         monkeypatch.setattr(module, "_shared_with", node.pid)
         with pytest.raises(PermissionError, match="of another user"):
-            module._connected(node.pid, subprocess.DEVNULL)
+            module._connected(node.pid)
         own = start_server()
         assert psutil.Process(own.pid).ppid() == os.getpid()
         own.close()
