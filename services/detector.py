@@ -186,7 +186,7 @@ class DetectorLoop:
             self.tell(core.Commanded(self._request(command)))
         if self._process.stop_requested and (self.state.stopping < 0 or phase is not Phase.FRAME):
             self.tell(core.Stopping(self._process.seconds_since_stop))
-        if phase is Phase.SUBSCRIBERS:
+        if self.state.phase is Phase.SUBSCRIBERS:
             self._tell_subscribed()
         if (progressed := self._progressed()) is not None:
             self.tell(progressed)
@@ -238,8 +238,7 @@ class DetectorLoop:
 
     def _tell_subscribed(self) -> None:
         missing, seconds = self._outputs.awaited, time.monotonic() - self._began
-        if self.state.phase is Phase.SUBSCRIBERS:
-            self.tell(core.Subscribed(RECORDER not in missing, not missing - {RECORDER}, seconds))
+        self.tell(core.Subscribed(RECORDER not in missing, not missing - {RECORDER}, seconds))
 
     def _request(self, command: Command) -> Request:
         """A command without the saved model, which is kept here."""

@@ -440,9 +440,9 @@ class _Server:
                     data, descriptors, _, _ = socket.recv_fds(client, 16, 4)
                 except ConnectionError:
                     data, descriptors = b"", []
-                if not data and self._listener is None:
-                    return None
                 if not data:
+                    if self._listener is None:
+                        return None
                     self._poll.unregister(client)
                     del self._clients[client.fileno()]
                     client.close()
