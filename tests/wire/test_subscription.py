@@ -18,7 +18,7 @@ from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
-from catstream.wire.endpoint import Endpoint, names_of_early_subscribers
+from catstream.wire.endpoint import Endpoint, meeting_place, names_of_early_subscribers
 from catstream.wire.newest import Publisher, Subscriber
 
 
@@ -318,9 +318,8 @@ def test_a_pipeline_waits_for_a_subscriber_that_started_first(endpoint, until, c
 
 
 def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_folder(folder, until):
-    place = Endpoint.parse(str(folder))
     with catstream.subscribe(str(folder), "tracks", timeout=20) as subscription:
-        with Publisher(TRACKS, place) as publisher:
+        with meeting_place(str(folder), folder) as place, Publisher(TRACKS, place) as publisher:
             until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
             publisher.send(track(1))
             assert next(subscription).seq == 1
