@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import fcntl
+import io
+import logging
 import os
 import random
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -23,10 +27,14 @@ import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 
 from catstream.box import Box
+from catstream.cli import main
+from catstream.client.registry import RegistryServer
+from catstream.messages.kinds import Answer, Command
 from catstream.numerics.threads import one_thread
 from catstream.video.demo import write
-from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import private_folder
+from catstream.wire.channels import CHANNELS, CONTROL
+from catstream.wire.commands import Responder
+from catstream.wire.endpoint import Endpoint, private_folder
 
 hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
 hypothesis.settings.load_profile("catstream")
@@ -145,6 +153,12 @@ def folder():
 
 
 @pytest.fixture
+def endpoint(folder):
+    """The endpoint of a pipeline in `folder`."""
+    return Endpoint.parse(str(folder))
+
+
+@pytest.fixture
 def tcp():
     """A tcp endpoint: as many free ports in a row as the channels take."""
     ports = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
@@ -172,6 +186,139 @@ def until():
         return found
 
     return wait
+
+
+@pytest.fixture(scope="session")
+def program():
+    """The words that start the command `catstream` in a process of its own."""
+    return [sys.executable, "-c", "from catstream.cli import main; main()"]
+
+
+@pytest.fixture
+def catstream(program):
+    """Starts the command `catstream`; what still runs after the test is killed."""
+    with ExitStack() as stack:
+
+        def start(*arguments, **options):
+            pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+            process = subprocess.Popen([*program, *map(str, arguments)], **pipes | options)
+            stack.callback(process.communicate)
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+@pytest.fixture
+def said():
+    """Runs the command in this process, which imports nothing anew: exit code, output, errors."""
+
+    def run(*arguments, cwd=None, env=None):
+        output, errors = io.StringIO(), io.StringIO()
+        warnings = logging.StreamHandler(errors)
+        warnings.setLevel(logging.WARNING)
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            redirect_stdout(output),
+            redirect_stderr(errors),
+            ExitStack() as stack,
+        ):
+            logging.getLogger().addHandler(warnings)
+            stack.callback(logging.getLogger().removeHandler, warnings)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                stack.callback(signal.signal, number, signal.getsignal(number))
+            patch.setattr(sys, "argv", ["catstream", *map(str, arguments)])
+            if cwd is not None:
+                patch.chdir(cwd)
+            for name, value in (env or {}).items():
+                patch.setenv(name, value)
+            code = 0
+            try:
+                main()
+            except SystemExit as end:
+                code = end.code or 0
+        return code, output.getvalue(), errors.getvalue()
+
+    return run
+
+
+@pytest.fixture
+def succeed(said):
+    """Runs the command in this process, which must succeed: output, errors."""
+
+    def run(*arguments, **options):
+        code, output, errors = said(*arguments, **options)
+        assert code == 0, errors
+        return output, errors
+
+    return run
+
+
+@pytest.fixture
+def fail(said):
+    """Runs the command in this process, which must end with an error of one line, and print no output: this line."""
+
+    def run(*arguments, **options):
+        code, output, errors = said(*arguments, **options)
+        lines = [line for line in errors.splitlines() if line.startswith(("catstream: ", "Error: "))]
+        assert (output, len(lines)) == ("", 1), errors
+        assert code == (2 if lines[0].startswith("Error: ") else 1)
+        assert "Traceback" not in errors
+        return lines[0]
+
+    return run
+
+
+@contextmanager
+def _turning(turn, pause=0.01):
+    def run():
+        while not over.wait(pause):
+            turn()
+
+    over = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(run)
+        try:
+            yield
+        finally:
+            over.set()
+            running.result(20)
+
+
+@pytest.fixture
+def turning():
+    """Calls a function again and again in a thread, with a pause of so many seconds before each call."""
+    return _turning
+
+
+@pytest.fixture
+def managing():
+    """Serves the registry of a fleet, of which a function returns the status: its endpoint."""
+
+    @contextmanager
+    def manage(status, address="", keys=""):
+        with RegistryServer(address, keys, status) as server, _turning(server.turn):
+            yield server.endpoint
+
+    return manage
+
+
+@pytest.fixture
+def commanded():
+    """A detector that a test replaces: it answers each command, for example `stop` or `forget ben`; those that came."""
+
+    @contextmanager
+    def answer(endpoint, answered=lambda command: (True, f"{command.verb} was done")):
+        def turn():
+            for command in responder.receive_all():
+                heard.append(f"{command.verb} {command.object}".strip())
+                responder.answer(Answer(command.id, *answered(command)))
+
+        heard = []
+        with Responder[Command, Answer](CONTROL, endpoint) as responder, _turning(turn):
+            yield heard
+
+    return answer
 
 
 @pytest.fixture

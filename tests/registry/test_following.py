@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
@@ -168,29 +168,14 @@ def test_the_endpoint_of_a_running_stream_is_that_of_its_pipeline(stream, managi
         assert str(waiting.result()) == stream.status.streams["cam-7"].endpoint
 
 
-@contextmanager
-def steered(endpoint, until):
-    """A detector that carries out each command; gives those that it received."""
-    received = []
-
-    def turn():
-        for command in responder.receive_all(0.01):
-            received.append(command.verb)
-            responder.answer(Answer(command.id, True, "done"))
-
-    with Responder[Command, Answer](CONTROL, endpoint) as responder:
-        yield lambda done: until(done, turn), received
-
-
-def test_each_command_goes_where_the_stream_runs(stream, managing, until):
-    with managing(stream.status), ThreadPoolExecutor(1) as pool:
-        places = [stream.runs()._endpoint]
+def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
+    with managing(stream.status):
+        place = stream.runs()._endpoint
         with catstream.control("fleet://cam-7", timeout=60) as control:
-            with steered(places[0], until) as (serve, first):
-                serve(pool.submit(control.pause).done)
-            places.append(stream.runs()._endpoint)
-            with steered(places[1], until) as (serve, second):
-                serve(pool.submit(control.resume).done)
+            with commanded(place) as first:
+                control.pause()
+            with commanded(stream.runs()._endpoint) as second:
+                control.resume()
         assert (first, second, control.source) == (["pause"], ["resume"], "walk.mp4")
 
 
