@@ -25,7 +25,6 @@ from catstream.messages.kinds import StreamStatus
 from catstream.wire.keys import allow
 
 GATE, ROOF = StreamSpec("gate", "demo:1"), StreamSpec("roof", "demo:2", cores=0.5)
-SEARCHED = {"anna": "a"}
 
 
 class RayError(Exception):
@@ -430,9 +429,3 @@ def test_a_controller_that_is_started_after_the_end_of_a_fleet_runs_nothing_befo
     assert lines == ["gate: continues from its last state", "lake: is added", "roof: is removed"]
     again._turn()
     assert sorted(ray.actors) == ["site/stream/gate", "site/stream/lake"]
-
-
-@pytest.mark.parametrize("data", [b"{", b"{}", b'{"spec": "{}", "origin": "", "pins": {}, "draining": []}'])
-def test_a_damaged_desired_state_is_an_error(data):
-    with pytest.raises(FleetError, match="damaged"):
-        from_json(data, Desired)
