@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from threading import Event
 from uuid import uuid4
 
 import cv2
@@ -16,7 +14,6 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.client.registry import RegistryServer
 from catstream.messages.kinds import (
     Features,
     FleetStatus,
@@ -32,7 +29,6 @@ from catstream.messages.kinds import (
 from catstream.web.app import fleet_site, pipeline_site
 from catstream.web.server import Server
 from catstream.wire.channels import HEALTH, PREVIEWS
-from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 JPEG = b"\xff\xd8\xff\xe0 a picture"
@@ -126,23 +122,11 @@ def fleet():
 
 
 @pytest.fixture
-def manager(fleet):
-    """The registry of the fleet, in a thread; it ends once this event is set."""
-    over = Event()
-
-    def serve():
-        with RegistryServer(fleet.listen, fleet.keys, fleet.status) as server:
-            begun.set()
-            while not over.is_set():
-                server.turn(0.01)
-
-    begun = Event()
-    with ThreadPoolExecutor(1) as pool:
-        serving = pool.submit(serve)
-        assert begun.wait(20)
-        yield over
-        over.set()
-        serving.result(20)
+def manager(fleet, managing):
+    """The registry of the fleet, which ends once this is closed."""
+    with ExitStack() as stack:
+        stack.enter_context(managing(fleet.status, fleet.listen, fleet.keys))
+        yield stack
 
 
 @pytest.fixture
@@ -175,6 +159,6 @@ def camera_at(rng):
 
 
 @pytest.fixture
-def camera(camera_at, folder):
+def camera(camera_at, endpoint):
     """One turn of a pipeline in `folder` that sends pictures."""
-    return camera_at(Endpoint.parse(str(folder)))
+    return camera_at(endpoint)

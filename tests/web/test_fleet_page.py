@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import threading
 
 import pytest
 
@@ -16,7 +15,7 @@ TOKEN = "correct-horse-battery"
 
 
 def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
-    fleet, manager, serve_fleet, camera, folder, script_of_browser, monkeypatch
+    fleet, manager, serve_fleet, camera, turning, folder, script_of_browser, monkeypatch
 ):
     monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
@@ -28,17 +27,13 @@ def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_s
     fleet.stream("dock", "waiting", node="south-2")
     link = str(serve_fleet(token=TOKEN).base_url.copy_set_param("token", TOKEN))
     said = {}
-    over = threading.Event()
-    turning = threading.Thread(target=lambda: [camera() for _ in iter(lambda: over.wait(0.02), True)])
-    turning.start()
-    with subprocess.Popen(script_of_browser("fleet.mjs", link), stdout=subprocess.PIPE, text=True) as browser:
+    words = script_of_browser("fleet.mjs", link)
+    with turning(camera, 0.02), subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as browser:
         for line in browser.stdout:
             name, *values = json.loads(line)
             said.setdefault(name, []).extend(values)
             if name == "silence":
-                manager.set()
-    over.set()
-    turning.join()
+                manager.close()
     assert said["all"] == [["cam-9", "cam-7", "cam-10", "dock"]]
     assert said["nodes"] == [["south", "north", "south-2"]]
     assert (said["search"], said["trouble"]) == ([["cam-7"]], [["cam-9"]])

@@ -8,7 +8,6 @@ import json
 import re
 import socket
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,20 +17,14 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages.kinds import Health
-from catstream.services.core import Commanded, Frame, History
-from catstream.services.core_state import Phase, Request, Rules, State
-from catstream.services.desired import DesiredObject, DesiredState
 from catstream.web import app
 from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
 from catstream.web.guard import Guard
 from catstream.web.server import Server
-from catstream.wire.channels import CONTROL, HEALTH, PREVIEWS, TRACKS
-from catstream.wire.commands import Responder
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
 from catstream.wire.newest import Publisher
 
 TOKEN = "correct-horse-battery"
@@ -55,38 +48,34 @@ def locked(serve):
 
 
 @pytest.fixture
-def pipeline(folder):
+def pipeline(endpoint):
     """The health of all three processes, and tracks and pictures, as a pipeline sends them."""
-    place = Endpoint.parse(str(folder))
     with ExitStack() as stack:
         health = {
-            name: stack.enter_context(Publisher(HEALTH, place, name)) for name in ("detector", "compressor", "trainer")
+            name: stack.enter_context(Publisher(HEALTH, endpoint, name))
+            for name in ("detector", "compressor", "trainer")
         }
         yield {
             **health,
-            "tracks": stack.enter_context(Publisher(TRACKS, place)),
-            "previews": stack.enter_context(Publisher(PREVIEWS, place)),
+            "tracks": stack.enter_context(Publisher(TRACKS, endpoint)),
+            "previews": stack.enter_context(Publisher(PREVIEWS, endpoint)),
         }
 
 
-def updates(page, name, turn):
+@pytest.fixture
+def updates(page, turning):
     """The first part of that name that the page is told, while turns are made; fails where none is."""
-    deadline = time.monotonic() + 60
 
-    def told():
-        with page.stream("GET", "/events") as events:
+    def told(name, turn):
+        deadline = time.monotonic() + 60
+        with turning(turn, 0.05), page.stream("GET", "/events") as events:
             for line in events.iter_lines():
                 assert time.monotonic() < deadline, f"the page was told no {name} in time"
                 if line.startswith("data: ") and name in (parts := json.loads(line.removeprefix("data: "))):
                     return parts[name]
         raise AssertionError("the stream ended")
 
-    with ThreadPoolExecutor(1) as pool:
-        found = pool.submit(told)
-        while not found.done():  # whether the page has updates or not: it listens from a moment on that nobody knows
-            turn()
-            time.sleep(0.05)
-    return found.result()
+    return told
 
 
 @pytest.mark.parametrize("kind", ["page", "page_of_a_fleet"])
@@ -130,32 +119,6 @@ def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline
     assert '\ncatstream_rejected_messages_total{process="trainer"} 1.0\n' in shown
 
 
-def test_what_is_counted_for_each_object_has_its_name_as_a_label(page, pipeline, facts, until):
-    objects = {"anna": {"rows": 3.0, "bytes": 9.0, "object_leaves": 1.0}, "ben": {"rows": 4.0, "object_leaves": 2.0}}
-
-    def shown():
-        pipeline["detector"].send(facts.tracking(time.monotonic(), "anna", "ben"))
-        pipeline["compressor"].send(Health("compressor", time.monotonic(), {"rows": 7.0}, objects=objects))
-        trained = {"ben": {"trained": 5.0}, "forgotten": {"trained": 6.0}}
-        pipeline["trainer"].send(Health("trainer", time.monotonic(), {}, objects=trained))
-        metrics = page.get("/metrics").text
-        return metrics if "catstream_models_trained_total{" in metrics and "catstream_rows_total{" in metrics else None
-
-    lines = until(shown).splitlines()
-    assert "catstream_objects 2.0" in lines
-    assert 'catstream_score{object="anna"} 0.75' in lines
-    assert 'catstream_present{object="ben"} 1.0' in lines
-    assert 'catstream_model_version{object="ben"} 1.0' in lines
-    assert [line for line in lines if line.startswith("catstream_rows_total")] == [
-        'catstream_rows_total{object="anna"} 3.0',
-        'catstream_rows_total{object="ben"} 4.0',
-    ]
-    assert 'catstream_tree_leaves{object="ben",tree="object"} 2.0' in lines
-    assert [line for line in lines if line.startswith("catstream_models_trained_total")] == [
-        'catstream_models_trained_total{object="ben"} 5.0'
-    ]
-
-
 def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
     monkeypatch.setattr("catstream.web.dashboard.SILENCE_SECONDS", 0.5)
 
@@ -169,16 +132,7 @@ def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until,
     assert answer("detector", "compressor").text == "no health report from: trainer\n"
 
 
-def test_tracks_reach_the_page_when_they_are_sent(page, pipeline, facts):
-    def turn():
-        pipeline["detector"].send(Health("detector", time.monotonic(), {}))
-        pipeline["tracks"].send(facts.track(5))
-
-    tracks = updates(page, "tracks", turn)
-    assert (tracks["frame"], tracks["time"], [one["name"] for one in tracks["objects"]]) == (5, 0.5, [""])
-
-
-def test_an_error_on_a_message_does_not_end_the_feed(page, pipeline, facts, monkeypatch, caplog):
+def test_tracks_reach_the_page_also_after_an_error_on_a_message(updates, pipeline, facts, monkeypatch, caplog):
     def fails(*_):
         monkeypatch.undo()
         raise ArithmeticError("it cannot be")
@@ -188,11 +142,12 @@ def test_an_error_on_a_message_does_not_end_the_feed(page, pipeline, facts, monk
         pipeline["tracks"].send(facts.track(5))
 
     monkeypatch.setattr(Dashboard, "take", fails)
-    assert updates(page, "tracks", turn)["frame"] == 5
+    tracks = updates("tracks", turn)
+    assert (tracks["frame"], tracks["time"], [one["name"] for one in tracks["objects"]]) == (5, 0.5, [""])
     assert "ArithmeticError: it cannot be" in caplog.text
 
 
-def test_pictures_are_subscribed_only_while_a_page_is_open(page, pipeline, facts, until):
+def test_pictures_are_subscribed_only_while_a_page_is_open(page, updates, pipeline, facts, until):
     frames = itertools.count()
 
     def turn():
@@ -202,32 +157,28 @@ def test_pictures_are_subscribed_only_while_a_page_is_open(page, pipeline, facts
 
     until(lambda: turn() and page.get("/metrics").text.count("\ncatstream_up 1.0\n"))
     assert not pipeline["previews"].has_subscribers
-    frame = updates(page, "picture", turn)["frame"]
+    frame = updates("picture", turn)["frame"]
     assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
     until(lambda: turn() and not pipeline["previews"].has_subscribers)
 
 
-def test_the_live_picture_has_the_track_of_its_frame_drawn_in(page, pipeline, facts):
+def test_the_live_picture_has_the_track_of_its_frame_drawn_in(page, pipeline, facts, turning):
     image = np.full((48, 64, 3), 128, np.uint8)
     preview = replace(facts.preview(5), jpeg=cv2.imencode(".jpg", image)[1].tobytes())
 
-    def turns():
-        while not seen:
-            pipeline["detector"].send(Health("detector", time.monotonic(), {}))
-            pipeline["tracks"].send(facts.track(5))
-            pipeline["previews"].send(preview)
-            time.sleep(0.02)
+    def turn():
+        pipeline["detector"].send(Health("detector", time.monotonic(), {}))
+        pipeline["tracks"].send(facts.track(5))
+        pipeline["previews"].send(preview)
 
-    seen, told = [], b""
-    with ThreadPoolExecutor(1) as pool, page.stream("GET", "/live.mjpeg") as live:
+    told = b""
+    with turning(turn, 0.02), page.stream("GET", "/live.mjpeg") as live:
         assert live.headers["content-type"] == "multipart/x-mixed-replace; boundary=picture"
-        pool.submit(turns)
         for data in live.iter_bytes():
             told += data
             parts = [part.partition(b"\r\n\r\n")[2] for part in told.split(b"--picture\r\n")[1:-1]]
             shown = [cv2.imdecode(np.frombuffer(part, np.uint8), cv2.IMREAD_COLOR) for part in parts]
             if any(picture[:48].max() > 150 for picture in shown):  # the first may come before its track
-                seen.append(True)
                 break
     assert {picture.shape[:2] for picture in shown} == {(68, 64)}, "one size, with a track and without"
 
@@ -247,9 +198,9 @@ def test_a_form_of_another_page_cannot_steer_without_an_origin_header(page):
     assert page.post("/control", data={"verb": "pause"}).status_code == 415
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
+INVALID = {
+    repr(command): json.dumps(command)
+    for command in (
         {"verb": "format"},
         {"verb": "set-box"},
         {"verb": "set-box", "box": [1, 2, 3]},
@@ -265,55 +216,36 @@ def test_a_form_of_another_page_cannot_steer_without_an_origin_header(page):
         {"verb": "set-box", "object": "../anna", "box": [1, 2, 3, 4]},
         ["pause"],
         "x" * 5000,
-    ],
-    ids=repr,
-)
-def test_an_invalid_command_is_rejected_before_it_is_sent(page, command):
-    body = json.dumps(command)
+    )
+}
+INVALID |= {"deep": "[" * 4000, "no JSON": "pause"}
+INVALID |= {"many digits": '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400)}
+
+
+@pytest.mark.parametrize("body", INVALID.values(), ids=INVALID)
+def test_an_invalid_command_is_rejected_before_it_is_sent(page, body):
     answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 400
     assert "expected" in answer.json()["reason"]
 
 
-@pytest.mark.parametrize(
-    "body",
-    ["[" * 4000, '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400), "pause"],
-    ids=["deep", "many digits", "no JSON"],
-)
-def test_malformed_json_is_rejected_like_any_invalid_command(page, body):
-    answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == 400
-    assert "expected" in answer.json()["reason"]
+def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(
+    page, pipeline, endpoint, commanded, until
+):
+    def attached():
+        pipeline["detector"].send(Health("detector", time.monotonic(), {}))
+        return "\ncatstream_up 1.0\n" in page.get("/metrics").text
 
+    def told(verb, name, **more):
+        answer = page.post("/control", json={"verb": verb, "object": name, **more})
+        return answer.status_code, answer.json()["reason"]
 
-def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(page, pipeline, folder, until):
-    rules = Rules(window=8, lag_frames=8, lockstep=False, objects_most=2, context=1.0)
-    boxes = {name: DesiredObject(Box(40, 30, 48, 48), begins=1) for name in ("anna", "ben")}
-    core = History(State(rules, Phase.FRAME, desired=DesiredState(boxes)))
-    with Responder(CONTROL, Endpoint.parse(str(folder))) as channel, ThreadPoolExecutor(1) as pool:
-
-        def answer(verb, name, **more):
-            asked = pool.submit(page.post, "/control", json={"verb": verb, "object": name, **more})
-            while not asked.done():
-                for command in channel.receive_all():
-                    frame = [Frame(0, live=False)] if command.verb == "set-box" else []
-                    for event in (Commanded(Request(command)), *frame):
-                        for each in [each for action in core.handle(event)[:1] for each in action.answers]:
-                            channel.answer(each)
-            return asked.result().status_code, asked.result().json()["reason"]
-
-        def attached():
-            pipeline["detector"].send(Health("detector", time.monotonic(), {}))
-            return "\ncatstream_up 1.0\n" in page.get("/metrics").text
-
-        until(attached)
-        assert answer("pause", "")[0] == 200
-        status, reason = answer("set-box", "carl", box=[40, 30, 48, 48])
-        assert (status, "3 objects are more than 2" in reason) == (409, True)
-        status, reason = answer("forget", "carl")
-        assert (status, "there is no object 'carl'" in reason) == (409, True)
-        assert answer("forget", "ben")[0] == 200
-        assert list(core.state.desired.objects) == ["anna"]
+    until(attached)
+    with commanded(endpoint, lambda command: (command.object != "carl", f"about {command.object}")) as heard:
+        assert told("pause", "") == (200, "about ")
+        assert told("set-box", "carl", box=[40, 30, 48, 48]) == told("forget", "carl") == (409, "about carl")
+        assert told("forget", "ben") == (200, "about ben")
+    assert heard == ["pause", "set-box carl", "forget carl", "forget ben"]
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -331,6 +263,7 @@ def test_with_the_token_or_without_the_need_of_one_everything_is_shown(serve, fa
     if opened == "by the link":
         assert page.get(f"/?token={TOKEN}", follow_redirects=True).status_code == 200
     elif opened == "by a header":
+        assert page.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 401
         page.headers["Authorization"] = f"Bearer {TOKEN}"
     for path in PATHS:
         with page.stream("GET", path) as answer:
@@ -362,11 +295,6 @@ def test_a_host_header_that_looks_like_a_public_path_does_not_open_another_path(
 def test_health_checks_need_no_token(locked):
     assert locked.get("/healthz").status_code == 200
     assert locked.get("/readyz").status_code == 503
-
-
-def test_the_token_is_accepted_as_a_header(locked):
-    assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}"}).status_code == 200
-    assert locked.get("/metrics", headers={"Authorization": f"Bearer {TOKEN}x"}).status_code == 401
 
 
 @pytest.mark.parametrize(("asked", "opened"), [("/", "/"), ("/?search=a%3Db&", "/?search=a%3Db")])

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import httpx
 
 
 def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and_of_the_server(
-    demo_video, folder, tmp_path, until
+    demo_video, catstream, folder, tmp_path, until
 ):
     source, boxes = demo_video(40)
     words = ["track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={folder}"]
     page = ["--view", "127.0.0.1:0"]
-    with (
-        subprocess.Popen(
-            [sys.executable, "-c", "from catstream.cli import main; main()", *map(str, words), *page],
-            stderr=subprocess.PIPE,
-            text=True,
-        ) as run,
-        httpx.Client(timeout=60, verify=False) as browser,
-    ):
+    run = catstream(*words, *page)
+    with httpx.Client(timeout=60, verify=False) as browser:
         said = run.stderr.readline()
         assert said.startswith("page: http://127.0.0.1:")
         link = said.split()[1]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import encodings.idna  # noqa: F401  # used below as another user, who may not read this installation
 import os
-import subprocess
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,24 +15,14 @@ OTHER_USER = 65534
 
 
 @pytest.fixture
-def started(folder):
+def started(catstream):
     """Starts a command, which prints the link of its page: the process, and the link."""
-    running = []
 
     def start(*words):
-        process = subprocess.Popen(
-            [sys.executable, "-c", "from catstream.cli import main; main()", *words],
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "TMPDIR": str(folder.parent), "PYTHONUNBUFFERED": "1"},
-        )
-        running.append(process)
+        process = catstream(*words, env=os.environ | {"PYTHONUNBUFFERED": "1"})
         return process, process.stdout.readline().strip()
 
-    yield start
-    for process in running:
-        process.terminate()
-        process.communicate(timeout=60)
+    return start
 
 
 @contextmanager
@@ -67,7 +55,9 @@ def test_another_user_of_the_machine_can_neither_watch_nor_steer(started, words)
         assert owner.get(f"{url}metrics").status_code == 200
 
 
-def test_with_no_token_the_page_is_open_to_every_user_of_the_machine(started):
-    _, link = started("view", "--listen", "127.0.0.1:0", "--no-token")
+def test_with_no_token_the_page_is_open_to_every_user_of_the_machine_until_sigterm(started):
+    process, link = started("view", "--listen", "127.0.0.1:0", "--no-token")
     with another_user(), httpx.Client(base_url=link, verify=False) as stranger:
         assert [stranger.get(path).status_code for path in ("/", "/metrics")] == [200, 200]
+    process.terminate()
+    assert process.wait(60) == 0
