@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
 import pytest
 
-from catstream.cli import COMMANDS
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
 from catstream.video.source import open_source
 
-STEER = ["set-box", "forget", "pause", "resume", "save", "stop"]
+NEED_A_PIPELINE = [["set-box", "1,2,3,4"], ["search", "one"], ["save", "one"], ["watch", "tracks"]]
+NEED_A_PIPELINE += [[name] for name in ("forget", "pause", "resume", "stop", "status")]
 PATIENT = ("--timeout", 60)
 
 
@@ -134,18 +133,12 @@ def test_a_saved_model_finds_the_object_in_another_run(video, follow, succeed, s
     assert [track.state for track in run.result(120)] == [row["state"] for row in found]
 
 
-def test_a_box_and_a_model_for_one_object_are_an_error(video, fail, tmp_path):
-    source, box = video
-    assert "give one of them" in fail("track", source, "--box", box, "--model", tmp_path / "one")
+@pytest.mark.parametrize("words", NEED_A_PIPELINE, ids=" ".join)
+def test_if_no_pipeline_runs_that_is_reported_in_one_line(fail, tmp_path, words):
+    nowhere = {"TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
+    assert fail(*words, env=nowhere).startswith("catstream: no pipeline of yours is running: start one")
 
 
-@pytest.mark.parametrize("name", STEER)
-def test_if_no_pipeline_runs_that_is_reported_in_one_line(said, tmp_path, name):
-    assert name in COMMANDS
-    words = {"set-box": ["1,2,3,4"], "save": [tmp_path / "one"]}.get(name, [])
-    (tmp_path / "run").mkdir()  # as a pipeline leaves it; one that is not there may be starting
-    code, output, errors = said(name, *words, "--endpoint", tmp_path / "run", "--timeout", 600)
-    assert (code, output) == (1, "")
-    assert errors.startswith(f"catstream: no answer to {name}: no pipeline runs at {tmp_path / 'run'}, start one")
-    nowhere = {**os.environ, "TMPDIR": str(tmp_path), "XDG_RUNTIME_DIR": ""}
-    assert said(name, *words, env=nowhere)[2].startswith("catstream: no pipeline of yours is running")
+def test_at_an_endpoint_that_a_pipeline_has_left_none_is_waited_for(fail, tmp_path):
+    error = fail("stop", "--endpoint", tmp_path, "--timeout", 600)  # one that is not there may be starting
+    assert error.startswith(f"catstream: no answer to stop: no pipeline runs at {tmp_path}, start one")

@@ -35,17 +35,17 @@ def models(demo_video, once):
     return folder / "door", folder / "yard", folder / "lake"
 
 
-def test_models_of_two_cameras_are_merged_into_one_file(said, models, tmp_path):
+def test_models_of_two_cameras_are_merged_into_one_file(succeed, models, tmp_path):
     door, yard, _ = models
-    code, output, errors = said("merge", door, yard, "-o", tmp_path / "both")
-    assert (code, errors) == (0, "")
+    output, errors = succeed("merge", door, yard, "-o", tmp_path / "both")
+    assert not errors
     one, other, both = map(Learned.load, (door, yard, tmp_path / "both"))
     rows = both.trees["object"].rows_seen
     assert rows == one.trees["object"].rows_seen + other.trees["object"].rows_seen
     assert f"2 saved models, 2 videos, {rows} rows of the object" in output
 
 
-def test_a_merge_that_cannot_be_made_is_one_line_and_writes_nothing(said, models, tmp_path):
+def test_a_merge_that_cannot_be_made_is_one_line_and_writes_nothing(fail, succeed, models, tmp_path):
     door, yard, _ = models
     damaged, kept = tmp_path / "damaged", tmp_path / "kept"
     damaged.write_bytes(door.read_bytes()[:-9])
@@ -57,30 +57,26 @@ def test_a_merge_that_cannot_be_made_is_one_line_and_writes_nothing(said, models
         ((door, tmp_path / "none", "-o", tmp_path / "new"), "there is no saved model"),
         ((door, yard, "-o", kept), "exists already"),
     ):
-        code, output, errors = said("merge", *words)
-        assert (code, output, errors.count("\n")) == (1, "", 1), errors
-        assert why in errors
+        assert why in fail("merge", *words)
     assert not (tmp_path / "new").exists()
     assert kept.read_text() == "kept"
-    assert said("merge", door, yard, "-o", kept, "--overwrite")[0] == 0
+    succeed("merge", door, yard, "-o", kept, "--overwrite")
 
 
-def test_models_of_different_objects_are_merged_only_with_force(said, models, tmp_path):
+def test_models_of_different_objects_are_merged_only_with_force(fail, succeed, models, tmp_path):
     door, _, lake = models
-    code, output, errors = said("merge", door, lake, "-o", tmp_path / "both")
-    assert (code, output, errors.count("\n")) == (1, "", 1), errors
-    assert "saved models 1 and 2 look like different objects" in errors
-    assert "--force" in errors
+    error = fail("merge", door, lake, "-o", tmp_path / "both")
+    assert "saved models 1 and 2 look like different objects" in error
+    assert "--force" in error
     assert not (tmp_path / "both").exists()
-    code, output, errors = said("merge", door, lake, "-o", tmp_path / "both", "--force")
-    assert (code, errors) == (0, "")
-    assert "2 saved models" in output
+    output, errors = succeed("merge", door, lake, "-o", tmp_path / "both", "--force")
+    assert (errors, "2 saved models" in output) == ("", True)
 
 
-def test_a_doubt_is_one_line_and_the_models_are_merged(said, models, tmp_path, monkeypatch):
+def test_a_doubt_is_one_line_and_the_models_are_merged(succeed, models, tmp_path, monkeypatch):
     monkeypatch.setattr("catstream.run.learned._UNLIKE", 0.0)
     door, _, lake = models
-    code, output, errors = said("merge", door, lake, "-o", tmp_path / "both")
-    assert (code, errors.count("\n")) == (0, 1)
+    output, errors = succeed("merge", door, lake, "-o", tmp_path / "both")
+    assert errors.count("\n") == 1
     assert "catstream: warning: saved models 1 and 2 look like different objects (likeness 0." in errors
     assert "2 saved models" in output

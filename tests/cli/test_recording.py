@@ -13,7 +13,6 @@ from catstream.messages.kinds import Features, Model, Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.sinks.recording.file import Recording, RecordingWriter
-from catstream.sinks.recording.learning import learn
 
 
 @pytest.fixture
@@ -26,12 +25,6 @@ def test_the_content_of_a_recording_is_reported(whole_run):
     errors = (whole_run / "stderr").read_text()
     assert "recording: rec, 32 features, " in errors
     assert "none missing" in errors
-    recording = Recording(whole_run / "rec")
-    assert [features.seq for features in recording.features()] == list(range(1, 33))
-    assert recording.end.totals == {"sent": 32, "stored": 32}
-    assert (recording.missing[Features], recording.missing[Track]) == (0, 0)
-    lesson = learn(recording, recording.settings)
-    assert lesson.identical == recording.counts[Model] > 5
 
 
 def test_the_learning_is_replayed_and_compared_with_other_settings(recorded, succeed, tmp_path):

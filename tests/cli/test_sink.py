@@ -14,7 +14,6 @@ from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS, TRAINING
-from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
 FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
@@ -63,9 +62,9 @@ def written(folder, errors):
 
 
 def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_ends_the_sink(
-    catstream, folder, tmp_path, until
+    catstream, endpoint, tmp_path, until
 ):
-    endpoint, file = Endpoint.parse(str(folder)), tmp_path / "tracks.ndjson"
+    file = tmp_path / "tracks.ndjson"
     with (
         Publisher(HEALTH, endpoint, "detector") as health,
         Publisher(TRACKS, endpoint) as tracks,
@@ -73,7 +72,7 @@ def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_end
             TRAINING, endpoint, first_message=Run.from_settings(Settings(run={"unstored_frames": 100}).portable())
         ) as training,
     ):
-        sink = catstream("sink", file, "--endpoint", folder)
+        sink = catstream("sink", file, "--endpoint", endpoint)
         until(file.exists, lambda: health.send(Health("detector", time.time())))
 
         def follow(first, last, written):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import csv
 import shutil
-import signal
 import subprocess
-import sys
 import time
-from functools import partial
 
 import psutil
 import pytest
@@ -44,13 +41,13 @@ def kill_everything(process):
 
 
 @pytest.fixture(scope="module")
-def wreck(video, tmp_path_factory):
+def wreck(video, program, tmp_path_factory):
     """What is left of a run that was killed with all its processes, as by a power cut: its place, and a copy of it."""
     source, box = video
     place = tmp_path_factory.mktemp("killed") / "run"
-    command = [sys.executable, "-c", "from catstream.cli import main; main()", "track", source, "--box", box]
     results = ["--output", place / "out", "--video", "--state", place / "kept"]
-    process = subprocess.Popen([*command, *map(str, results), *OFTEN], stderr=subprocess.PIPE, text=True)
+    command = [*program, "track", source, "--box", box, *map(str, results), *OFTEN]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while not (len(checkpoints(place / "kept")) > 1 and len(frames(place / "out")) >= 6):
         assert process.poll() is None, process.communicate()[1]
@@ -158,19 +155,6 @@ def test_settings_that_are_given_again_change_and_all_others_stay(video, said, s
         assert Job.load(kept).settings.changed() == changed
 
 
-def test_a_program_that_resumes_a_run_gives_only_the_changed_settings(video, tmp_path):
-    source, box = video
-    begun = {"settings": Settings(run={"unstored_frames": 8, "lockstep": True}), "state": tmp_path / "kept"}
-    with Pipeline(source, [float(side) for side in box.split(",")], **begun):
-        pass
-    given = {"run.unstored_frames": 4}
-    assert Pipeline(resume=tmp_path / "kept", settings=given).settings == Settings(
-        run={"unstored_frames": 4, "lockstep": True}
-    )
-    resumed = Pipeline(resume=tmp_path / "kept", settings={"run.unstored_frames": 256})
-    assert resumed.settings == Settings(run={"lockstep": True})
-
-
 def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_whose_last_frame_was_torn(
     video, succeed, tmp_path
 ):
@@ -189,19 +173,6 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
         assert len((out / f"demo-{name}.txt").read_text().splitlines()) == 16
     ids = {tuple(line.split(",")[:2]) for line in (tmp_path / "t.txt").read_text().splitlines()}
     assert ids == {(str(frame + 1), number) for frame in range(16) for number in ("1", "2")}
-
-
-def test_a_terminal_that_is_lost_ends_a_run_like_ctrl_c(long_video, catstream, until, tmp_path):
-    source, box = long_video
-    heeded = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
-    files, slowly = ["--output", tmp_path, "--video"], ["--set", "run.unstored_frames=1", "--lockstep"]
-    process = catstream("track", source, "--box", box, *files, *slowly, preexec_fn=heeded)
-    until(lambda: len(frames(tmp_path)) > 5 or process.poll() is not None)
-    process.send_signal(signal.SIGHUP)
-    errors = process.communicate(timeout=120)[1]
-    assert process.returncode == 130, errors
-    with open_source(tmp_path / "demo.mp4") as film:  # it may be short of the frame at which the signal came
-        assert len(frames(tmp_path)) - sum(1 for _ in film) in (0, 1)
 
 
 def test_a_complete_run_is_not_resumed_and_that_is_reported(video, succeed, fail, tmp_path):

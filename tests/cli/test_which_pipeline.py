@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
-from threading import Event
+from contextlib import ExitStack
 
 import pytest
 from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
-from catstream.client.registry import RegistryServer
-from catstream.messages.kinds import Answer, FleetStatus, StreamStatus
-from catstream.wire.channels import CONTROL
-from catstream.wire.commands import Responder
+from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.wire.endpoint import meeting_place, private_folder
 
 
 @pytest.fixture
-def pipeline(folder, monkeypatch):
+def pipeline(folder, commanded, monkeypatch):
     """Starts a pipeline as far as commands can tell; gives its endpoint and the list of the commands that came.
 
     No pipelines but those of the test are found.
@@ -27,31 +22,13 @@ def pipeline(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     with ExitStack() as stack:
-        yield lambda source: stack.enter_context(_commanded(source))
 
+        def start(source):
+            own = stack.enter_context(private_folder())
+            place = stack.enter_context(meeting_place("", own, source=source))
+            return place, stack.enter_context(commanded(place))
 
-@contextmanager
-def _commanded(source):
-    heard, over = [], Event()
-
-    def serve():
-        while not over.wait(0.01):
-            for command in responder.receive_all():
-                heard.append(command.verb)
-                responder.answer(Answer(command.id, True, f"{command.verb} was done", 7, None, 1))
-
-    with (
-        private_folder() as folder,
-        meeting_place("", folder, source=source) as place,
-        Responder(CONTROL, place) as responder,
-        ThreadPoolExecutor(1) as pool,
-    ):
-        serving = pool.submit(serve)
-        try:
-            yield place, heard
-        finally:
-            over.set()
-            serving.result(20)
+        yield start
 
 
 def said(*words, **options):
@@ -98,29 +75,17 @@ def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatc
     assert said("stop", "--source", "walk.mp4", "--endpoint", tmp_path).exit_code == 2
 
 
-def test_a_stream_of_a_fleet_can_be_selected_by_its_name(pipeline):
+def test_a_stream_of_a_fleet_can_be_selected_by_its_name(pipeline, managing):
     place, heard = pipeline("/films/walk.mp4")
     pipeline("/films/other.mp4")
     stream = StreamStatus("cam-7", "running", source="/films/walk.mp4", endpoint=str(place), token=1)
-    site = FleetStatus("site", 0.0, {"cam-7": stream})
-    over = Event()
-
-    def serve():
-        while not over.is_set():
-            registry.turn(0.01)
-
-    with RegistryServer("", "", lambda: site) as registry, ThreadPoolExecutor(1) as pool:
-        serving = pool.submit(serve)
-        try:
-            for words in (["--stream", "cam-7"], ["--stream", "cam-7", "--fleet", "site"]):
-                result = said("pause", *words)
-                assert (result.exit_code, result.stderr) == (0, f"pipeline: /films/walk.mp4 at {place}\n")
-            assert said("resume", "--endpoint", "fleet://site/cam-7").exit_code == 0
-            assert heard == ["pause", "pause", "resume"]
-            assert "no stream 'cam-8': its streams are cam-7" in str(said("stop", "--stream", "cam-8").exception)
-        finally:
-            over.set()
-            serving.result(20)
+    with managing(lambda: FleetStatus("site", 0.0, {"cam-7": stream})):
+        for words in (["--stream", "cam-7"], ["--stream", "cam-7", "--fleet", "site"]):
+            result = said("pause", *words)
+            assert (result.exit_code, result.stderr) == (0, f"pipeline: /films/walk.mp4 at {place}\n")
+        assert said("resume", "--endpoint", "fleet://site/cam-7").exit_code == 0
+        assert heard == ["pause", "pause", "resume"]
+        assert "no stream 'cam-8': its streams are cam-7" in str(said("stop", "--stream", "cam-8").exception)
 
 
 @pytest.mark.parametrize(
