@@ -8,8 +8,6 @@ import pytest
 from catstream.applications.evaluation.attributes import attributes_of, computed_attributes, read_attributes
 from catstream.errors import SettingsError
 
-ALL = ["fast motion", "scale variation", "aspect change", "low resolution", "out of view"]
-
 
 @pytest.mark.parametrize(
     ("last", "attributes"),

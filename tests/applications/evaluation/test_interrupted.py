@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -16,13 +15,11 @@ from catstream.applications.evaluation.workers import run_tasks
 from catstream.cli.interrupts import INTERRUPTED, interruptible
 from catstream.services.start import sigint_blocked
 
-EVALUATE = [sys.executable, "-c", "from catstream.cli import main; main()", "evaluate"]
 
-
-def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, tmp_path):
+def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, tmp_path):
     """The terminal sends it to all of them, of which the workers are at their imports."""
-    command = [*EVALUATE, str(walk), "--starts", "4", "--jobs", "2", "--output", str(tmp_path / "out")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, process_group=0)
+    runs = ["--starts", 4, "--jobs", 2, "--output", tmp_path / "out"]
+    process = catstream("evaluate", walk, *runs, process_group=0)
     family = psutil.Process(process.pid)
     while len(family.children()) < 3 and process.poll() is None:  # two workers, and the tracker of their resources
         pass

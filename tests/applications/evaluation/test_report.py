@@ -9,14 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from catstream.applications.evaluation.failures import failure_strip, worst_runs
 from catstream.applications.evaluation.report import write_report, write_strips
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.applications.evaluation.starts import FIRST
-from catstream.cli.evaluate import evaluate
-from catstream.errors import CatstreamError, VideoError
+from catstream.errors import VideoError
 from catstream.settings import Settings
 
 
@@ -85,16 +83,14 @@ def test_a_report_that_cannot_be_written_is_an_error(tmp_path, lost):
         write_report(tmp_path / "missing" / "report.html", [lost], Settings(), {})
 
 
-def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
+def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
     out, file = tmp_path / "out", tmp_path / "numbers.json"
     attributes = tmp_path / "attributes.json"
     attributes.write_text('{"walk": ["blur"]}')
-    arguments = [str(walk), "--output", str(out), "--json", str(file), "--set", "coreset.size=32"]
-    arguments += ["--attributes", str(attributes)]
-    result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
-    assert re.search(r"walk +catstream +12 +0\.\d{3}", result.output)
-    assert "report.html" in result.output
+    files = ["--output", out, "--json", file, "--attributes", attributes]
+    output, errors = succeed("evaluate", walk, *files, "--set", "coreset.size=32")
+    assert re.search(r"walk +catstream +12 +0\.\d{3}", output)
+    assert "report.html" in output + errors
     figures = json.loads(file.read_text())
     assert figures["mean"]["catstream"]["success"] > 0.7
     assert figures["attributes"]["blur"] == {"sequences": ["walk"], "mean": figures["mean"]}
@@ -102,16 +98,10 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk):
     assert (out / "catstream" / "walk.txt").exists()
 
 
-def test_the_command_shows_the_spread_over_several_starts(walk):
-    result = CliRunner().invoke(evaluate, [str(walk), "--starts", "2", "--tracker", "mil"], catch_exceptions=False)
-    assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
-
-
-def test_the_command_counts_the_sequences_that_flip(tmp_path, walk):
-    arguments = [str(walk), "--jitter", "2", "--tracker", "mil", "--output", str(tmp_path)]
-    result = CliRunner().invoke(evaluate, arguments, catch_exceptions=False)
-    assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", result.output)
-    (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the first box", result.output)  # MIL is random
+def test_the_command_shows_the_spread_of_several_runs_and_counts_the_sequences_that_flip(tmp_path, walk, succeed):
+    output, errors = succeed("evaluate", walk, "--jitter", 2, "--tracker", "mil", "--output", tmp_path)
+    assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", output)
+    (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the first box", output + errors)  # MIL is random
     assert sentence in (tmp_path / "report.html").read_text()
 
 
@@ -123,34 +113,29 @@ def test_the_command_counts_the_sequences_that_flip(tmp_path, walk):
         (("--attributes", "attributes.json"), "give --output or --json"),
     ],
 )
-def test_options_that_contradict_one_another_are_an_error(walk, options, message):
-    result = CliRunner().invoke(evaluate, [str(walk), *options])
-    assert result.exit_code == 2
-    assert message in " ".join(result.output.split())
+def test_options_that_contradict_one_another_are_an_error(walk, fail, options, message):
+    assert message in fail("evaluate", walk, *options)
 
 
-def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk):
+def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk, said):
     torn = tmp_path / "torn"
     shutil.copytree(walk, torn)
     (torn / "img" / "0012.png").unlink()
     file = tmp_path / "out.json"
-    result = CliRunner().invoke(evaluate, [str(walk), str(torn), "--tracker", "mil", "--json", str(file)])
-    assert re.search(r"walk +mil +12 +0\.\d{3}", result.output)
-    assert re.search(r"mil on torn: .* 1 frames too few", result.output)
-    assert isinstance(result.exception, CatstreamError)
-    assert "1 of 2 runs" in str(result.exception)
+    code, output, errors = said("evaluate", walk, torn, "--tracker", "mil", "--json", file)
+    assert re.search(r"walk +mil +12 +0\.\d{3}", output)
+    assert re.search(r"mil on torn: .* 1 frames too few", errors)
+    assert (code, "1 of 2 runs" in errors.splitlines()[-1]) == (1, True)
     assert [row["name"] for row in json.loads(file.read_text())["sequences"]] == ["walk"]
 
 
-def test_an_unwritable_json_path_is_an_error_before_the_work(tmp_path, walk):
+def test_an_unwritable_json_path_is_an_error_before_the_work(tmp_path, walk, fail):
     for place in (tmp_path, tmp_path / "a" / "b"):
-        result = CliRunner().invoke(evaluate, [str(walk), "--tracker", "mil", "--json", str(place)])
-        assert isinstance(result.exception, CatstreamError)
-        assert "give a file in a folder that exists" in str(result.exception)
-        assert not result.output
+        error = fail("evaluate", walk, "--tracker", "mil", "--json", place)
+        assert "give a file in a folder that exists" in error
 
 
-def test_the_help_names_every_tracker_and_measure():
-    text = CliRunner().invoke(evaluate, ["--help"]).output
+def test_the_help_names_every_tracker_and_measure(succeed):
+    text, _ = succeed("evaluate", "--help")
     for word in ("csrt", "kcf", "mil", "tld", "AUC", "success", "precision", "norm.", "F-score", "--starts 5"):
         assert word in text
