@@ -231,9 +231,9 @@ def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, 
 
 def test_memory_is_flat_between_doublings(settings, messages):
     forest = Forest(settings)
-    take(forest, messages, 256)
+    take(forest, messages, 64)
     small = forest.counters()["bytes"]
-    take(forest, messages, 256 * 15)
+    take(forest, messages, 64 * 15)
     assert forest.counters()["bytes"] < 2.5 * small
 
 

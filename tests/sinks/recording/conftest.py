@@ -13,7 +13,6 @@ from catstream.settings import Settings
 from catstream.sinks.recording.file import RecordingWriter
 from catstream.training.trainer import Trainer
 from catstream.video.source import open_source
-from catstream.wire.endpoint import Endpoint, private_folder
 
 SETTINGS = Settings(coreset={"size": 16})
 
@@ -63,10 +62,3 @@ def written(tmp_path):
         return tmp_path / "run.rec"
 
     return record
-
-
-@pytest.fixture
-def endpoint():
-    """Where to meet."""
-    with private_folder() as folder:
-        yield Endpoint.parse(str(folder))

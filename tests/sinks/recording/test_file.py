@@ -290,11 +290,19 @@ def with_message(folder, kind, data):
     return path
 
 
-@pytest.mark.parametrize("kind", [Features, Model])
-def test_a_recording_of_an_earlier_protocol_is_an_error_of_one_line(tmp_path, kind):
-    path = with_message(tmp_path, kind, msgpack.packb([2, kind.__name__.lower(), {}]))
-    with pytest.raises(RecordingError, match=r"cannot read: expected version 4 of the protocol, got 2") as raised:
-        Recording(path)
+@pytest.mark.parametrize(
+    ("kind", "data", "told"),
+    [
+        (Features, msgpack.packb([2, "features", {}]), "expected version 4 of the protocol, got 2"),
+        (Model, msgpack.packb([2, "model", {}]), "expected version 4 of the protocol, got 2"),
+        (Model, b"of another version", "expected model"),
+        (End, b'{"seq": 1, "reason": "\x95"}', "expected end in JSON"),
+    ],
+    ids=["features of an earlier protocol", "a model of an earlier protocol", "no msgpack", "no UTF-8"],
+)
+def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(tmp_path, kind, data, told):
+    with pytest.raises(RecordingError, match=f"holds a message at byte .* cannot read: {told}") as raised:
+        Recording(with_message(tmp_path, kind, data))
     assert "\n" not in str(raised.value)
 
 
@@ -333,18 +341,6 @@ def test_an_existing_file_is_not_overwritten(written):
     ):
         written([], resume=True)
     assert len(read(path)) == 2
-
-
-def test_a_message_that_this_version_cannot_read_is_an_error_of_one_line(tmp_path):
-    path = with_message(tmp_path, Model, b"of another version")
-    with pytest.raises(RecordingError, match=r"holds a message at byte .* cannot read: expected model"):
-        Recording(path)
-
-
-def test_text_that_is_not_utf_8_is_an_error_of_one_line(tmp_path):
-    path = with_message(tmp_path, End, b'{"seq": 1, "reason": "\x95"}')
-    with pytest.raises(RecordingError, match=r"holds a message at byte .* cannot read: expected end in JSON"):
-        Recording(path)
 
 
 def test_a_file_that_is_not_a_recording_is_rejected(tmp_path):
