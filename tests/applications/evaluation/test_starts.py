@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.starts import FIRST, SHIFTS, Start, jittered, one_pass, spatial, temporal
+from catstream.applications.evaluation.starts import (
+    FIRST,
+    SHIFTS,
+    Start,
+    choose_starts,
+    jittered,
+    one_pass,
+    spatial,
+    temporal,
+)
 from catstream.box import Box
 from catstream.errors import CatstreamError
 from catstream.settings import Settings
@@ -57,6 +66,13 @@ def test_every_choice_starts_when_the_object_appears(sequence):
     for starts in (one_pass, temporal(1), spatial, jittered(3)):
         assert {start.frame for start in starts(late)} == {3}
     assert {start.suffix for start in spatial(late)} > {"@3-left", "@3-size-0.8"}
+
+
+def test_each_option_of_the_command_chooses_its_starts(sequence):
+    assert choose_starts()(sequence) == [FIRST]
+    assert choose_starts(2)(sequence) == temporal(2)(sequence)
+    assert choose_starts(boxes=2)(sequence) == jittered(2)(sequence)
+    assert choose_starts(shifts=True)(sequence) == spatial(sequence)
 
 
 def test_the_shifts_are_those_of_the_cvpr2013_benchmark(sequence):
