@@ -193,11 +193,14 @@ def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
     ]
 
 
+DEEP = b'{"name": "a", "streams": {"b": {"name": "b", "source": "0", "settings": {"run.seed": ' + b"[" * 100_000
+
+
 @pytest.mark.parametrize("kind", [FleetSpec, Desired])
 @pytest.mark.parametrize(
     "data",
     [
-        *(b"", b"[]", b"{", b"{}", b"[" * 100_000, b'{"name": "a", "every": 0}'),
+        *(b"", b"[]", b"{", b"{}", DEEP, b'{"spec": ' + DEEP, b'{"name": "a", "every": 0}'),
         *(b'{"name": "a", "streams": {"b": {}}}', b'{"spec": "{}", "origin": "", "pins": {}, "draining": []}'),
     ],
 )
