@@ -291,7 +291,7 @@ def drain(running: Fleet, node: str, undo: bool) -> None:
 @with_fleet
 def logs(running: Fleet, name: str, lines: int) -> None:
     """Print what the stream NAME has logged on its node since it started there."""
-    for line in running.logs(name, lines):
+    for line in running.logs(name, lines) or [f"{name} has logged nothing since it started there"]:
         click.echo(line)
 
 

@@ -217,8 +217,8 @@ class Registry:
             which = f"no fleet {fleet!r} of yours" if fleet else "no fleet of yours"
             listed = f"; there is {', '.join(sorted(known))}" if known else ""
             raise ServiceError(
-                f"{which} is running: start it (catstream fleet up), wait some seconds if a node of it has just died, "
-                f"or give HOST:PORT of one{listed}"
+                f"{which} is running: start it (catstream fleet up), wait if it starts or a node of it has just died, or "
+                f"give HOST:PORT of one{listed}"
             )
         names = ", ".join(sorted(known))
         raise ServiceError(

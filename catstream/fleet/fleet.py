@@ -169,7 +169,7 @@ class Fleet:
         self._node(node)
         count = sum(each.node == node for each in self.status().streams.values())
         self._change(Desired.drained, node, undo=undo)
-        return f"{node} takes streams again" if undo else f"{node} is draining: its {count} streams move to other nodes"
+        return f"{node} takes streams again" if undo else f"{node} is draining; streams that leave it: {count}"
 
     def status(self) -> FleetStatus:
         """The state of all streams and nodes."""
@@ -218,15 +218,14 @@ class Fleet:
         Raises
         ------
         FleetError
-            If it has ended because its head died.
+            If it has ended by itself, for example because its head died.
         """
         if self._local is None or self._local.running:
             return True
         self.is_owner = False
-        if self._local.head_died:
+        if death := self._local.death:
             raise FleetError(
-                f"the head of {self.name}, node-1, has died, and the fleet with it: catstream fleet up continues from "
-                "the last states"
+                f"the fleet {self.name} has died with Ray; catstream fleet up continues from the last states: {death}"
             )
         return False
 

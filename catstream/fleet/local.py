@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,8 @@ from catstream.wire.endpoint import private_folder
 
 __all__ = ["LocalCluster", "main"]
 
-_HEAD_DIED = 3  # exit code
+_ENDED = (0, 1)  # exit codes after SIGTERM: 1 if Ray has handled it
+_DIED = 3  # exit code if the cluster has ended by itself
 _STORE_BYTES = 80 << 20  # of Ray's object store: only models and states that are merged go through it
 
 
@@ -60,9 +62,11 @@ class LocalCluster:
         return False
 
     @property
-    def head_died(self) -> bool:
-        """Whether the cluster that this object has started has ended because its head died."""
-        return self._process is not None and self._process.poll() == _HEAD_DIED
+    def death(self) -> str:
+        """Why the cluster that this object has started has ended by itself, and the log that says more, or ""."""
+        if self._process is None or self._process.poll() in (None, *_ENDED):
+            return ""
+        return self._reason()
 
     @property
     def address(self) -> str:
@@ -129,11 +133,7 @@ class LocalCluster:
         try:
             while not self.address:
                 if process.poll() is not None or time.monotonic() > deadline:
-                    lines = (self.folder / "log").read_text(errors="replace").strip().splitlines()
-                    raise FleetError(
-                        f"Ray does not start on this machine: {lines[-1] if lines else 'it printed nothing'}\n"
-                        f"See {self.folder / 'log'}"
-                    )
+                    raise FleetError(f"Ray does not start on this machine: {self._reason()}")
                 time.sleep(CLUSTER_LOOK_SECONDS)
         except BaseException:
             self.stop()
@@ -151,6 +151,11 @@ class LocalCluster:
         if self._process is not None:
             self._process.communicate()  # closes the pipe
             self._process = None
+
+    def _reason(self) -> str:
+        """The last line that the cluster has printed, and where the others are."""
+        lines = (self.folder / "log").read_text(errors="replace").strip().splitlines()
+        return f"{lines[-1] if lines else 'it printed nothing'}\nSee {self.folder / 'log'}"
 
 
 def main() -> None:
@@ -173,13 +178,16 @@ def main() -> None:
         with private_folder() as work:
             (work / "ray").mkdir()
             os.environ["RAY_TMPDIR"] = str(work)
-            _keep(folder, count, cores, ends)
+            try:
+                _keep(folder, count, cores, ends)
+            except Exception:
+                traceback.print_exc()
     if not ends.is_set():
-        sys.exit(_HEAD_DIED)
+        sys.exit(_DIED)
 
 
 def _set_at_the_end_of_input(ends: threading.Event) -> None:
-    sys.stdin.buffer.read()
+    os.read(sys.stdin.fileno(), 1)  # not through the buffer, whose lock would be held when the process ends
     ends.set()
 
 
@@ -193,15 +201,39 @@ def _keep(folder: Path, count: int, cores: int, ends: threading.Event) -> None:
     try:
         nodes = {number: cluster.add_node(**options(number)) for number in range(2, count + 1)}
         write_atomically(folder / "address", cluster.address.encode(), mode=0o600)
-        while not ends.wait(NODES_SECONDS) and not _has_died(cluster.head_node):
+        while not ends.wait(NODES_SECONDS):
+            if _has_died(cluster.head_node):
+                print("the head, node-1, has died", flush=True)
+                return
             for number, node in nodes.items():
-                if _has_died(node):
+                if node is None or _has_died(node):
                     print(f"node-{number} has died, and is started again", flush=True)
-                    cluster.remove_node(node, allow_graceful=False)
-                    nodes[number] = cluster.add_node(**options(number))
+                    if node is not None:
+                        cluster.remove_node(node, allow_graceful=False)
+                    nodes[number] = _start_again(cluster, options(number))
     finally:  # Ray ends this process on SIGTERM
         (folder / "address").unlink(missing_ok=True)
         cluster.shutdown()
+
+
+def _start_again(cluster: Any, options: dict[str, Any]) -> Any:
+    """Add a node; None if it has not started within the time that Ray gives it, for example on a busy machine."""
+    before = _children()
+    try:
+        return cluster.add_node(**options)
+    except Exception as error:  # Ray has no type for it
+        print(f"{options['node_name']} does not start: {error}", flush=True)
+        for pid in _children() - before:  # else it might start later, beside the next one of its name
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        return None
+
+
+def _children() -> set[int]:
+    """The processes that this thread has started; none, if the kernel does not list them."""
+    with suppress(FileNotFoundError):
+        return set(map(int, Path("/proc/thread-self/children").read_text().split()))
+    return set()
 
 
 def _has_died(node: Any) -> bool:

@@ -156,7 +156,7 @@ def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     fleet, _ = site
     until(lambda: fleet.status().streams["gate"].state == "running")
     node = fleet.status().streams["gate"].node
-    assert fleet.drain(node).startswith(f"{node} is draining: its ")
+    assert fleet.drain(node).startswith(f"{node} is draining; ")
     until(lambda: (found := fleet.status().streams["gate"]).node not in ("", node) and found.state == "running")
     assert fleet.drain(node, undo=True) == f"{node} takes streams again"
 
