@@ -217,7 +217,7 @@ class Registry:
             which = f"no fleet {fleet!r} of yours" if fleet else "no fleet of yours"
             listed = f"; there is {', '.join(sorted(known))}" if known else ""
             raise ServiceError(
-                f"{which} is running: start it (catstream fleet up), wait if it starts or a node of it has just died, or "
+                f"{which} is running: start it (catstream fleet up), wait if it starts or if a node has just died, or "
                 f"give HOST:PORT of one{listed}"
             )
         names = ", ".join(sorted(known))
