@@ -67,6 +67,7 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 _End = Literal["", "ended", "moved", "stopped"]
 
 _log = logging.getLogger(__name__)
+_log.setLevel(logging.INFO)  # `catstream fleet logs` shows when a stream was claimed, and when it tracked again
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +249,8 @@ class Stream:
         self._store = Store(self._url)
         claim = self._store.claim(self._spec.name, f"{self._place.node} process {os.getpid()}")
         self._store_trouble = ""
+        where = f"after frame {claim.state.facts['frame']}" if claim.state is not None else "from the start"
+        _log.info("%s: claimed with token %d, %s", self._spec.name, claim.token, where)
         shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
         self._seq = 0
         facts: Metadata = claim.state.facts if claim.state is not None else {}
@@ -276,6 +279,7 @@ class Stream:
                     lost_seconds=float(facts.get("lost_seconds", 0.0)),
                 )
             self._change_objects(pipeline, facts)
+            _log.info("%s: its processes have started", self._spec.name)
             over = threading.Event()
             storing = threading.Thread(target=self._keep_storing, args=(claim, pipeline, over), name="store")
             storing.daemon = True  # a store that hangs must not keep the process
@@ -384,6 +388,7 @@ class Stream:
             if tracks:
                 if not self._seq:  # the seconds of the start do not count
                     self._rates = _Rates(skipped=skipped)
+                    _log.info("%s: the first frame is tracked", self._spec.name)
                 self._rates.frames += 1
                 newest = next(iter(tracks.values()))
                 models = {name: track.model_version for name, track in tracks.items()}
@@ -445,7 +450,7 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         moment = time.strftime("%H:%M:%S", time.localtime(record.created))
-        self._lines.append(f"{moment} {record.levelname.lower()} {record.getMessage()}")
+        self._lines.append(f"{moment}.{int(record.msecs):03d} {record.levelname.lower()} {record.getMessage()}")
 
 
 def _processor_seconds(pids: list[int]) -> float:

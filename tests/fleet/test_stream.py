@@ -68,6 +68,9 @@ def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
         until(lambda: second.report().status.state == "ended")
     after = second.report().status
     assert 10 <= before < FRAMES
+    claimed, *_, tracked = [line.partition(" info ")[2] for line in second.logs(100) if " info " in line]
+    assert claimed == f"cam-7: claimed with token {after.token}, after frame {before - 1}"
+    assert tracked == "cam-7: the first frame is tracked"
     assert after.token > first.report().status.token
     assert Store(store).newest("cam-7").facts["seq"] == FRAMES
 
