@@ -212,15 +212,15 @@ class StartServer:
         self._program, self._imports = os.getpid(), _imports()
         self._processes: WeakSet[StartedProcess] = WeakSet()
         self._process: subprocess.Popen[bytes] | None = None
+        if shared_with is not None:
+            self._requests = _connected(shared_with)
+            self.pid = _other_end(self._requests)[0]
         self.log = ProcessLog("start server", cast(BinaryIO, tempfile.TemporaryFile()))  # noqa: SIM115
         if shared_with is None:
             self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
                 self._process = _start(theirs, self._program, self.log.fileno())
             self.pid = self._process.pid
-        else:
-            self._requests = _connected(shared_with)
-            self.pid = _other_end(self._requests)[0]
 
     @property
     def is_owned(self) -> bool:

@@ -37,10 +37,10 @@ def test_it_is_iterated_without_with_and_leaves_no_process(pipeline):
 def test_a_detector_that_has_ended_with_the_stream_is_no_failure(pipeline, monkeypatch, until):
     check = Supervisor.check_children
 
-    def check_late(supervisor):
+    def check_late(supervisor, **facts):
         if pipeline.totals:  # the end was received: the detector may end before it is looked at
             until(lambda: supervisor.finished)
-        check(supervisor)
+        check(supervisor, **facts)
 
     monkeypatch.setattr(Supervisor, "check_children", check_late)
     monkeypatch.setattr(run_reader, "TURN_SECONDS", 0)

@@ -345,7 +345,7 @@ def test_an_existing_file_is_not_overwritten(written):
 
 def test_a_file_that_is_not_a_recording_is_rejected(tmp_path):
     (tmp_path / "video.mp4").write_bytes(b"something else entirely")
-    with pytest.raises(RecordingError, match="is no recording"):
+    with pytest.raises(RecordingError, match="is not a recording"):
         Recording(tmp_path / "video.mp4")
     with pytest.raises(RecordingError, match="No such file"):
         Recording(tmp_path / "none.rec")
