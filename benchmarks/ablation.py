@@ -32,7 +32,6 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "mirrored copies": {"teaching.mirrored": 0},
     "other backgrounds behind the first copies": {"teaching.other_backgrounds": 0.0},
     "histogram of colours": {"teaching.colours": False},
-    "window shifted to the centroid of the colours": {"extent.colour_slack": 1.0},
     "search over scales": {"extent.size_count": 1},
     "extent tree": {"extent.weight": 0.0},
     "another aspect than the first": {"extent.aspect_count": 1},

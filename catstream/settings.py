@@ -290,15 +290,6 @@ class ExtentSettings(_Group):
             ge=0,
         ),
     ] = 1.0
-    colour_slack: Annotated[
-        float,
-        _about(
-            "How far the centroid of the object's colours may lie beyond its first place and the middle of the window, "
-            "in windows; farther, the box is moved after it (1: never).",
-            ge=0,
-            le=1,
-        ),
-    ] = 0.14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -503,7 +494,6 @@ _PAPER: dict[str, Value] = {
     "extent.weight": 0.0,
     "extent.prior": 0.0,
     "teaching.colours": False,
-    "extent.colour_slack": 1.0,
     "teaching.other_backgrounds": 0.0,
     "teaching.mirrored": 0,
     "belief.trusted_score": 0.0,

@@ -33,7 +33,6 @@ class Policy:
 
     report           the object counts as present
     resize           size and aspect ratio change
-    recentre         the centroid of the colours is updated, and the window shifted to it
     remember         the window becomes the `confident_window` of the state: searches of the whole frame use its size
     teach            training rows are cut from the frame, and now and then hard negatives from all of it
     search_interval  frames from one search of the whole frame to the next, 0 for none; looked up by the level of the
@@ -42,7 +41,6 @@ class Policy:
 
     report: bool
     resize: bool
-    recentre: bool
     remember: bool
     teach: bool
     search_interval: int
@@ -57,11 +55,11 @@ def policies(interval: int) -> Mapping[Level, Policy]:
     """
     no, yes = False, True
     return MappingProxyType(
-        {  #                    report resize recentre remember teach search_interval
-            "lost": Policy(no, no, no, no, no, 1),
-            "redetected": Policy(yes, yes, no, yes, no, interval),
-            "weak": Policy(yes, no, no, no, no, interval),
-            "confident": Policy(yes, yes, yes, yes, yes, 0),
+        {  #                    report resize remember teach search_interval
+            "lost": Policy(no, no, no, no, 1),
+            "redetected": Policy(yes, yes, yes, no, interval),
+            "weak": Policy(yes, no, no, no, interval),
+            "confident": Policy(yes, yes, yes, yes, 0),
         }
     )
 

@@ -129,7 +129,7 @@ class Detector:
         """Take the detection of `look`, or another one of the same frame, and cut the training rows."""
         state, model, settings = self._known(), self.model, self.settings
         followed = self._scm is not None  # by the paper's first tracker
-        state = replaced(state, found) if followed else settled(state, found, frame.size, model, settings)
+        state = replaced(state, found) if followed else settled(state, found, frame.size, settings)
         self.state = state
         return self._result(seq, time, found.score, taught(state, found, frame, seq, model, self.likeness, settings))
 
@@ -151,7 +151,6 @@ class Detector:
                 window=window,
                 confident_window=window,
                 first_window=state.first_window or window,
-                colour_centroid=None,  # this box determines again where in it the colours are
             )
         )
         score = float(ScoreMap.around(frame, window, WINDOW, self.model).scores[0, 0])

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from catstream.detection import belief, colour_centroid, extent, motion, search, teacher
+from catstream.detection import belief, extent, motion, search, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
-from catstream.features.layout import COLOURS
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Model, State, Track
 from catstream.settings import Settings
@@ -38,9 +37,7 @@ def looked(
     return search.searched(frame, motion.expected(state), seq, model, likeness, settings)
 
 
-def settled(
-    state: DetectorState, found: Detection, size: tuple[int, int], model: Model, settings: Settings
-) -> DetectorState:
+def settled(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
     """The state after a detection: its belief in it, and the window moved as far as the belief allows.
 
     Parameters
@@ -49,7 +46,7 @@ def settled(
     """
     state = belief.updated(state, found.score, found.redetected, settings.belief)
     if _policy(state, settings).report:
-        state = motion.observed(_followed(state, found, size, model, settings))
+        state = motion.observed(_followed(state, found, size, settings))
     return state
 
 
@@ -78,18 +75,11 @@ def taught(
     return teacher.training_of(frame, state.window, found.around, seq, model, settings)
 
 
-def _followed(
-    state: DetectorState, found: Detection, size: tuple[int, int], model: Model, settings: Settings
-) -> DetectorState:
+def _followed(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
     """The state with the window moved to a detection, as far as the belief in it allows."""
-    policy, colours = _policy(state, settings), state.colour_centroid
-    window = extent.followed(state.window, found.window, policy.resize)
-    if found.around is not None and policy.recentre:
-        slack, weights = settings.extent.colour_slack, model.weights[COLOURS]
-        colours, window = colour_centroid.recentred(colours, window, found.around, weights, slack)
-    window = window.with_centre_in(*size)
-    confident = window if policy.remember else state.confident_window
-    return replace(state, window=window, confident_window=confident, colour_centroid=colours)
+    policy = _policy(state, settings)
+    window = extent.followed(state.window, found.window, policy.resize).with_centre_in(*size)
+    return replace(state, window=window, confident_window=window if policy.remember else state.confident_window)
 
 
 def track_of(

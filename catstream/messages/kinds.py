@@ -111,8 +111,6 @@ class DetectorState:
     sightings         frames in a row in which the object of a saved model was seen in one place
     motion            of the Kalman filter of the centre, None before a model had any
     centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
-    colour_centroid   where in the window the object's colours are: frames taken in, contrast, x and y at first, x and y
-                      now; None before the first of these frames
     """
 
     first_frame: int
@@ -124,7 +122,6 @@ class DetectorState:
     sightings: int = 0
     motion: Motion | None = None
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
-    colour_centroid: Annotated[np.ndarray, Array("float64", (6,))] | None = None
 
     @property
     def is_sought(self) -> bool:

@@ -221,7 +221,7 @@ def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, 
     motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
     detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, 2)
     if moving:
-        detector = dataclasses.replace(detector, motion=motion, centre=centre, colour_centroid=rng.random(6))
+        detector = dataclasses.replace(detector, motion=motion, centre=centre)
     forest = Forest(settings)
     forest.take(changed(next(messages), detector=detector))
     forest.save(tmp_path / "state")

@@ -14,7 +14,7 @@ from catstream.settings import Settings
 SETTINGS = Settings()
 BELIEF, TABLE = SETTINGS.belief, belief.policies(SETTINGS.search.whole_interval)
 WINDOW = Window(60.0, 50.0, 48.0, 40.0)
-ACTIONS = ("report", "resize", "recentre", "remember", "teach")
+ACTIONS = ("report", "resize", "remember", "teach")
 SCORES = st.floats(-1, 2, width=32)
 LEVELS = st.sampled_from(["lost", "redetected", "weak", "confident"])
 

@@ -358,9 +358,3 @@ def test_tracking_continues_from_a_corrected_box_which_is_learned_from(scene):
     assert len(features.training[APPEARANCE])
     assert not features.begins
     assert detector.step(scene((92, 60)))[0].box.overlap(Box(92, 60, 48, 40)) > 0.7
-
-
-def test_a_corrected_box_resets_the_colour_centroid(scene):
-    detector = started(scene)
-    assert detector.step(scene((62, 50)))[1].detector.colour_centroid[0] == 1
-    assert detector.move(scene((90, 60)), Box(90, 60, 48, 40))[1].detector.colour_centroid is None
