@@ -32,8 +32,8 @@ class Policy:
     """The behaviour of the detector at a level of belief.
 
     report           the object counts as present
-    resize           size and aspect ratio change
-    remember         the window becomes the `confident_window` of the state: searches of the whole frame use its size
+    resize           size and aspect ratio change, and the window becomes the `confident_window` of the state, whose
+                     size searches of the whole frame use
     teach            training rows are cut from the frame, and now and then hard negatives from all of it
     search_interval  frames from one search of the whole frame to the next, 0 for none; looked up by the level of the
                      local score of this frame (`level_of`), without hysteresis, because the search precedes `updated`
@@ -41,7 +41,6 @@ class Policy:
 
     report: bool
     resize: bool
-    remember: bool
     teach: bool
     search_interval: int
 
@@ -55,11 +54,11 @@ def policies(interval: int) -> Mapping[Level, Policy]:
     """
     no, yes = False, True
     return MappingProxyType(
-        {  #                    report resize remember teach search_interval
-            "lost": Policy(no, no, no, no, 1),
-            "redetected": Policy(yes, yes, yes, no, interval),
-            "weak": Policy(yes, no, no, no, interval),
-            "confident": Policy(yes, yes, yes, yes, 0),
+        {  #                    report resize teach search_interval
+            "lost": Policy(no, no, no, 1),
+            "redetected": Policy(yes, yes, no, interval),
+            "weak": Policy(yes, no, no, interval),
+            "confident": Policy(yes, yes, yes, 0),
         }
     )
 

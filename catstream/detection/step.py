@@ -77,9 +77,9 @@ def taught(
 
 def _followed(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
     """The state with the window moved to a detection, as far as the belief in it allows."""
-    policy = _policy(state, settings)
-    window = extent.followed(state.window, found.window, policy.resize).with_centre_in(*size)
-    return replace(state, window=window, confident_window=window if policy.remember else state.confident_window)
+    resize = _policy(state, settings).resize
+    window = extent.followed(state.window, found.window, resize).with_centre_in(*size)
+    return replace(state, window=window, confident_window=window if resize else state.confident_window)
 
 
 def track_of(

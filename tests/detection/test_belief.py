@@ -14,7 +14,7 @@ from catstream.settings import Settings
 SETTINGS = Settings()
 BELIEF, TABLE = SETTINGS.belief, belief.policies(SETTINGS.search.whole_interval)
 WINDOW = Window(60.0, 50.0, 48.0, 40.0)
-ACTIONS = ("report", "resize", "remember", "teach")
+ACTIONS = ("report", "resize", "teach")
 SCORES = st.floats(-1, 2, width=32)
 LEVELS = st.sampled_from(["lost", "redetected", "weak", "confident"])
 
@@ -52,7 +52,7 @@ def test_trust_allows_to_train_and_searches_no_more_often(score):
 
 
 def test_a_redetected_object_is_reported_and_trains_nothing():
-    assert done("redetected") == {"report", "resize", "remember"}
+    assert done("redetected") == {"report", "resize"}
 
 
 def test_a_lost_object_is_not_reported_changes_nothing_and_is_searched_for_in_each_frame():

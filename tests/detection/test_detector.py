@@ -153,7 +153,7 @@ def test_another_detector_continues_bit_for_bit_from_the_state_after_a_frame(sce
 def stepped(state, frame, seq, model, settings):
     """State, detection and training rows of the next frame."""
     state, found = looked(state, frame, seq, model, None, settings)
-    state = settled(state, found, frame.size, model, settings)
+    state = settled(state, found, frame.size, settings)
     return state, found, taught(state, found, frame, seq, model, None, settings)
 
 
