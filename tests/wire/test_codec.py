@@ -72,7 +72,7 @@ def summary(columns: int) -> Summary:
 
 MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
 WINDOWS = Window(4.0, 2.0, 25.0, 12.5), Window(4.5, 2.0, 25.0, 12.5), Window(9.0, 2.0, 25.0, 12.5)
-DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 2, MOTION, array(5, 4, dtype="<f8"), array(6, dtype="<f8"))
+DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 2, MOTION, array(5, 4, dtype="<f8"))
 TRAINING = TrainingRows(array(3, 5), array(3), array(3), array(3, 2))
 TREES = {
     "object": summary(5),
