@@ -60,6 +60,8 @@ await withBrowser(executablePath, profile, async (browser) => {
   console.log("kill");
   await is("silent");
   console.log("state", await state.innerText());
+  await is("ended");
+  console.log("state", await state.innerText());
   for await (const line of createInterface({ input: process.stdin })) if (line === "restart") break;
   await is("present");
   console.log("state", await state.innerText());

@@ -86,11 +86,12 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
             until(lambda: said("kill"))
             for pid in pipeline.pids.values():
                 os.kill(pid, signal.SIGKILL)
-        until(lambda: said("state pipeline silent"))
+            until(lambda: said("state pipeline silent"))
+        until(lambda: said("state ended"))
         with Pipeline(str(path), boxes[0], settings) as pipeline:
             browser.stdin.write("restart\n")
             browser.stdin.flush()
-            seen = lines.index("state pipeline silent") + 1
+            seen = lines.index("state ended") + 1
             for number, track in enumerate(pipeline):
                 if track.state == "present" and number > 5:
                     until(lambda: "state present" in lines[seen:] and said("errors []"))
