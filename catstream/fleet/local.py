@@ -180,7 +180,7 @@ def main() -> None:
             os.environ["RAY_TMPDIR"] = str(work)
             try:
                 _keep(folder, count, cores, ends)
-            except Exception:
+            except Exception:  # said in the log, whose last line `up` repeats; the exit code is that of a death
                 traceback.print_exc()
     if not ends.is_set():
         sys.exit(_DIED)

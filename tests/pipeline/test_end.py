@@ -66,9 +66,10 @@ def test_no_process_is_started_again_because_the_owner_is_slow(video, tmp_path, 
 
 def test_tracks_that_have_arrived_are_returned_although_a_signal_has_ended_the_detector(video, until):
     """It does not wait for its owner any longer."""
-    with Pipeline(video[0], video[1][0]) as pipeline:
+    with Pipeline(video[0], video[1][0]) as pipeline, subscribe(pipeline.endpoint, "tracks") as published:
         tracks, detector = list(islice(pipeline, 1)), pipeline.pids["detector"]
-        time.sleep(2)  # until all of them are on their way
+        while next(published).frame < len(video[1]) - 1:
+            pass  # all of them are then on their way
         os.kill(detector, signal.SIGTERM)
         until(lambda: "detector" not in pipeline.pids)
         tracks.extend(pipeline)

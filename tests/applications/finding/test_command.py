@@ -32,8 +32,8 @@ def rows(folder, name):
 
 
 def test_the_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
-    code, told = run(video)
-    assert code == 0, told
+    code, output = run(video)
+    assert code == 0, output
     folder = tmp_path / "found"
     sightings, intervals = rows(folder, "sightings.csv"), rows(folder, "intervals.csv")
     (file,) = json.loads((folder / "found.json").read_text())["files"]
@@ -54,9 +54,9 @@ def test_a_command_that_was_interrupted_keeps_its_results_and_continues(run, vid
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(SearchLog, "step", interrupted)
-    code, told = run(video)
+    code, output = run(video)
     assert code == 130
-    assert "the same command continues" in told
+    assert "the same command continues" in output
     early = rows(tmp_path / "found", "sightings.csv")
     assert early
     assert "searched in part" in (tmp_path / "found" / "report.html").read_text()
@@ -74,14 +74,14 @@ def test_a_damaged_file_is_reported_and_the_others_are_searched(run, video, tmp_
     (tmp_path / "a.mp4").write_bytes(b"no video")
     shutil.copy(video, tmp_path / "b.mp4")
     for _ in range(2):
-        code, told = run(tmp_path / "a.mp4", tmp_path / "b.mp4")
-        assert (code, "1 problem" in told) == (1, True)
-        assert "a.mp4' is not a video" in told
+        code, output = run(tmp_path / "a.mp4", tmp_path / "b.mp4")
+        assert (code, "1 problem" in output) == (1, True)
+        assert "a.mp4' is not a video" in output
     assert {row["file"] for row in rows(tmp_path / "found", "sightings.csv")} == {str(tmp_path / "b.mp4")}
     assert "is not a video" in (tmp_path / "found" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("sizes", ["2,1", "0,1", "1", "a,b", "1,nan"])
 def test_sizes_are_two_positive_numbers_in_order(run, video, sizes):
-    code, told = run(video, "--sizes", sizes)
-    assert (code, "the smaller one first" in told) == (2, True)
+    code, output = run(video, "--sizes", sizes)
+    assert (code, "the smaller one first" in output) == (2, True)
