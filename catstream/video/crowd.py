@@ -123,7 +123,7 @@ class _Scene:
             seen = sprite.paint(image, turn, free)
             free *= 1 - cv2.warpAffine(sprite.mask, turn, SIZE)
             boxes[name] = sprite.box(turn) if seen >= VISIBLE else None
-        return self.lake.with_noise(image), dict(reversed(boxes.items()))
+        return self.lake.with_noise(image, frame), dict(reversed(boxes.items()))
 
 
 def _sprite(number: int, lake: np.ndarray, dahlia: Sprite) -> Sprite:

@@ -20,7 +20,7 @@ from catstream.messages.names import UNNAMED
 from catstream.video.sprite import SIZE, VISIBLE, Lake, cut_out_dahlia, load_photograph, resized
 from catstream.video.writer import VideoWriter
 
-__all__ = ["FRAMES", "RATE", "SIZE", "render", "write"]
+__all__ = ["FRAMES", "RATE", "SIZE", "Demo", "render", "write"]
 
 #: Number of different frames, and frames per second.
 FRAMES, RATE = 600, 30.0
@@ -81,28 +81,8 @@ _PAGODA = np.array(
 def render(
     frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0, *, begin: int = 0
 ) -> Iterator[tuple[np.ndarray, Box | None]]:
-    """Yield the images of the demo in order, each with the box of the dahlia.
-
-    After `FRAMES` images the sequence runs backwards, then forwards again, so that a video of any length has no jump.
-
-    Parameters
-    ----------
-    frames : number of images
-    size : (width, height) of the images; if it is not 4:3, the images are stretched
-    seed : seed of the sensor noise
-    begin : number of the first image
-
-    Yields
-    ------
-    image : uint8 (height, width, 3), blue green red
-    box : box of the whole dahlia, including parts that are occluded or outside the image; None if less than a tenth of
-        it is visible
-    """
-    scene = _Scene(seed)
-    for number in range(begin, begin + frames):
-        image, box = scene.render(FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1)))
-        image, boxes = resized(image, {UNNAMED: box}, size)
-        yield image, boxes[UNNAMED]
+    """Yield the first images of a `Demo` in order, each with the box of the dahlia; the parameters are those of it."""
+    yield from map(Demo(size, seed, begin=begin).image, range(frames))
 
 
 def write(
@@ -139,10 +119,20 @@ def write(
     return path, truth
 
 
-class _Scene:
-    """Renders single frames from the two photographs; colours are float32, 0 to 255."""
+class Demo:
+    """Renders single images from the two photographs.
 
-    def __init__(self, seed: int) -> None:
+    After `FRAMES` images the sequence runs backwards, then forwards again, so that a video of any length has no jump.
+
+    Parameters
+    ----------
+    size : (width, height) of the images; if it is not 4:3, the images are stretched
+    seed : seed of the sensor noise
+    begin : number in the sequence of image 0
+    """
+
+    def __init__(self, size: tuple[int, int] = SIZE, seed: int = 0, *, begin: int = 0) -> None:
+        self.size, self.begin = size, begin
         self.lake = Lake(_ZOOM, np.random.default_rng(seed))
         shape = self.lake.picture.shape[:2]
         pagoda = cv2.fillPoly(np.zeros(shape, np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
@@ -151,8 +141,16 @@ class _Scene:
         self.decoy = replace(self.dahlia, colours=self.dahlia.colours[..., [2, 0, 1]] * np.float32(0.9))
         self.flight, self.away, self.camera = (_interpolate(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
 
-    def render(self, frame: int) -> tuple[np.ndarray, Box | None]:
-        """Return the image of one frame in full size, and the box."""
+    def image(self, number: int) -> tuple[np.ndarray, Box | None]:
+        """Return an image, and the box of the dahlia.
+
+        Returns
+        -------
+        image : uint8 (height, width, 3), blue green red
+        box : box of the whole dahlia, including parts that are occluded or outside the image; None if less than a tenth
+            of it is visible
+        """
+        frame = FRAMES - 1 - abs((self.begin + number) % (2 * FRAMES - 2) - (FRAMES - 1))
         left, top, light = self.camera[frame]
         sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # camera shake
         view = np.array([[1, 0, -left - sway[0]], [0, 1, -top - sway[1]]])  # lake -> picture
@@ -162,7 +160,8 @@ class _Scene:
         turn = self.dahlia.turned(self.flight[frame], view)
         seen = self.dahlia.paint(image, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
         box = self.dahlia.box(turn) if seen >= VISIBLE else None
-        return self.lake.with_noise(image * np.float32(light)), box
+        shown, boxes = resized(self.lake.with_noise(image * np.float32(light), number), {UNNAMED: box}, self.size)
+        return shown, boxes[UNNAMED]
 
 
 def _interpolate(keys: np.ndarray) -> np.ndarray:

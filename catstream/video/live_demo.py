@@ -18,6 +18,7 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from time import monotonic
 from urllib.parse import parse_qsl
 
@@ -49,6 +50,11 @@ class _Parameters:
     size: tuple[int, int] = _SIZE
     rate: float = RATE
 
+    @property
+    def begin(self) -> int:
+        """Number of the first image in the demo video."""
+        return _BEGINS[self.seed % len(_BEGINS)]
+
     @classmethod
     def parse(cls, text: str) -> _Parameters:
         seed, _, query = text.removeprefix(PREFIX).partition("?")
@@ -73,7 +79,7 @@ def first_box(text: str) -> Box:
     Box(x=184.0, y=88.0, w=57.0, h=58.0)
     """
     chosen = _Parameters.parse(text)
-    first = demo.render(1, chosen.size, begin=_BEGINS[chosen.seed % len(_BEGINS)])  # in which the object is visible
+    first = demo.render(1, chosen.size, begin=chosen.begin)  # in which the object is visible
     (box,) = (box for _, box in first if box is not None)
     return Box(*(float(round(value)) for value in box))
 
@@ -99,9 +105,8 @@ class LiveDemo(Source):
         chosen = _Parameters.parse(text)
         super().__init__(f"demo-{chosen.seed}", chosen.rate, chosen.size)
         self.skipped = 0
-        begin = _BEGINS[chosen.seed % len(_BEGINS)]
-        self._rendered = demo.render(_IMAGES, chosen.size, chosen.seed, begin=begin)
-        self._images: list[np.ndarray] = []
+        self._chosen = chosen
+        self._images: dict[int, np.ndarray] = {}  # that were rendered, by number
         self._first = self._number = start
         self._zero, self._idle = since, idle
         self._opened: float | None = None  # time at which the first frame was read
@@ -142,10 +147,15 @@ class LiveDemo(Source):
         self._last, self._number = newest, self._number + 1
         return frame
 
+    @cached_property
+    def _demo(self) -> demo.Demo:
+        """Made for the first image: a source may be opened without being read."""
+        return demo.Demo(self._chosen.size, self._chosen.seed, begin=self._chosen.begin)
+
     def _image(self, number: int) -> np.ndarray:
         """An image of the endless video: forwards, then backwards, and so on."""
         last = _IMAGES - 1
         shown = last - abs(number % (2 * last) - last)
-        while len(self._images) <= shown:
-            self._images.append(next(self._rendered)[0])
+        if shown not in self._images:
+            self._images[shown] = self._demo.image(shown)[0]
         return self._images[shown]

@@ -25,6 +25,7 @@ VISIBLE = 0.1
 
 _DAHLIA = (308, 221)  # centre of the dahlia in its photograph, in pixels
 _NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
+_NOISES = 4096  # different images of noise, one after the other
 
 
 def load_photograph(name: str) -> np.ndarray:
@@ -109,16 +110,16 @@ class Lake:
     def __init__(self, zoom: float, rng: np.random.Generator) -> None:
         photograph = load_photograph("china")
         self.picture = cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC).clip(0, 255)
-        self._rng = rng
         self._noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
+        self._corners = rng.integers(SIZE[::-1], size=(_NOISES, 2))
 
     def seen(self, view: np.ndarray) -> np.ndarray:
         """Return the part of it that the camera sees, float32 (h, w, 3), 0 to 255; `view` maps it to the image."""
         return cv2.warpAffine(self.picture, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
 
-    def with_noise(self, image: np.ndarray) -> np.ndarray:
-        """Return an image with noise, uint8."""
-        y, x = self._rng.integers(SIZE[1]), self._rng.integers(SIZE[0])
+    def with_noise(self, image: np.ndarray, number: int) -> np.ndarray:
+        """Return an image with the noise of a number, uint8."""
+        y, x = self._corners[number % _NOISES]
         return (image + self._noise[y : y + SIZE[1], x : x + SIZE[0]]).clip(0, 255).astype(np.uint8)
 
 

@@ -61,6 +61,7 @@ def test_a_later_start_continues_with_the_image_of_that_number(clock):
     with open_source(SMALL) as whole, open_source(SMALL, start=3, since=90.0) as later:
         frame = next(later)
         assert (frame.number, frame.time) == (3, 10.0)
+        assert list(later._images) == [3], "the images before it are not rendered"
         next(whole)
         assert np.array_equal(frame.image, read(whole, clock, 0.121).image)
 
