@@ -352,12 +352,14 @@ class Stream:
         """Begin the objects that the spec has now and had not when the state was made, and forget the others."""
         before = set(facts["objects"]) if facts else set(self._spec.boxes)
         now = self._spec.boxes.keys() | self._spec.models.keys()
-        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
-            for name in sorted(self._spec.boxes.keys() - before):
-                controlled.set_box(self._spec.boxes[name], name)
-            for name in sorted(before - now):
-                with suppress(CommandRejectedError):  # it was forgotten already
-                    controlled.forget(name)
+        begin, forget = sorted(self._spec.boxes.keys() - before), sorted(before - now)
+        if begin or forget:  # a peer that connects for nothing counts as rejected
+            with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
+                for name in begin:
+                    controlled.set_box(self._spec.boxes[name], name)
+                for name in forget:
+                    with suppress(CommandRejectedError):  # it was forgotten already
+                        controlled.forget(name)
         for name in sorted(self._spec.models.keys() - before):
             if (model := self._store.get_model(given_model(self._spec.name, name))) is None:
                 raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
