@@ -85,7 +85,8 @@ def next_box(state: State) -> tuple[State, list[Action]] | None:
         except ObjectError as error:
             return replace(state, boxes=boxes), concluded(state, [_answer(state, command, False, str(error))])
         order = SetBox(name, command.box, _is_kept(state, name, command))
-        return replace(state, phase=Phase.BOX, boxes=boxes, box=with_fields(command, object=name)), [order]
+        command = with_fields(command, object=name, keep=order.keep)
+        return replace(state, phase=Phase.BOX, boxes=boxes, box=command), [order]
     return None
 
 
@@ -95,7 +96,7 @@ def begun(state: State, command: Command, known: Known | None, error: str) -> tu
         return state, [_answer(state, command, False, error)]
     name = command.object
     at, of_name = f"at {command.box} in frame {state.seq}", f" {name}" if name else ""
-    if _is_kept(state, name, command):
+    if command.keep:
         effect = f"the same object{of_name} continues {at}"
     else:
         effect = f"{'another' if name in state.desired.objects else 'the'} object{of_name} begins {at}"
