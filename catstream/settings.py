@@ -424,8 +424,7 @@ class Settings:
             _check_name(name)
             group, _, short = name.partition(".")
             groups.setdefault(group, {})[short] = _read_text(name, value) if isinstance(value, str) else value
-        made: dict[str, Any] = {group: _groups()[group](**named) for group, named in groups.items()}
-        return cls(**made)
+        return cls(**groups)
 
     def for_length(self, frames: int | None) -> Settings:
         """These settings for a video of so many frames: `coreset.share` becomes a `coreset.size`.

@@ -85,22 +85,24 @@ def next_box(state: State) -> tuple[State, list[Action]] | None:
         except ObjectError as error:
             return replace(state, boxes=boxes), concluded(state, [_answer(state, command, False, str(error))])
         order = SetBox(name, command.box, _is_kept(state, name, command))
-        return replace(state, phase=Phase.BOX, boxes=boxes, box=command, named=name), [order]
+        command = with_fields(command, object=name, keep=order.keep)
+        return replace(state, phase=Phase.BOX, boxes=boxes, box=command), [order]
     return None
 
 
-def begun(state: State, command: Command, name: str, known: Known | None, error: str) -> tuple[State, list[Answer]]:
+def begun(state: State, command: Command, known: Known | None, error: str) -> tuple[State, list[Answer]]:
     """The state and the answer after `SetBox` was carried out; `known` is the detector, None if the box was refused."""
     if known is None or command.box is None:
         return state, [_answer(state, command, False, error)]
+    name = command.object
     at, of_name = f"at {command.box} in frame {state.seq}", f" {name}" if name else ""
-    if _is_kept(state, name, command):
+    if command.keep:
         effect = f"the same object{of_name} continues {at}"
     else:
         effect = f"{'another' if name in state.desired.objects else 'the'} object{of_name} begins {at}"
         state = replace(state, desired=state.desired.begun(name, DesiredObject(command.box, state.seq + 1)))
     state = replace(state, given=(*state.given, name), known=state.known | {name: known})
-    return state, [_answer(state, command, True, effect, name, state.seq)]
+    return state, [_answer(state, command, True, effect, frame=state.seq)]
 
 
 def _is_kept(state: State, name: str, command: Command) -> bool:

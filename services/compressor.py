@@ -70,7 +70,7 @@ class CompressorLoop:
             self._checkpoints = CheckpointStore(stack.enter_context(locked(job.state / TREES, LOCK_SECONDS)))
         self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
         position = self._forest.position
-        self._stored = StoredPart(position, position.seq, time.monotonic())
+        self._stored = StoredPart(position, time.monotonic())
         self._recorder = None
         if job.record is not None:
             writer = stack.enter_context(RecordingWriter(job.record, process.run, resume=True))

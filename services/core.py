@@ -206,8 +206,8 @@ class Begun(_Event, frozen=True):
         """Answer the command."""
         if (command := state.box) is None:
             return state, []
-        name, state = state.named, replace(state, phase=Phase.READY, box=None, named="")
-        state, answers = commands.begun(state, command, name, self.known, self.error)
+        state = replace(state, phase=Phase.READY, box=None)
+        state, answers = commands.begun(state, command, self.known, self.error)
         return state, commands.concluded(state, answers)
 
 

@@ -121,7 +121,7 @@ class State(msgspec.Struct, frozen=True):
     known     the detectors, by the names of their objects
     given     the objects whose boxes commands have set in the present frame
     boxes     commands that wait for a frame
-    box       the one of them that is carried out, for the object `named`
+    box       the one of them that is carried out, with the name of its object, and `keep` only if that can be kept
     waiting   commands that wait until all frames of an earlier detector are repeated
     progress  of the receivers
     arrived   version of the newest model of each object, before the positions agree
@@ -142,7 +142,6 @@ class State(msgspec.Struct, frozen=True):
     given: tuple[str, ...] = ()
     boxes: tuple[Command, ...] = ()
     box: Command | None = None
-    named: str = ""
     waiting: tuple[Request, ...] = ()
     progress: Progress = Progress()
     arrived: dict[str, int] = {}

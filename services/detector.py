@@ -88,8 +88,8 @@ def main(process: Process) -> None:
                     break
         except VideoError as error:
             reason, failed = str(error), True
-        loop.end(reason, failed)
         process.source_failed = failed
+        loop.end(reason)
         if failed:
             _log.error("%s", reason)
 
@@ -227,10 +227,9 @@ class DetectorLoop:
         self.tell(core.Frame(frame.number, self._source is not None and self._source.live))
         self.wait()
 
-    def end(self, reason: str, failed: bool) -> None:
+    def end(self, reason: str) -> None:
         """Send the end of the stream, and wait until it is stored; with a time-out if the process was asked to end."""
-        self._failed = failed
-        self.tell(core.Ended(reason, failed))
+        self.tell(core.Ended(reason, self._process.source_failed))
         while self.state.phase is not Phase.ENDED:
             self.turn()
 
@@ -357,7 +356,8 @@ class DetectorLoop:
     def _send(self, order: actions.Send) -> Event | None:
         results, features = self._outputs.results, self._outputs.features
         if order.channel == "features":
-            features.send(End(order.seq, self.state.ending, self._failed) if order.end else self._features)
+            failed = self._process.source_failed
+            features.send(End(order.seq, self.state.ending, failed) if order.end else self._features)
             return self._progressed()
         if results is not None:
             results.send(self._end if order.end else self._tracks)
@@ -394,7 +394,7 @@ class DetectorLoop:
         stored, seq = self._outputs.features.window.stored, self.state.seq
         totals = {"sent": float(seq), "stored": float(min(stored, seq))} | self._source_counters()
         totals.pop("lost_seconds", None)  # this one is of the moment
-        return End(seq + 1, self.state.ending, self._failed, totals)
+        return End(seq + 1, self.state.ending, self._process.source_failed, totals)
 
     def _known(self) -> dict[str, Known]:
         """The detectors by name, as the core sees them."""

@@ -34,7 +34,6 @@ __all__ = [
     "die_with",
     "log_as",
     "run",
-    "run_child",
 ]
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
@@ -135,23 +134,7 @@ class Process:
         self._stop_moment = min(self._stop_moment, time.monotonic())
 
 
-def run_child(name: str, file: Path, parent: Parent, *, restarted: bool) -> int:
-    """Run one process of the job in a file; return its exit code, as `run` does.
-
-    Parameters
-    ----------
-    restarted : whether it continues the work of a process that died
-    """
-    log_as(name)
-    try:
-        job = Job.load(file)
-    except CatstreamError as error:
-        _log.error("%s", error)
-        return PERMANENT_FAILURE
-    return run(name, replace(job, resume=job.resume or restarted), parent)
-
-
-def run(name: str, job: Job, parent: Parent | None = None) -> int:
+def run(name: str, job: Job | Path, parent: Parent | None = None, *, restarted: bool = False) -> int:
     """Run the detector, the compressor or the trainer; return its exit code.
 
     The code is 0 at the end of the stream or after SIGTERM, `SOURCE_FAILED` if the source failed, and
@@ -159,7 +142,9 @@ def run(name: str, job: Job, parent: Parent | None = None) -> int:
 
     Parameters
     ----------
+    job : the job, or the file that contains it
     parent : the process that started this one and that ends it; None for a process that was started by hand
+    restarted : whether it continues the work of a process that died
     """
     if parent is not None:
         die_with(parent.pid)
@@ -168,6 +153,8 @@ def run(name: str, job: Job, parent: Parent | None = None) -> int:
     service = import_module(f"catstream.services.{name}")
     service.prepare()
     try:
+        job = Job.load(job) if isinstance(job, Path) else job
+        job = replace(job, resume=job.resume or restarted)
         process = Process(name, job, parent.watchdog if parent else None)
         try:
             service.main(process)

@@ -16,15 +16,18 @@ class StoredPart:
     """What a receiver has stored of a stream, and when it tried to store more.
 
     position  the answer to a sender: messages up to it need not be retransmitted
-    stored    seq of the newest message that is in a checkpoint
     tried     moment at which the last attempt to write a checkpoint ended
     took      seconds that it took
     """
 
     position: Position
-    stored: int
     tried: float
     took: float = 0.0
+
+    @property
+    def stored(self) -> int:
+        """Seq of the newest message that is in a checkpoint."""
+        return self.position.seq - self.position.unsaved
 
     def is_urgent(self, seq: int, window: int) -> bool:
         """Whether half of the sender's window is not stored yet: a full window would block the sender."""
@@ -49,10 +52,9 @@ class StoredPart:
         saved : whether the checkpoint was written
         urgent : whether the sender waits for it
         """
-        stored = position.seq if saved else self.stored
         if not saved and not urgent:
             return replace(self, tried=now, took=now - began)
-        return StoredPart(replace(position, unsaved=position.seq - stored), stored, now, now - began)
+        return StoredPart(replace(position, unsaved=0 if saved else position.seq - self.stored), now, now - began)
 
     def acknowledgement(self, now: Position, end: End | None) -> Position:
         """The position to acknowledge.

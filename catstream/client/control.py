@@ -20,12 +20,12 @@ from uuid import uuid4
 from catstream.box import Box
 from catstream.client.registry import follow
 from catstream.errors import CommandRejectedError, SilenceError
-from catstream.messages.kinds import Answer, Command, SavedModel
+from catstream.messages.kinds import Answer, Command, SavedModel, Verb
 from catstream.messages.names import UNNAMED, check_name
 from catstream.run.learned import Learned
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Endpoint, find, is_deserted
+from catstream.wire.endpoint import Endpoint, find, is_deserted, source_at
 from catstream.wire.newest import Subscriber
 from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
 
@@ -39,8 +39,6 @@ class Control:
     ----------
     endpoint : str
         Endpoint of the pipeline.
-    source : str
-        Source that the pipeline tracks; empty if it is unknown here.
     timeout : float
         Seconds to wait for the answer to a command.
 
@@ -60,8 +58,13 @@ class Control:
     ) -> None:
         self._stream = follow(endpoint, keys)
         self._place = self._stream.endpoint if self._stream is not None else find(endpoint, keys, source)
-        self.endpoint, self.source, self.timeout = str(self._place), self._place.source, timeout
+        self.endpoint, self.timeout = str(self._place), timeout
         self._commands = Requester[Command, Answer](CONTROL, self._place)
+
+    @property
+    def source(self) -> str:
+        """Source that the pipeline tracks; empty if it is unknown here."""
+        return source_at(self._place)
 
     def set_box(self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False) -> Answer:
         """Set the box of an object in the next frame that is tracked: x, y, w, h in pixels.
@@ -83,7 +86,7 @@ class Control:
         ObjectError
             If the name is not valid.
         """
-        return self._ask(Command(uuid4().hex, "set-box", Box.parse(box), keep, object=check_name(object)))
+        return self.execute("set-box", object, box=Box.parse(box), keep=keep)
 
     def search(self, model: Learned | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Search for the object of a saved model from the next frame on, beside the others.
@@ -107,7 +110,7 @@ class Control:
             If the file cannot be read, or is not a saved model.
         """
         learned = model if isinstance(model, Learned) else Learned.load(model)
-        return self._ask(Command(uuid4().hex, "search", model=learned.to_bytes(), object=check_name(object)))
+        return self.execute("search", object, model=learned.to_bytes())
 
     def forget(self, object: str = UNNAMED) -> Answer:
         """Stop tracking an object, and drop everything that was learned of it; without a name, the only object.
@@ -119,15 +122,15 @@ class Control:
         ObjectError
             If the name is not valid.
         """
-        return self._ask(Command(uuid4().hex, "forget", object=check_name(object)))
+        return self.execute("forget", object)
 
     def pause(self) -> Answer:
         """Stop processing frames; the frames of a live source are counted as skipped."""
-        return self._ask(Command(uuid4().hex, "pause"))
+        return self.execute("pause")
 
     def resume(self) -> Answer:
         """Continue processing frames."""
-        return self._ask(Command(uuid4().hex, "resume"))
+        return self.execute("resume")
 
     def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Write everything that was learned of an object to a file on this machine, atomically.
@@ -148,14 +151,49 @@ class Control:
         ServiceError
             If the file cannot be written.
         """
-        answer = self._ask(Command(uuid4().hex, "save", object=check_name(object)))
+        answer = self.execute("save", object)
         learned = self._newest(answer.object, answer.version)
         learned.save(path)
         return replace(answer, version=learned.model.version)
 
     def stop(self) -> Answer:
         """End the run as if the source had ended: everything learned is stored first."""
-        return self._ask(Command(uuid4().hex, "stop"))
+        return self.execute("stop")
+
+    def execute(
+        self,
+        verb: Verb,
+        object: str = UNNAMED,
+        *,
+        box: Box | None = None,
+        keep: bool = False,
+        model: bytes | None = None,
+    ) -> Answer:
+        """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol.
+
+        Raises
+        ------
+        ObjectError
+            If the name of the object is not valid.
+        """
+        command = Command(uuid4().hex, verb, box, keep, check_name(object), model)
+        self._follow()
+        first = min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
+        answer = self._commands.ask(command, first)
+        if answer is None and first and is_deserted(self._place):
+            raise SilenceError(
+                f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
+                "or give the endpoint of one that runs (--endpoint)"
+            )
+        answer = answer or self._commands.ask(command, self.timeout - first)
+        if answer is None:
+            raise SilenceError(
+                f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
+                "Check it with catstream status"
+            )
+        if not answer.done:
+            raise CommandRejectedError(f"{verb}: {answer.reason}")
+        return answer
 
     def close(self) -> None:
         """Disconnect; the pipeline continues."""
@@ -191,25 +229,6 @@ class Control:
             self._commands.close()
             self._place, self.endpoint = place, str(place)
             self._commands = Requester[Command, Answer](CONTROL, place)
-
-    def _ask(self, command: Command) -> Answer:
-        self._follow()
-        verb, first = command.verb, min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
-        answer = self._commands.ask(command, first)
-        if answer is None and first and is_deserted(self._place):
-            raise SilenceError(
-                f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
-                "or give the endpoint of one that runs (--endpoint)"
-            )
-        answer = answer or self._commands.ask(command, self.timeout - first)
-        if answer is None:
-            raise SilenceError(
-                f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
-                "Check it with catstream status"
-            )
-        if not answer.done:
-            raise CommandRejectedError(f"{verb}: {answer.reason}")
-        return answer
 
 
 def control(endpoint: str = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = "") -> Control:

@@ -20,7 +20,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import monotonic
 from typing import Self, TypeVar
 from uuid import uuid4
@@ -38,7 +38,6 @@ from catstream.wire.timing import ANSWER_SECONDS, CONTROLLER_SECONDS, QUIET_SECO
 __all__ = [
     "REGISTRY_PORT",
     "FollowedStream",
-    "Place",
     "Registry",
     "RegistryServer",
     "address_of",
@@ -57,27 +56,6 @@ REGISTRY_PORT = 5690
 
 _PREFIX = "fleet://"
 _LONGEST_TROUBLE = 1000  # characters
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """The place of a stream.
-
-    status    state of the stream
-    endpoint  of its pipeline, with the keys to connect with; None if it does not run
-    """
-
-    status: StreamStatus
-    endpoint: Endpoint | None = field(default=None, compare=False)
-
-    @property
-    def identity(self) -> tuple[str, str, int]:
-        """Differs for each pipeline that was started for the stream."""
-        return self.status.endpoint, self.status.server, self.status.token
-
-    def continues_as(self, later: Place) -> bool:
-        """Whether the numbers of the frames continue at a later place of the stream."""
-        return (self.status.source, self.status.began) == (later.status.source, later.status.began)
 
 
 class Registry:
@@ -118,22 +96,22 @@ class Registry:
             status.nodes.update(listing.nodes)
         return status
 
-    def place(self, stream: str) -> Place:
-        """Return the place of a stream.
+    def stream(self, stream: str) -> StreamStatus:
+        """The state of one stream.
 
         Raises
         ------
         ServiceError
-            If the fleet has no such stream, or its pipeline requires keys and there are none.
+            If the fleet has no such stream.
         """
         listing = self._ask(Question(uuid4().hex, stream))
         if stream not in listing.streams:
             names = ", ".join(self.streams().streams) or "none"
             raise ServiceError(f"the fleet {listing.fleet} has no stream {stream!r}: its streams are {names}")
-        return self.place_of(listing.streams[stream])
+        return listing.streams[stream]
 
-    def place_of(self, status: StreamStatus) -> Place:
-        """The place of a stream whose state is known, without a question.
+    def endpoint_of(self, status: StreamStatus) -> Endpoint | None:
+        """The endpoint of the pipeline of a stream in this state, with the keys to connect with; None if it has none.
 
         Raises
         ------
@@ -141,7 +119,7 @@ class Registry:
             If its pipeline requires keys and there are none.
         """
         if not status.endpoint:
-            return Place(status)
+            return None
         keys = self._endpoint.keys
         if status.server and keys is None:
             raise ServiceError(
@@ -149,7 +127,7 @@ class Registry:
                 "(--keys DIR, see catstream keys)"
             )
         known = keys.for_server(status.server) if status.server and keys is not None else ""
-        return Place(status, replace(Endpoint.parse(status.endpoint, known), source=status.source))
+        return replace(Endpoint.parse(status.endpoint, known), source=status.source)
 
     def request(self, stream: str) -> None:
         """Ask for one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
@@ -157,13 +135,9 @@ class Registry:
         self._follow_controller()
         self._requester.send(Question(self._question, stream))
 
-    def receive(self, stream: str) -> tuple[str, Place | None] | None:
-        """The answer to `request` if it has arrived: name of the fleet, and the place, None if there is no stream."""
-        listing = self._requester.receive(self._question, 0)
-        if listing is None:
-            return None
-        status = listing.streams.get(stream)
-        return listing.fleet, None if status is None else self.place_of(status)
+    def receive(self) -> Listing | None:
+        """The answer to `request` if it has arrived."""
+        return self._requester.receive(self._question, 0)
 
     def fileno(self) -> int:
         """Readable if an answer may have arrived."""
@@ -245,8 +219,8 @@ class FollowedStream:
 
     Attributes
     ----------
-    place : Place
-        Where the stream runs; if it runs nowhere now, where it ran before.
+    place : Endpoint or None
+        The endpoint of its pipeline; if it runs nowhere now, of the last one; None if there was none.
     status : StreamStatus
         Its newest state.
     end : End or None
@@ -265,12 +239,13 @@ class FollowedStream:
         self._pipeline_end: End | None = None
         self._frames: dict[str, int] = {}  # the newest frame of each object
         self.end: End | None = None
+        self.place: Endpoint | None = None
+        self.status = self._at_place = StreamStatus(stream, "starting")  # newest state; state at the start of `place`
         try:
-            self.place = self._registry.place(stream)
+            self._keep(registry.stream(stream))
         except ServiceError:
-            self._registry.close()
+            registry.close()
             raise
-        self._conclude(self.place.status)
         self._next_question = monotonic() + QUIET_SECONDS
 
     def take(self, message: object) -> bool:
@@ -296,14 +271,12 @@ class FollowedStream:
         if now >= self._next_question:
             self._registry.request(self._stream)
             self._next_question = now + QUIET_SECONDS
-        answer = self._registry.receive(self._stream)
-        if answer is None:
+        if (listing := self._registry.receive()) is None:
             return False
-        fleet, place = answer
-        if place is None:
-            self.end = End(0, f"the stream {self._stream} was removed from the fleet {fleet}")
+        if self._stream not in listing.streams:
+            self.end = End(0, f"the stream {self._stream} was removed from the fleet {listing.fleet}")
             return False
-        return self._move_to(place)
+        return self._keep(listing.streams[self._stream])
 
     def ask(self, seconds: float) -> None:
         """Ask the registry now, and wait for the answer; the last one holds if none arrives in time.
@@ -315,7 +288,7 @@ class FollowedStream:
         """
         self._registry.timeout = seconds
         with contextlib.suppress(SilenceError):
-            self._move_to(self._registry.place(self._stream))
+            self._keep(self._registry.stream(self._stream))
 
     @property
     def endpoint(self) -> Endpoint:
@@ -326,9 +299,9 @@ class FollowedStream:
         ServiceError
             If it runs nowhere.
         """
-        if self.place.endpoint is None or not self.status.endpoint:
+        if self.place is None or not self.status.endpoint:
             raise ServiceError(f"the stream {self._stream} runs nowhere, {described(self.status)}")
-        return self.place.endpoint
+        return self.place
 
     def fileno(self) -> int:
         """Readable if an answer may have arrived."""
@@ -338,21 +311,19 @@ class FollowedStream:
         """Disconnect from the registry."""
         self._registry.close()
 
-    def _move_to(self, place: Place) -> bool:
-        """Keep what the registry says of the stream; returns whether it has another pipeline."""
-        moved = place.endpoint is not None and place.identity != self.place.identity
+    def _keep(self, status: StreamStatus) -> bool:
+        """Keep what the registry says, and end if the stream has ended; returns whether it has another pipeline."""
+        before, self.status = self._at_place, status
+        moved = bool(status.endpoint) and (
+            (status.endpoint, status.server, status.token) != (before.endpoint, before.server, before.token)
+        )
         if moved:
-            if not self.place.continues_as(place):
+            if (status.source, status.began) != (before.source, before.began):  # its frames count from 0 again
                 self._frames.clear()
-            self.place, self._pipeline_end = place, None
-        self._conclude(place.status)
-        return moved
-
-    def _conclude(self, status: StreamStatus) -> None:
-        """Keep the state; end if the stream has ended."""
-        self.status = status
+            self.place, self._at_place, self._pipeline_end = self._registry.endpoint_of(status), status, None
         if status.state == "ended":
             self.end = self._pipeline_end or End(0, f"the stream {self._stream} has ended")
+        return moved
 
 
 class RegistryServer:

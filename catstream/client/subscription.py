@@ -276,7 +276,7 @@ class Subscription(Generic[Message]):
         moved = self._stream.update()
         if self._stream.end is not None:
             self.end, self._close_time = self._stream.end, monotonic() + DRAIN_SECONDS
-        elif (moved or self._connection is None) and (place := self._stream.place.endpoint) is not None:
+        elif (moved or self._connection is None) and (place := self._stream.place) is not None:
             self._disconnect()
             self._connection = _Connection(self._channel, place, self._only, self._about)
 

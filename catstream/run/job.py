@@ -7,16 +7,18 @@ folder keeps a copy of the job in that folder, from which it is resumed.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
+
+import msgspec
 
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
-from catstream.messages.storage import Metadata
 from catstream.settings import Settings
 
 __all__ = ["Job", "Models", "Results", "files_by_name"]
@@ -53,13 +55,6 @@ class Results:
             write=self.write or earlier.write,
             models=self.models or earlier.models,
         )
-
-    @classmethod
-    def from_json(cls, metadata: Metadata) -> Results:
-        """Return the results that `asdict` and JSON converted to this metadata."""
-        write = tuple(Path(file) for file in metadata["write"])
-        models = {name: Path(file) for name, file in metadata["models"].items()}
-        return cls(_path(metadata["output"]), bool(metadata["video"]), write, models)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +123,8 @@ class Job:
             If the file cannot be written.
         """
         try:
-            metadata = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+            values = {field.name: getattr(self, field.name) for field in fields(self)}
+            metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
             storage.write(folder / _NAME, {}, metadata, mode=0o600)
         except OSError as error:
             raise ServiceError(
@@ -152,9 +148,10 @@ class Job:
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {path}")
         metadata = storage.read(file)[1]
         try:
-            read = {name: _READERS[name](metadata[name]) for name in _READERS}
-            return cls(**(metadata | read))
-        except (KeyError, TypeError) as error:
+            settings = Settings.from_values(metadata.pop("settings"))
+            read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}
+            return cls(**(metadata | read), settings=settings)
+        except (AttributeError, KeyError, TypeError, msgspec.ValidationError) as error:
             raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
 
     @staticmethod
@@ -192,36 +189,16 @@ def files_by_name(files: Models | None) -> dict[str, Path]:
 
 
 def _plain(value: object) -> object:
-    """A field of a job in the types of JSON."""
-    match value:
-        case Path():
-            return str(value)
-        case slice():
-            return [value.start, value.stop, value.step]
-        case Settings():
-            return value.values()
-        case Results():
-            return {name: _plain(item) for name, item in asdict(value).items()}
-        case tuple():
-            return [_plain(item) for item in value]
-        case dict():
-            return {name: _plain(item) for name, item in value.items()}
-        case _:
-            return value
+    """A value in the types of JSON, if it is of a type that `msgspec` does not know."""
+    return [value.start, value.stop, value.step] if isinstance(value, slice) else str(value)
 
 
-def _path(text: str | None) -> Path | None:
-    return Path(text) if text is not None else None
+def _typed(kind: type, value: Any) -> object:
+    """The reverse of `_plain`."""
+    return slice(*value) if kind is slice else kind(value)
 
 
-#: Functions that convert a JSON value back to the type of a field, for fields of other types.
-_READERS: dict[str, Callable[[Any], object]] = {
-    "boxes": lambda boxes: {name: Box(*box) for name, box in boxes.items()},
-    "models": lambda models: {name: Path(file) for name, file in models.items()},
-    "part": lambda part: slice(*part),
-    "settings": Settings.from_values,
-    "size": lambda size: size and tuple(size),
-    "record": _path,
-    "state": _path,
-    "results": Results.from_json,
-}
+@cache
+def _kinds() -> dict[str, Any]:
+    """The types of the fields of a job, by name, without its settings, which check themselves."""
+    return {name: kind for name, kind in get_type_hints(Job).items() if name != "settings"}

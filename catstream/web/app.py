@@ -194,11 +194,7 @@ class Command:
 def _execute(feed: PipelineFeed, command: Command) -> Answer:
     """Send a command and wait for its answer."""
     with feed.control() as pipeline:
-        if command.box is not None:
-            return pipeline.set_box(command.box, object=command.object, keep=command.keep)
-        if command.verb == "forget":
-            return pipeline.forget(command.object)
-        return {"pause": pipeline.pause, "resume": pipeline.resume, "stop": pipeline.stop}[command.verb]()
+        return pipeline.execute(command.verb, command.object, box=command.box, keep=command.keep)
 
 
 def _failed(_: Request, error: Exception) -> Response:

@@ -85,7 +85,7 @@ class FleetFeed(Feed):
 
     def _endpoint_of(self, stream: StreamStatus) -> Endpoint | None:
         """Return the endpoint of the pipeline of a stream, with the keys to connect with; None if it does not run."""
-        return self._registry.place_of(stream).endpoint if self._registry is not None else None
+        return self._registry.endpoint_of(stream) if self._registry is not None else None
 
     async def _run(self) -> None:
         try:

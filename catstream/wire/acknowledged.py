@@ -61,14 +61,17 @@ class Sender(ChannelSocket[Message]):
             return answer if isinstance(answer, Position) else None
         return None
 
-    def send(self, message: Message) -> bool:
-        """Send the message with the next seq, without waiting; False if the window is full."""
+    def send(self, message: Message) -> None:
+        """Send the message with the next seq, without waiting.
+
+        Raises
+        ------
+        ValueError
+            If the window is full.
+        """
         self.poll(0)
-        if self.window.full:
-            return False
         self.window.push(message.seq, self._encode(message))
         self._transmit()
-        return True
 
     def poll(self, seconds: float) -> None:
         """Process acknowledgements, waiting at most this long for the first; retransmit what is missing.
@@ -95,9 +98,8 @@ class Sender(ChannelSocket[Message]):
 
     def _transmit(self) -> None:
         with contextlib.suppress(zmq.Again):  # tried again at the next poll
-            while (frame := self.window.next_frame()) is not None:
+            for frame in self.window.frames():
                 self._socket.send(frame, zmq.NOBLOCK, copy=False)
-                self.window.transmitted()
 
     def _say_hello(self) -> None:
         self.window.position_requested(monotonic())

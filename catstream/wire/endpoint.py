@@ -36,6 +36,7 @@ __all__ = [
     "note_early_subscriber",
     "private_folder",
     "running",
+    "source_at",
 ]
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
@@ -288,6 +289,8 @@ def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, s
 def find(text: str | Endpoint = "", keys: str = "", source: str = "") -> Endpoint:
     """The endpoint of a running pipeline: the given one, the one with this source, or the user's only one.
 
+    The source of a given one is not looked for: see `source_at`.
+
     Parameters
     ----------
     text, keys : the settings `endpoint` and `keys`; the keys of this user's pipelines are known. What is an `Endpoint`
@@ -302,8 +305,7 @@ def find(text: str | Endpoint = "", keys: str = "", source: str = "") -> Endpoin
     if isinstance(text, Endpoint):
         return text
     if text:
-        given = Endpoint.parse(text, keys)
-        return replace(given, source=_source_at(given))
+        return Endpoint.parse(text, keys)
     endpoints = running()
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so
@@ -338,10 +340,10 @@ def is_deserted(endpoint: Endpoint) -> bool:
     return is_unknown and not endpoint.taken(CHANNELS["control"])  # asked last: a detector counts it as a rejected peer
 
 
-def _source_at(endpoint: Endpoint) -> str:
-    """The source of this user's pipeline at an endpoint; empty if it is not known."""
-    known = _running_at(endpoint)
-    return known.source if known is not None else ""
+def source_at(endpoint: Endpoint) -> str:
+    """The source of the pipeline at an endpoint, if that is one of this user; empty if it is not known."""
+    known = None if endpoint.source else _running_at(endpoint)
+    return known.source if known is not None else endpoint.source
 
 
 def _running_at(endpoint: Endpoint) -> Endpoint | None:

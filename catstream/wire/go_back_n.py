@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from catstream.errors import ProtocolError, StreamRewoundError
@@ -95,25 +96,24 @@ class SendWindow:
         self.stored = min(seq, position.seq - position.unsaved)
         self._sent_before = position.seq + self._size  # a whole window of the earlier sender may still be on its way
 
-    @property
-    def full(self) -> bool:
-        """Whether no message can be pushed now."""
-        return len(self._unacknowledged) >= self._size
-
     def push(self, seq: int, frame: bytes) -> None:
-        """Accept the next message for transmission; only if the window is not full."""
+        """Accept the next message for transmission.
+
+        Raises
+        ------
+        ValueError
+            If the window is full.
+        """
+        if len(self._unacknowledged) >= self._size:
+            raise ValueError(f"message {seq} of {self._channel} was pushed while {self._size} are not acknowledged")
         self._unacknowledged.append((seq, frame))
         self.sent = seq
 
-    def next_frame(self) -> bytes | None:
-        """The frame to transmit next, None if all were transmitted; call `transmitted` once the socket took it."""
-        if self._in_flight < len(self._unacknowledged):
-            return self._unacknowledged[self._in_flight][1]
-        return None
-
-    def transmitted(self) -> None:
-        """Note that the socket took the frame of `next_frame`."""
-        self._in_flight += 1
+    def frames(self) -> Iterator[bytes]:
+        """The frames that were not transmitted yet; each counts as transmitted once the next one is asked for."""
+        while self._in_flight < len(self._unacknowledged):
+            yield self._unacknowledged[self._in_flight][1]
+            self._in_flight += 1
 
     def must_ask(self, now: float) -> bool:
         """Whether to send a hello now: messages wait, and the last reply or hello is `PATIENCE_SECONDS` ago."""

@@ -328,7 +328,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
         running(site, ray, "gate")
         with Registry("site", timeout=30) as registry:
             until(lambda: registry.streams().streams["gate"].state == "running")
-            assert registry.place("gate").status.node == "n1"
+            assert registry.stream("gate").node == "n1"
     finally:
         goes_on.set()
         change.join()

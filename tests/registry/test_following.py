@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import catstream
 from catstream.box import Box
-from catstream.client.registry import FollowedStream, Place
+from catstream.client.registry import FollowedStream
 from catstream.client.subscription import wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
+from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, Listing, StreamStatus, Track
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -217,17 +217,19 @@ class _Script:
 
     @staticmethod
     def _status(token, state):
-        endpoint = Endpoint.parse(f"run-{token}") if state == "running" else None
-        return Place(StreamStatus("cam-7", state, endpoint=str(endpoint or ""), token=token), endpoint)
+        return StreamStatus("cam-7", state, endpoint=f"run-{token}" if state == "running" else "", token=token)
 
-    def place(self, _):
+    def stream(self, _):
         return self.answer
+
+    def endpoint_of(self, status):
+        return Endpoint.parse(status.endpoint)
 
     def request(self, _):
         pass
 
-    def receive(self, _):
-        return None if self.answer is None else ("site", self.answer)
+    def receive(self):
+        return None if self.answer is None else Listing("question", "site", 1.7e9, {"cam-7": self.answer})
 
 
 STEPS = st.lists(st.sampled_from(["move", "stop", "down", "end of the pipeline"]), max_size=20)
@@ -247,9 +249,9 @@ def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_controll
             registry.answer = None if step == "down" else _Script._status(token, "moving")
         moved = followed.update()
         assert moved == (step == "move")
-        assert (followed.end, followed.place.status.token) == (None, token)
+        assert (followed.end, str(followed.place)) == (None, f"run-{token}")
     registry.answer = _Script._status(token, last) if last == "ended" else None
     if last == "removed":
-        registry.receive = lambda _: ("site", None)
+        registry.receive = lambda: Listing("question", "site", 1.7e9)
     assert not followed.update()
     assert followed.end is not None

@@ -20,8 +20,9 @@ SITE = FleetStatus("site", 1.7e9, {"cam-7": CAM}, {"north": NodeStatus("north", 
 def test_the_state_of_a_fleet_arrives_as_it_is(managing):
     with managing(SITE), Registry() as registry:
         assert registry.streams() == SITE
-        place = registry.place("cam-7")
-    assert (place.status, str(place.endpoint), place.endpoint.source) == (CAM, "run", "walk.mp4")
+        status = registry.stream("cam-7")
+        endpoint = registry.endpoint_of(status)
+    assert (status, str(endpoint), endpoint.source) == (CAM, "run", "walk.mp4")
 
 
 def test_a_fleet_with_more_streams_than_a_message_holds_arrives_whole(managing):
@@ -47,13 +48,13 @@ def test_a_state_that_no_message_may_have_does_not_end_the_registry(managing):
         with pytest.raises(SilenceError):
             registry.streams()
         registry.timeout = 20
-        assert registry.place("cam-7").status == CAM
+        assert registry.stream("cam-7") == CAM
 
 
 def test_a_stream_that_does_not_run_has_no_endpoint(managing):
     idle = replace(SITE, streams={"cam-7": StreamStatus("cam-7", "unplaced", trouble="cam-7 needs site=north")})
     with managing(idle), Registry() as registry:
-        assert registry.place("cam-7").endpoint is None
+        assert registry.endpoint_of(registry.stream("cam-7")) is None
         with pytest.raises(ServiceError, match="cam-7 runs nowhere, its state is unplaced: cam-7 needs site=north"):
             locate("fleet://cam-7")
 
@@ -109,9 +110,9 @@ def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_t
     server, anna = public_key(folder / "stream"), Keys.load(folder / "anna")
     keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server)})
     with managing(keyed, tcp, str(fleet_keys)), Registry(tcp.removeprefix("tcp://"), str(folder / "anna")) as registry:
-        place = registry.place("cam-7")
-    assert place.endpoint.keys == replace(anna, server=server.encode())
-    assert str(place.endpoint) == "tcp://10.0.0.2:5700"
+        place = registry.endpoint_of(registry.stream("cam-7"))
+    assert place.keys == replace(anna, server=server.encode())
+    assert str(place) == "tcp://10.0.0.2:5700"
 
 
 def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp, managing):

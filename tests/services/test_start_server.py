@@ -230,7 +230,7 @@ def test_processes_of_one_server_have_random_numbers_of_their_own(server, start,
         monkeypatch,
         "from catstream.numerics.threads import limit_process; limit_process(); "
         "import numpy, random, sys; from catstream.services import loop; "
-        f"loop.run_child = lambda *_, **__: {numbers} or 0; ",
+        f"loop.run = lambda *_, **__: {numbers} or 0; ",
     )
     server.close()
     drawn = []

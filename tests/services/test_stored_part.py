@@ -23,7 +23,7 @@ class Storing(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.part = StoredPart(Position(5), 5, 0.0)
+        self.part = StoredPart(Position(5), 0.0)
         self.seq = self.on_disk = 5
         self.now = 0.0
 
@@ -87,6 +87,6 @@ TestStoring = Storing.TestCase
 
 @given(took=st.integers(0, 60), interval=st.integers(1, 20), later=st.integers(0, 1000))
 def test_at_most_a_tenth_of_the_time_is_spent_writing(took, interval, later):
-    part = StoredPart(Position(1), 1, 0.0).after(Position(2), 100.0, 100.0 + took, saved=True, urgent=False)
+    part = StoredPart(Position(1), 0.0).after(Position(2), 100.0, 100.0 + took, saved=True, urgent=False)
     due = part.is_due(3, 100.0 + took + later, interval)
     assert due == (later >= interval and took * 10 <= took + later)

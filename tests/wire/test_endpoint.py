@@ -15,7 +15,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, Note, find, is_deserted, meeting_place, private_folder, running
+from catstream.wire.endpoint import Endpoint, Note, find, is_deserted, meeting_place, private_folder, running, source_at
 from catstream.wire.keys import Keys, create
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
@@ -240,4 +240,4 @@ def test_a_pipeline_whose_keys_cannot_be_read_does_not_hide_the_others(tmp_path)
         shutil.move(tmp_path / "keys", tmp_path / "moved")
         assert str(good) in {str(endpoint) for endpoint in running()}
         assert str(other) not in {str(endpoint) for endpoint in running()}
-        assert find(source="good.mp4").source == find(str(good)).source == "good.mp4"
+        assert find(source="good.mp4").source == source_at(find(str(good))) == "good.mp4"
