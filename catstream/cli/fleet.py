@@ -21,7 +21,7 @@ from rich.text import Text
 from catstream.cli.output import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
-from catstream.errors import FleetError, ServiceError, SilenceError
+from catstream.errors import FleetError, SilenceError
 from catstream.fleet.timing import SHOW_SECONDS, UP_SECONDS
 from catstream.messages import storage
 from catstream.messages.kinds import FleetStatus
@@ -316,10 +316,8 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
     """
     merged = running.merge(*names, object=object_name)
     if output is not None:
-        try:
+        with storage.writing(output):
             storage.write_atomically(output, merged.model)
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(output)!r} ({error.strerror}): give another file") from None
     line = f"merged: {', '.join(merged.streams)}"
     if merged.skipped:
         line += f"; the frames of these are in them already, at least in part: {', '.join(merged.skipped)}"

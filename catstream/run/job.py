@@ -127,13 +127,9 @@ class Job:
         ServiceError
             If the file cannot be written.
         """
-        try:
-            metadata = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        metadata = {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        with storage.writing(folder):
             storage.write(folder / _NAME, {}, metadata, mode=0o600)
-        except OSError as error:
-            raise ServiceError(
-                f"cannot write the state to {str(folder)!r} ({error.strerror}): give another folder"
-            ) from None
         return folder / _NAME
 
     @classmethod

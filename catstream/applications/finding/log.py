@@ -17,6 +17,7 @@ from catstream.applications.finding.search import Step
 from catstream.applications.finding.sightings import GAP_SECONDS, Interval, Linker, Sighting
 from catstream.box import Box
 from catstream.errors import ServiceError
+from catstream.messages.storage import writing
 from catstream.video.image import jpeg
 
 __all__ = ["FileResult", "SearchLog"]
@@ -82,15 +83,13 @@ class SearchLog:
     def __init__(self, path: Path, search: Mapping[str, Any], *, overwrite: bool = False) -> None:
         self.path, self.search = path, search
         self.results: dict[str, FileResult] = {}
-        try:
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             good = 0 if overwrite or not path.exists() else self._load(path.read_bytes())
             self._stream = path.open("ab")
             self._stream.truncate(good)  # the last line of a process that was killed may be incomplete
             if not good:
                 self._write({"kind": _KIND, "search": search})
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another folder") from None
 
     def __enter__(self) -> Self:
         return self

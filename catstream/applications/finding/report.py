@@ -25,7 +25,7 @@ def write_report(path: Path, objects: Sequence[str], results: Iterable[FileResul
 
     Raises
     ------
-    VideoError
+    ServiceError
         If the file cannot be written.
     """
     results = list(results)
