@@ -6,7 +6,7 @@ import base64
 import binascii
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,7 +22,7 @@ from catstream.video.image import jpeg
 
 __all__ = ["FileResult", "SearchLog"]
 
-_KIND = "catstream find 1"  # and the version of the lines
+_KIND = "catstream find 2"  # and the version of the lines
 _GAP_STEPS = 2.5  # longest time between two sightings of an interval, in steps, if these are long
 _PICTURE = 240  # side of a picture in pixels
 _SURROUNDINGS = 1.7  # side of a picture, as a multiple of the longer side of the object's box
@@ -115,7 +115,7 @@ class SearchLog:
             if interval.best is sighting:
                 interval.picture = _picture(image, sighting.box)
             picture = interval.picture if interval.best is sighting else b""
-            seen.append([*_values(sighting), base64.b64encode(picture).decode("ascii")])
+            seen.append(asdict(sighting) | {"picture": base64.b64encode(picture).decode("ascii")})
         self._write({"of": result.file, "step": step.frame, "time": step.time, "seen": seen})
 
     def note(self, result: FileResult, **facts: Any) -> None:
@@ -148,7 +148,7 @@ class SearchLog:
             if head["search"] == self.search:
                 for line in rest:
                     self._apply(line)
-        except (KeyError, TypeError, ValueError, binascii.Error) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, binascii.Error) as error:
             raise ServiceError(
                 f"{str(self.path)!r} is not the log of a search ({error}): give another folder, or --overwrite"
             ) from None
@@ -171,27 +171,11 @@ class SearchLog:
         result.complete = line.get("complete", result.complete)
         result.problems += [line["problem"]] if "problem" in line else []
         if "step" in line:
-            sightings = [_sighting(result.file, values[:-1]) for values in line["seen"]]
+            pictures = [each.pop("picture") for each in line["seen"]]
+            sightings = [Sighting(**each | {"box": Box(*each["box"])}) for each in line["seen"]]
             intervals = result.add(line["step"], line["time"], sightings)
-            for interval, (*_, picture) in zip(intervals, line["seen"], strict=True):
+            for interval, picture in zip(intervals, pictures, strict=True):
                 interval.picture = base64.b64decode(picture) or interval.picture
-
-
-def _values(sighting: Sighting) -> list[Any]:
-    return [
-        sighting.object,
-        sighting.frame,
-        sighting.time,
-        list(sighting.box),
-        sighting.score,
-        sighting.image,
-    ]
-
-
-def _sighting(file: str, values: Sequence[Any]) -> Sighting:
-    """The reverse of `_values`."""
-    name, frame, time, box, *rest = values
-    return Sighting(name, file, frame, time, Box(*box), *rest)
 
 
 def _picture(image: np.ndarray, box: Box) -> bytes:
