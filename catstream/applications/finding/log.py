@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,55 +14,19 @@ import numpy as np
 
 from catstream.applications.finding.files import File
 from catstream.applications.finding.search import Step
-from catstream.applications.finding.sightings import GAP_SECONDS, Interval, Linker, Sighting
+from catstream.applications.finding.sightings import FileResult, Sighting
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages.storage import writing
 from catstream.video.image import jpeg
 
-__all__ = ["FileResult", "SearchLog"]
+__all__ = ["SearchLog"]
 
 _KIND = "catstream find 2"  # and the version of the lines
+_GAP_SECONDS = 1.0  # longest time between two sightings of an interval, if steps are short
 _GAP_STEPS = 2.5  # longest time between two sightings of an interval, in steps, if these are long
 _PICTURE = 240  # side of a picture in pixels
 _SURROUNDINGS = 1.7  # side of a picture, as a multiple of the longer side of the object's box
-
-
-@dataclass(slots=True)
-class FileResult:
-    """The result for one file so far.
-
-    file       path of the video, the image or the folder
-    signature  of the file when it was searched, see `File.signature`
-    linker     links its sightings into intervals
-    frames     number of its frames, None if unknown
-    position   frame of the last step, None before the first one
-    time       time of the last step in seconds
-    complete   whether the file was searched to its end, or to its damage
-    problems   reasons for what could not be read
-    sightings  in the order of the frames
-    """
-
-    file: str
-    signature: list[int]
-    linker: Linker
-    frames: int | None = None
-    position: int | None = None
-    time: float = 0.0
-    complete: bool = False
-    problems: list[str] = field(default_factory=list)
-    sightings: list[Sighting] = field(default_factory=list)
-
-    @property
-    def intervals(self) -> list[Interval]:
-        """The intervals of all objects, in the order of their first sighting."""
-        return self.linker.intervals
-
-    def add(self, position: int, time: float, sightings: Sequence[Sighting]) -> list[Interval]:
-        """Add a step; returns the interval of each sighting."""
-        self.position, self.time = position, time
-        self.sightings += sightings
-        return self.linker.add(sightings)
 
 
 class SearchLog:
@@ -163,8 +127,8 @@ class SearchLog:
     def _apply(self, line: Mapping[str, Any]) -> None:
         """Change the results as a line says."""
         if "file" in line:
-            linker = Linker(max(GAP_SECONDS, _GAP_STEPS * self.search["every"]))
-            self.results[line["file"]] = FileResult(line["file"], line["signature"], linker)
+            gap = max(_GAP_SECONDS, _GAP_STEPS * self.search["every"])
+            self.results[line["file"]] = FileResult(line["file"], line["signature"], gap)
             return
         result = self.results[line["of"]]
         result.frames = line.get("frames", result.frames)

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
-from catstream.applications.finding.log import FileResult
-from catstream.applications.finding.sightings import Interval
+from catstream.applications.finding.sightings import FileResult, Interval
 from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.timeline import Bar, clock, legend, timeline
 from catstream.messages.names import counted

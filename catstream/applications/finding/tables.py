@@ -9,8 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from catstream.applications.finding.log import FileResult
-from catstream.applications.finding.sightings import Interval, Sighting
+from catstream.applications.finding.sightings import FileResult, Interval, Sighting
 from catstream.messages import storage
 
 __all__ = ["write_tables"]
