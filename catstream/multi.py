@@ -284,10 +284,8 @@ class MultiTracker:
             "forest": metadata,
             "objects": objects,
         }
-        try:
+        with storage.writing(path):
             storage.write(path, arrays, whole)
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:

@@ -215,7 +215,7 @@ def test_a_missing_file_and_one_of_something_else_are_told_apart(tmp_path):
 
 
 def test_an_unwritable_place_is_named_as_it_was_given(video, tmp_path):
-    with pytest.raises(ServiceError, match=r"cannot write .*: give another file") as error:
+    with pytest.raises(ServiceError, match=r"cannot write .*: give another place") as error:
         started(video).save(tmp_path / "none" / "x")
     assert ".part" not in str(error.value)
 

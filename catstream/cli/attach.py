@@ -10,7 +10,7 @@ from catstream.client.subscription import wait_until_running
 from catstream.services.options import combined, with_keys
 from catstream.wire.endpoint import Endpoint
 
-__all__ = ["wait_for_pipeline", "with_endpoint", "with_wait"]
+__all__ = ["wait_for_pipeline", "with_endpoint", "with_fleet_address", "with_wait"]
 
 
 def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
@@ -21,6 +21,10 @@ def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
     return address_of(fleet, stream) if stream else endpoint
 
 
+with_fleet_address = click.option(
+    "--fleet", default="", metavar="ADDRESS", help="HOST:PORT or name of the fleet; not needed if only one runs here."
+)
+
 #: Adds the options that select a running pipeline, as two texts: the arguments `endpoint` and `keys`. The endpoint of a
 #: stream of a fleet is its address, `fleet://FLEET/STREAM`.
 with_endpoint = combined(
@@ -30,12 +34,7 @@ with_endpoint = combined(
         "--endpoint", default="", metavar="PLACE", help="Endpoint of the pipeline; not needed if only one runs."
     ),
     click.option("--stream", default="", metavar="NAME", help="A stream of a fleet, instead of --endpoint."),
-    click.option(
-        "--fleet",
-        default="",
-        metavar="ADDRESS",
-        help="HOST:PORT or name of its fleet; not needed if only one runs here.",
-    ),
+    with_fleet_address,
     with_keys,
 )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from catstream.errors import ServiceError
-from catstream.messages.storage import why_not_writable
+from catstream.messages.storage import why_not_writable, writing
 from catstream.services.options import PATH
 
 __all__ = ["check_file", "with_json_file", "write_json"]
@@ -46,7 +46,5 @@ def write_json(file: Path | None, figures: dict[str, object]) -> None:
         If it cannot be written.
     """
     if file is not None:
-        try:
+        with writing(file):
             file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(file)!r}: {error.strerror}") from None

@@ -18,8 +18,9 @@ from catstream.settings import RunSettings
 
 if TYPE_CHECKING:
     from catstream.applications.finding.files import File
-    from catstream.applications.finding.log import FileResult, SearchLog
+    from catstream.applications.finding.log import SearchLog
     from catstream.applications.finding.search import Search
+    from catstream.applications.finding.sightings import FileResult
 
 __all__ = ["find"]
 

@@ -18,14 +18,16 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from catstream.cli.attach import with_fleet_address
 from catstream.cli.output import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
-from catstream.errors import FleetError, ServiceError, SilenceError
+from catstream.errors import FleetError, SilenceError
 from catstream.fleet.timing import SHOW_SECONDS, UP_SECONDS
 from catstream.messages import storage
 from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, split_name
+from catstream.services.options import PATH, with_json, with_keys
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
@@ -84,7 +86,7 @@ def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @fleet.command(short_help="Start the streams of a file, or apply its changes.")
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=PATH)
 @click.option("--nodes", type=click.IntRange(1, 64), help="Nodes to start on this machine; default: as the file says.")
 @click.option("--cores", type=click.IntRange(1), help="Cores of each of them; default: equal shares.")
 @click.option("--detach", is_flag=True, help="Return once the streams run; `catstream fleet down` ends them.")
@@ -168,10 +170,10 @@ def _watch_until_its_end(console: Console, fleet: Fleet) -> None:
 
 
 @fleet.command()
-@click.option("--fleet", "place", default="", metavar="ADDRESS", help="HOST:PORT or name; not needed if only one runs.")
-@click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the fleet requires keys.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def status(place: str, keys: str, as_json: bool) -> None:
+@with_fleet_address
+@with_keys
+@with_json
+def status(fleet: str, keys: str, as_json: bool) -> None:
     """Show all streams and nodes of a fleet.
 
     The exit code is 1 if something is wrong with a stream: each line below the
@@ -182,7 +184,7 @@ def status(place: str, keys: str, as_json: bool) -> None:
       catstream fleet status
       catstream fleet status --fleet 10.0.0.1:5690 --keys my-keys --json | jq .streams
     """
-    with Registry(place, keys=keys) as registry:
+    with Registry(fleet, keys=keys) as registry:
         found = registry.streams()
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(found)))
@@ -300,7 +302,7 @@ def logs(running: Fleet, name: str, lines: int) -> None:
 @click.option(
     "--object", "object_name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one."
 )
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="Write the model to a file, too.")
+@click.option("-o", "--output", type=PATH, metavar="FILE", help="Write the model to a file, too.")
 @with_fleet
 def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path | None) -> None:
     """Merge what the streams NAMES have learned of an object; default: all.
@@ -316,10 +318,8 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
     """
     merged = running.merge(*names, object=object_name)
     if output is not None:
-        try:
+        with storage.writing(output):
             storage.write_atomically(output, merged.model)
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(output)!r} ({error.strerror}): give another file") from None
     line = f"merged: {', '.join(merged.streams)}"
     if merged.skipped:
         line += f"; the frames of these are in them already, at least in part: {', '.join(merged.skipped)}"

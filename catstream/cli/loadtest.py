@@ -12,7 +12,7 @@ import click
 from catstream.cli.files import with_json_file, write_json
 from catstream.cli.interrupts import stopped
 from catstream.cli.output import complain, line_of, messages, screen, table
-from catstream.errors import CatstreamError
+from catstream.messages.storage import writing
 from catstream.services.options import with_settings
 
 if TYPE_CHECKING:
@@ -110,7 +110,8 @@ def loadtest(
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)
     if output is not None:
-        _make(output)
+        with writing(output):
+            output.mkdir(parents=True, exist_ok=True)
     with line_of(messages(), lambda task: [task.description, task.fields["figures"]]) as progress:
         task = progress.add_task("starting", total=1.0, figures="")
 
@@ -141,14 +142,6 @@ def loadtest(
         complain(f"broken: {line}")
     if load_test.violations:
         sys.exit(_FAILED)
-
-
-def _make(output: Path) -> None:
-    """Make the folder of the results before the run."""
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CatstreamError(f"cannot write to {str(output)!r} ({error.strerror}): give another folder") from None
 
 
 def _print(result: Result, limits: list[Limit]) -> None:

@@ -181,18 +181,18 @@ def _of_recording(recording: Recording, count: int, name: str | None, source: st
     require_features(recording, incomplete=True)
     settings, source = recording.settings, source or _source_of(recording)
     with line_of(console) as progress, one_thread():
-        task = progress.add_task("comparing frames", total=recording.counts[Features])
-        objects = taught_frames(recording.features(), settings.coreset, lambda: progress.advance(task))
+        frames = progress.track(recording.features(), recording.counts[Features], description="comparing frames")
+        objects = taught_frames(frames, settings.coreset)
     measured = objects[_object_of(list(objects), name)]
-    frames, pictures = most_taught(measured, count), dict[int, bytes]()
+    chosen, pictures = most_taught(measured, count), dict[int, bytes]()
     try:
         if not source:
             raise VideoError("the recording does not name its video, give it with --source")
         with console.status(f"reading {source}"):
-            pictures = pictures_of(frames, source, settings.run.image_rate)
+            pictures = pictures_of(chosen, source, settings.run.image_rate)
     except VideoError as error:
         console.print(f"the sheet has no pictures: {error}", style="yellow")
-    return sheet_of_frames(Path(source or recording.path).stem, frames, len(measured), source, pictures)
+    return sheet_of_frames(Path(source or recording.path).stem, chosen, len(measured), source, pictures)
 
 
 def _source_of(recording: Recording) -> str:

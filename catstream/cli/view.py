@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from catstream.cli.attach import with_endpoint
+from catstream.cli.attach import with_endpoint, with_fleet_address
 from catstream.cli.serving import PORT, Address, AddressType, with_token
+from catstream.services.options import with_keys
 
 if TYPE_CHECKING:
     from catstream.web.server import Site
@@ -62,13 +63,8 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
 
 
 @click.command("view")
-@click.option(
-    "--fleet",
-    default="",
-    metavar="ADDRESS",
-    help="HOST:PORT or name of the fleet; not needed if only one runs.",
-)
-@click.option("--keys", default="", metavar="DIR", help="Folder of keys, if the fleet requires keys.")
+@with_fleet_address
+@with_keys
 @_with_listen
 @with_token()
 def fleet_view(fleet: str, keys: str, listen: Address, token: str | None) -> None:

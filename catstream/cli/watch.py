@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from functools import partial
 from typing import Any, Self
 
@@ -164,24 +164,16 @@ def watch(
         click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
 
 
-def _print_json(message: object) -> None:
-    click.echo(json.dumps(_plain(message)))
+def _print_json(message: AnyMessage) -> None:
+    click.echo(json.dumps(asdict(message), default=_described))
 
 
-def _plain(value: object) -> object:
-    """Return a message as a JSON value; an array or a picture is replaced by a description."""
-    if isinstance(value, np.ndarray):
-        norm = float(np.linalg.norm(np.nan_to_num(value)))
-        return {"dtype": value.dtype.name, "shape": value.shape, "norm": round(norm, 6)}
+def _described(value: bytes | np.ndarray) -> dict[str, object]:
+    """Return a description of a picture or an array, for which JSON has no form."""
     if isinstance(value, bytes):
         return {"bytes": len(value)}
-    if isinstance(value, Box):
-        return list(value)
-    if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if dataclasses.is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return value
+    norm = float(np.linalg.norm(np.nan_to_num(value)))
+    return {"dtype": value.dtype.name, "shape": value.shape, "norm": round(norm, 6)}
 
 
 def _print_line(channel: str, message: object) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from catstream.errors import ProtocolError
+from catstream.errors import ProtocolError, ServiceError
 
 __all__ = [
     "ABANDONED_SECONDS",
@@ -36,6 +36,7 @@ __all__ = [
     "why_not_writable",
     "write",
     "write_atomically",
+    "writing",
 ]
 
 #: Arrays by name.
@@ -120,6 +121,21 @@ def remove_parts(folder: Path, name: str = "") -> None:
         with contextlib.suppress(OSError):
             if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
                 part.unlink()
+
+
+@contextlib.contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+    """A block that writes a file, or into a folder.
+
+    Raises
+    ------
+    ServiceError
+        If the block raises an OSError: one line, for a person.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise ServiceError(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
 
 
 def is_writable(folder: Path) -> bool:

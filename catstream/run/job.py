@@ -122,14 +122,10 @@ class Job:
         ServiceError
             If the file cannot be written.
         """
-        try:
-            values = {field.name: getattr(self, field.name) for field in fields(self)}
-            metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
+        with storage.writing(folder):
             storage.write(folder / _NAME, {}, metadata, mode=0o600)
-        except OSError as error:
-            raise ServiceError(
-                f"cannot write the state to {str(folder)!r} ({error.strerror}): give another folder"
-            ) from None
         return folder / _NAME
 
     @classmethod

@@ -119,10 +119,8 @@ class Learned:
         ServiceError
             If it cannot be written.
         """
-        try:
+        with storage.writing(path):
             storage.write_atomically(path, self.to_bytes())
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another file") from None
 
     def to_bytes(self) -> bytes:
         """The content of the file that `save` writes."""

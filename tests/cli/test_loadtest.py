@@ -46,7 +46,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
         (["--rate", 0], "0.5<=x<=1000"),
         (["--json", "missing/x.json"], "give a file in a folder that exists"),
-        (["--output", "/dev/null/load"], "give another folder"),
+        (["--output", "/dev/null/load"], "give another place"),
         (["--set", "run.lockstep=true"], "leave out lockstep"),
     ],
 )

@@ -14,7 +14,7 @@ import numpy as np
 
 from catstream.box import Box
 
-__all__ = ["Boxes", "MultipleScores", "hota", "score_multiple"]
+__all__ = ["Boxes", "MultipleScores", "score_multiple"]
 
 #: The box of each object in one frame by name; None while it is absent.
 Boxes = Mapping[str, Box | None]
@@ -57,7 +57,7 @@ def score_multiple(truth: Sequence[Boxes], found: Sequence[Boxes]) -> MultipleSc
     true, reported = (sum(len(each[part]) for each in frames) for part in (0, 1))
     right, switches = _clear_mot(frames)
     mota = 1 - (true - right + reported - right + switches) / max(true, 1)
-    return MultipleScores(mota, _idf1(frames, totals), hota(truth, found), switches)
+    return MultipleScores(mota, _idf1(frames, totals), _hota(frames, totals), switches)
 
 
 def _clear_mot(frames: Sequence[_Frame]) -> tuple[int, int]:
@@ -97,22 +97,13 @@ def _idf1(frames: Sequence[_Frame], totals: tuple[int, int]) -> float:
     return 2 * float(together[linear_sum_assignment(-together)].sum()) / max(boxes, 1)
 
 
-def hota(truth: Sequence[Boxes], found: Sequence[Boxes]) -> float:
-    """Higher order tracking accuracy: the mean over the overlaps of sqrt(detection accuracy * association accuracy).
-
-    Examples
-    --------
-    >>> frames = [{"anna": Box(0, 0, 10, 10), "ben": Box(50, 0, 10, 10)}] * 4
-    >>> float(hota(frames, frames))
-    1.0
-    """
+def _hota(frames: Sequence[_Frame], totals: tuple[int, int]) -> float:
+    """Higher order tracking accuracy: the mean over the overlaps of sqrt(detection accuracy * association accuracy)."""
     from scipy.optimize import linear_sum_assignment
 
-    frames, (true_total, found_total) = _numbered(truth, found)
-    if not true_total or not found_total:
+    if not all(totals):
         return 0.0
-    together = np.zeros((true_total, found_total))
-    true_count, found_count = np.zeros((true_total, 1)), np.zeros((1, found_total))
+    together, true_count, found_count = np.zeros(totals), np.zeros((totals[0], 1)), np.zeros((1, totals[1]))
     for rows, columns, overlaps in frames:
         union = overlaps.sum(axis=0) + overlaps.sum(axis=1, keepdims=True) - overlaps
         together[np.ix_(rows, columns)] += np.divide(overlaps, union, out=np.zeros_like(overlaps), where=union > 0)

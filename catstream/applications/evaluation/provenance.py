@@ -12,9 +12,8 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 
 from threadpoolctl import threadpool_info
@@ -72,17 +71,8 @@ def machine() -> dict[str, object]:
         "python": platform.python_version(),
         "opencv": OPENCV,
         "blas": sorted(blas),
-        **_versions(),
+        **{library: version(library) for library in _LIBRARIES},
     }
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of the installed libraries."""
-    versions = {}
-    for library in _LIBRARIES:
-        with suppress(PackageNotFoundError):
-            versions[library] = version(library)
-    return versions
 
 
 def _processor() -> str:

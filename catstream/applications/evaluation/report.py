@@ -42,7 +42,7 @@ def write_report(
 
     Raises
     ------
-    VideoError
+    ServiceError
         If the file cannot be written.
     """
     rows = rows_of(runs)
@@ -76,7 +76,7 @@ def write_strips(path: Path, runs: list[EvaluationRun], count: int) -> Path:
 
     Raises
     ------
-    VideoError
+    ServiceError
         If the file cannot be written.
     """
     strips = map(failure_strip, worst_runs(runs, count))

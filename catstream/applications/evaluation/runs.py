@@ -28,6 +28,7 @@ from catstream.applications.evaluation.metrics import Score, score
 from catstream.applications.evaluation.peers import OPENCV
 from catstream.applications.evaluation.starts import Start
 from catstream.errors import CatstreamError, SettingsError, VideoError
+from catstream.messages.storage import writing
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
@@ -85,12 +86,12 @@ def prepare_folder(output: Path, settings: Settings) -> None:
     ------
     SettingsError
         If they were not; the message names the settings that differ.
-    VideoError
+    ServiceError
         If the folder cannot be written to.
     """
     file = output / "catstream" / "settings.json"
     values = settings.values() | {"catstream": version("catstream"), "opencv": OPENCV}
-    try:
+    with writing(output):
         if file.exists():
             before = json.loads(file.read_text(encoding="utf-8"))
             changed = sorted(key for key in {*before, *values} if before.get(key) != values.get(key))
@@ -102,8 +103,6 @@ def prepare_folder(output: Path, settings: Settings) -> None:
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise VideoError(f"cannot write results to {str(output)!r} ({error.strerror}): give another folder") from None
 
 
 def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
@@ -117,7 +116,7 @@ def save(output: Path, run: EvaluationRun) -> None:
 
     Raises
     ------
-    VideoError
+    ServiceError
         If a file cannot be written.
     """
     boxes, confidence, seconds = _files(output, run.tracker, run.name)
@@ -125,7 +124,7 @@ def save(output: Path, run: EvaluationRun) -> None:
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(folder, ignore_errors=True)
-    try:
+    with writing(home):
         for made in (part, home / "times"):
             made.mkdir(parents=True, exist_ok=True)
         np.savetxt(home / f"{run.name}.txt", run.boxes, fmt="%.4f", delimiter=",")
@@ -134,8 +133,6 @@ def save(output: Path, run: EvaluationRun) -> None:
         np.savetxt(part / confidence.name, run.confidence, fmt="%.6f")
         np.savetxt(part / seconds.name, run.seconds, fmt="%.8f")
         part.rename(folder)
-    except OSError as error:
-        raise VideoError(f"its result cannot be written to {str(home)!r} ({error.strerror}): free some space") from None
 
 
 def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> EvaluationRun | None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,54 +14,19 @@ import numpy as np
 
 from catstream.applications.finding.files import File
 from catstream.applications.finding.search import Step
-from catstream.applications.finding.sightings import GAP_SECONDS, Interval, Linker, Sighting
+from catstream.applications.finding.sightings import FileResult, Sighting
 from catstream.box import Box
 from catstream.errors import ServiceError
+from catstream.messages.storage import writing
 from catstream.video.image import jpeg
 
-__all__ = ["FileResult", "SearchLog"]
+__all__ = ["SearchLog"]
 
-_KIND = "catstream find 1"  # and the version of the lines
+_KIND = "catstream find 2"  # and the version of the lines
+_GAP_SECONDS = 1.0  # longest time between two sightings of an interval, if steps are short
 _GAP_STEPS = 2.5  # longest time between two sightings of an interval, in steps, if these are long
 _PICTURE = 240  # side of a picture in pixels
 _SURROUNDINGS = 1.7  # side of a picture, as a multiple of the longer side of the object's box
-
-
-@dataclass(slots=True)
-class FileResult:
-    """The result for one file so far.
-
-    file       path of the video, the image or the folder
-    signature  of the file when it was searched, see `File.signature`
-    linker     links its sightings into intervals
-    frames     number of its frames, None if unknown
-    position   frame of the last step, None before the first one
-    time       time of the last step in seconds
-    complete   whether the file was searched to its end, or to its damage
-    problems   reasons for what could not be read
-    sightings  in the order of the frames
-    """
-
-    file: str
-    signature: list[int]
-    linker: Linker
-    frames: int | None = None
-    position: int | None = None
-    time: float = 0.0
-    complete: bool = False
-    problems: list[str] = field(default_factory=list)
-    sightings: list[Sighting] = field(default_factory=list)
-
-    @property
-    def intervals(self) -> list[Interval]:
-        """The intervals of all objects, in the order of their first sighting."""
-        return self.linker.intervals
-
-    def add(self, position: int, time: float, sightings: Sequence[Sighting]) -> list[Interval]:
-        """Add a step; returns the interval of each sighting."""
-        self.position, self.time = position, time
-        self.sightings += sightings
-        return self.linker.add(sightings)
 
 
 class SearchLog:
@@ -82,15 +47,13 @@ class SearchLog:
     def __init__(self, path: Path, search: Mapping[str, Any], *, overwrite: bool = False) -> None:
         self.path, self.search = path, search
         self.results: dict[str, FileResult] = {}
-        try:
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             good = 0 if overwrite or not path.exists() else self._load(path.read_bytes())
             self._stream = path.open("ab")
             self._stream.truncate(good)  # the last line of a process that was killed may be incomplete
             if not good:
                 self._write({"kind": _KIND, "search": search})
-        except OSError as error:
-            raise ServiceError(f"cannot write {str(path)!r} ({error.strerror}): give another folder") from None
 
     def __enter__(self) -> Self:
         return self
@@ -116,7 +79,7 @@ class SearchLog:
             if interval.best is sighting:
                 interval.picture = _picture(image, sighting.box)
             picture = interval.picture if interval.best is sighting else b""
-            seen.append([*_values(sighting), base64.b64encode(picture).decode("ascii")])
+            seen.append(asdict(sighting) | {"picture": base64.b64encode(picture).decode("ascii")})
         self._write({"of": result.file, "step": step.frame, "time": step.time, "seen": seen})
 
     def note(self, result: FileResult, **facts: Any) -> None:
@@ -149,7 +112,7 @@ class SearchLog:
             if head["search"] == self.search:
                 for line in rest:
                     self._apply(line)
-        except (KeyError, TypeError, ValueError, binascii.Error) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, binascii.Error) as error:
             raise ServiceError(
                 f"{str(self.path)!r} is not the log of a search ({error}): give another folder, or --overwrite"
             ) from None
@@ -164,35 +127,19 @@ class SearchLog:
     def _apply(self, line: Mapping[str, Any]) -> None:
         """Change the results as a line says."""
         if "file" in line:
-            linker = Linker(max(GAP_SECONDS, _GAP_STEPS * self.search["every"]))
-            self.results[line["file"]] = FileResult(line["file"], line["signature"], linker)
+            gap = max(_GAP_SECONDS, _GAP_STEPS * self.search["every"])
+            self.results[line["file"]] = FileResult(line["file"], line["signature"], gap)
             return
         result = self.results[line["of"]]
         result.frames = line.get("frames", result.frames)
         result.complete = line.get("complete", result.complete)
         result.problems += [line["problem"]] if "problem" in line else []
         if "step" in line:
-            sightings = [_sighting(result.file, values[:-1]) for values in line["seen"]]
+            pictures = [each.pop("picture") for each in line["seen"]]
+            sightings = [Sighting(**each | {"box": Box(*each["box"])}) for each in line["seen"]]
             intervals = result.add(line["step"], line["time"], sightings)
-            for interval, (*_, picture) in zip(intervals, line["seen"], strict=True):
+            for interval, picture in zip(intervals, pictures, strict=True):
                 interval.picture = base64.b64decode(picture) or interval.picture
-
-
-def _values(sighting: Sighting) -> list[Any]:
-    return [
-        sighting.object,
-        sighting.frame,
-        sighting.time,
-        list(sighting.box),
-        sighting.score,
-        sighting.image,
-    ]
-
-
-def _sighting(file: str, values: Sequence[Any]) -> Sighting:
-    """The reverse of `_values`."""
-    name, frame, time, box, *rest = values
-    return Sighting(name, file, frame, time, Box(*box), *rest)
 
 
 def _picture(image: np.ndarray, box: Box) -> bytes:

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
-from catstream.applications.finding.log import FileResult
-from catstream.applications.finding.sightings import Interval
+from catstream.applications.finding.sightings import FileResult, Interval
 from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.timeline import Bar, clock, legend, timeline
 from catstream.messages.names import counted
@@ -25,7 +24,7 @@ def write_report(path: Path, objects: Sequence[str], results: Iterable[FileResul
 
     Raises
     ------
-    VideoError
+    ServiceError
         If the file cannot be written.
     """
     results = list(results)

@@ -273,19 +273,15 @@ def _scanned(scan: Scan, stretches: Iterator[_Stretch]) -> Generator[tuple[_Stre
     pending: deque[tuple[_Stretch, Future[list[list[Seen]]]]] = deque()
     problem: VideoError | None = None
     with ThreadPoolExecutor(workers, "scan") as pool:
-        while True:
-            while problem is None and len(pending) <= workers:
-                try:
-                    stretch = next(stretches, None)
-                except VideoError as error:
-                    problem = error
-                    break
-                if stretch is None:
-                    break
+        try:
+            for stretch in stretches:
                 pending.append((stretch, pool.submit(scan, stretch.frame.image)))
-            if not pending:
-                break
-            stretch, found = pending.popleft()
+                if len(pending) > workers:
+                    first, found = pending.popleft()
+                    yield first, found.result()
+        except VideoError as error:
+            problem = error
+        for stretch, found in pending:
             yield stretch, found.result()
     if problem is not None:
         raise problem

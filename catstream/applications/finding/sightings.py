@@ -1,4 +1,4 @@
-"""Sightings of objects, and their intervals: the sightings of one object that follow one another in a file."""
+"""The result for a file: sightings of objects, and intervals, the sightings of one object that follow one another."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from dataclasses import dataclass, field
 
 from catstream.box import Box
 
-__all__ = ["GAP_SECONDS", "Interval", "Linker", "Sighting"]
-
-#: Longest time between two sightings of an interval.
-GAP_SECONDS = 1.0
+__all__ = ["FileResult", "Interval", "Sighting"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,24 +65,42 @@ class Interval:
 
 
 @dataclass(slots=True)
-class Linker:
-    """Links the sightings of a file into intervals, frame by frame.
+class FileResult:
+    """The result for one file so far, step by step.
 
-    A sighting continues the interval of its object if that ended at most a second ago, wherever in the frame it is: a
-    model is of one object, so its intervals never overlap.
+    A sighting continues the interval of its object if that ended a short time ago, wherever in the frame it is: a model
+    is of one object, so its intervals never overlap.
 
+    file         path of the video, the image or the folder
+    signature    of the file when it was searched, see `File.signature`
     gap_seconds  longest time between two sightings of an interval
+    frames       number of its frames, None if unknown
+    position     frame of the last step, None before the first one
+    time         time of the last step in seconds
+    complete     whether the file was searched to its end, or to its damage
+    problems     reasons for what could not be read
+    sightings    in the order of the frames
     intervals    of all objects, in the order of their first sighting
     """
 
-    gap_seconds: float = GAP_SECONDS
+    file: str
+    signature: list[int]
+    gap_seconds: float
+    frames: int | None = None
+    position: int | None = None
+    time: float = 0.0
+    complete: bool = False
+    problems: list[str] = field(default_factory=list)
+    sightings: list[Sighting] = field(default_factory=list)
     intervals: list[Interval] = field(default_factory=list)
     _newest: dict[str, Interval] = field(default_factory=dict)  # of each object
 
-    def add(self, sightings: Iterable[Sighting]) -> list[Interval]:
-        """Link the sightings of one frame; returns their intervals, in the same order."""
+    def add(self, position: int, time: float, sightings: Iterable[Sighting]) -> list[Interval]:
+        """Add a step; returns the interval of each sighting."""
+        self.position, self.time = position, time
         found: list[Interval] = []
         for sighting in sightings:
+            self.sightings.append(sighting)
             interval = self._newest.get(sighting.object)
             if interval is None or sighting.time - interval.last.time > self.gap_seconds:
                 interval = self._newest[sighting.object] = Interval(sighting, sighting, sighting)

@@ -9,9 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from catstream.applications.finding.log import FileResult
-from catstream.applications.finding.sightings import Interval, Sighting
-from catstream.errors import ServiceError
+from catstream.applications.finding.sightings import FileResult, Interval, Sighting
 from catstream.messages import storage
 
 __all__ = ["write_tables"]
@@ -32,12 +30,10 @@ def write_tables(folder: Path, results: Iterable[FileResult], search: dict[str, 
     sightings = [_sighting_row(each) for result in results for each in result.sightings]
     intervals = [_interval_row(each) for result in results for each in result.intervals]
     found = {"search": search, "files": [_file(result) for result in results]}
-    try:
+    with storage.writing(folder):
         storage.write_atomically(folder / "sightings.csv", _csv(_SIGHTING, sightings))
         storage.write_atomically(folder / "intervals.csv", _csv(_INTERVAL, intervals))
         storage.write_atomically(folder / "found.json", json.dumps(found, indent=1).encode() + b"\n")
-    except OSError as error:
-        raise ServiceError(f"cannot write to {str(folder)!r} ({error.strerror}): give another folder") from None
 
 
 def _file(result: FileResult) -> dict[str, Any]:

@@ -7,8 +7,7 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from catstream.errors import VideoError
-from catstream.messages.storage import write_atomically
+from catstream.messages.storage import write_atomically, writing
 
 __all__ = ["figure", "table", "write_page"]
 
@@ -83,7 +82,7 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
 
     Raises
     ------
-    VideoError
+    ServiceError
         If the file cannot be written.
     """
     page = (
@@ -92,8 +91,6 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
         + "\n".join(part for part in body if part)
         + "\n</body></html>\n"
     )
-    try:
+    with writing(path):
         write_atomically(path, page.encode())
-    except OSError as error:
-        raise VideoError(f"cannot write the report {str(path)!r} ({error.strerror}): give another folder") from None
     return path

@@ -180,7 +180,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
 
     Raises
     ------
-    VideoError
+    ServiceError
         If the file cannot be written.
     """
     result = load_test.result

@@ -15,7 +15,7 @@ from catstream.applications.summaries.collection import Collection, Origin
 from catstream.applications.summaries.selection import Selection
 from catstream.applications.summaries.taught import TaughtFrame
 from catstream.errors import VideoError
-from catstream.messages.storage import write_atomically
+from catstream.messages.storage import write_atomically, writing
 from catstream.video.annotate import thumbnail
 from catstream.video.source import is_live, open_source
 
@@ -47,16 +47,14 @@ class Sheet:
 
         Raises
         ------
-        VideoError
+        ServiceError
             If a file cannot be written.
         """
         paragraphs = (f'<p class="about">{escape(text)}</p>' for text in self.about)
         heading = f"<h1>{escape(self.title)}</h1>"
         write_page(path, self.title, [heading, *paragraphs, '<div class="pictures">', *self.pictures, "</div>"])
-        try:
-            write_atomically(json_beside(path), (json.dumps(self.figures, indent=1) + "\n").encode())
-        except OSError as error:
-            raise VideoError(f"cannot write {str(json_beside(path))!r}: {error.strerror}") from None
+        with writing(json_beside(path)):
+            write_atomically(json_beside(path), json.dumps(self.figures, indent=1).encode(), b"\n")
 
 
 def json_beside(path: Path) -> Path:

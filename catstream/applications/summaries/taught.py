@@ -7,7 +7,7 @@ outside the span of the object's coreset before it, ||R (I - P)||^2 / ||R||^2, w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,9 +66,7 @@ class Novelty:
         return min(energy(outside) / max(energy(rows), 1e-30), 1.0)
 
 
-def taught_frames(
-    features: Iterable[Features], settings: CoresetSettings, step: Callable[[], None] | None = None
-) -> dict[str, list[TaughtFrame]]:
+def taught_frames(features: Iterable[Features], settings: CoresetSettings) -> dict[str, list[TaughtFrame]]:
     """Measure each frame that taught something of an object, in order; return the frames of each object by its name.
 
     If another object begins under a name, the frames of the one before are left out.
@@ -76,7 +74,6 @@ def taught_frames(
     Parameters
     ----------
     settings : of the coreset trees
-    step : called after each frame
     """
     frames: dict[str, list[TaughtFrame]] = {}
     novelties: dict[str, Novelty] = {}
@@ -88,8 +85,6 @@ def taught_frames(
                 of_object: Bool = training.labels == 1
                 new = novelties[name].of(training.rows[of_object])
                 frames[name].append(TaughtFrame(message.frame, message.time, part.box, new))
-        if step is not None:
-            step()
     return frames
 
 

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.multiple import hota, score_multiple
+from catstream.applications.evaluation.multiple import score_multiple
 from catstream.box import Box
 
 NAMES = "abcde"
@@ -39,7 +39,7 @@ def noisy_case(seed):
     ("seed", "expected"), [(0, 0.3964280489299904), (1, 0.37030759851651895), (2, 0.3984270674302707)]
 )
 def test_hota_is_that_of_trackeval(seed, expected):
-    assert hota(*noisy_case(seed)) == pytest.approx(expected, rel=1e-9)  # by TrackEval 1.3.0
+    assert score_multiple(*noisy_case(seed)).hota == pytest.approx(expected, rel=1e-9)  # by TrackEval 1.3.0
 
 
 def by_motmetrics(truth, found):

@@ -14,7 +14,7 @@ from catstream.applications.evaluation.failures import failure_strip, worst_runs
 from catstream.applications.evaluation.report import write_report, write_strips
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.applications.evaluation.starts import FIRST
-from catstream.errors import VideoError
+from catstream.errors import ServiceError
 from catstream.settings import Settings
 
 
@@ -79,7 +79,7 @@ def test_a_page_of_film_strips_has_the_worst_runs_only(tmp_path, sequence, lost)
 
 
 def test_a_report_that_cannot_be_written_is_an_error(tmp_path, lost):
-    with pytest.raises(VideoError, match="cannot write the report"):
+    with pytest.raises(ServiceError, match="cannot write"):
         write_report(tmp_path / "missing" / "report.html", [lost], Settings(), {})
 
 

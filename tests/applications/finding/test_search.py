@@ -89,7 +89,7 @@ def test_the_log_of_another_search_is_not_continued(search, tmp_path):
         assert not log.results
 
 
-@pytest.mark.parametrize("content", ["[]\n", '{"kind":"other"}\n', "no json\n", '{"kind":"catstream find 1"}\n'])
+@pytest.mark.parametrize("content", ["[]\n", '{"kind":"other"}\n', "no json\n", '{"kind":"catstream find 2"}\n'])
 def test_a_file_that_is_no_log_is_an_error_and_stays(search, tmp_path, content):
     (tmp_path / "log").write_text(content)
     with pytest.raises(ServiceError, match="is not the log of a search"):
