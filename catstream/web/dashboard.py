@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from itertools import takewhile
 from typing import Any, Literal
 
@@ -12,9 +13,8 @@ from catstream.web.objects import Objects
 from catstream.web.recent import Recent
 from catstream.web.surprising import SurprisingFrames
 from catstream.web.timing import POINT_SECONDS, RATE_SECONDS, SILENCE_SECONDS
-from catstream.web.viewers import Parts
 
-__all__ = ["RUNNING", "Dashboard", "FleetDashboard"]
+__all__ = ["RUNNING", "Dashboard", "FleetDashboard", "Parts"]
 
 #: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
@@ -32,13 +32,55 @@ _PICTURES = 64  # number of pictures that a page may still request, for slow con
 _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
+class Parts:
+    """The state of a page, in parts that are sent to each open page when they have changed.
+
+    Parameters
+    ----------
+    parts : of each part the function that returns it as JSON values; its argument is the number of changes since the
+        page has received it. The parts are sent in this order
+
+    Attributes
+    ----------
+    phase, reason : phase of the pipeline or the fleet, and the reason of its end or silence
+    """
+
+    def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
+        self._parts = parts
+        self._revisions: Counter[str] = Counter()
+        self.phase: Phase = "waiting"
+        self.reason = ""
+        self._mark_changed(*parts)
+
+    def updates(self, seen: dict[str, int]) -> dict[str, object]:
+        """Return the parts that have changed since the last call for this page; all at first.
+
+        Parameters
+        ----------
+        seen : revisions that the page has received; empty at first, updated by this call
+        """
+        news = {name: self._revisions[name] - seen.get(name, 0) for name in self._parts}
+        seen.update(self._revisions)
+        return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
+
+    def mark_silent(self, reason: str, now: float) -> None:  # noqa: ARG002  # a fleet keeps its age
+        """Record that nothing arrives, at the time `now` in seconds of a monotonic clock."""
+        if self.phase == "running":
+            self.phase = "silent"
+        if self.phase != "ended":
+            self.reason = reason
+        self._mark_changed("status")
+
+    def _mark_changed(self, *parts: str) -> None:
+        self._revisions.update(parts)
+
+
 class Dashboard(Parts):
     """Receives messages, and returns the updates for each open page.
 
     It shows one pipeline. It keeps the last picture and figures until the first track or health report of another
     pipeline arrives; then it drops all state of the previous one.
 
-    phase, reason : phase of the pipeline, and the reason of its end or silence
     endpoint, source : endpoint of the pipeline, and its source of frames
     health : last health report of each process
     last_reports : arrival time of the last health report of each process that is not silent
@@ -57,7 +99,6 @@ class Dashboard(Parts):
                 "surprising": self._surprising_part,
             }
         )
-        self._mark_changed("pipeline", "trees")
         self.endpoint = self._attached = ""
         self._run = ""  # id of the run that is shown
         self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
@@ -99,7 +140,7 @@ class Dashboard(Parts):
             if self._run:
                 self._runs_before.add(self._run)
                 self._reset()
-                self._mark_changed("pipeline", "status", "tracks", "picture", "trees", "surprising")
+                self._mark_changed(*self._parts)
             self._run, self.endpoint = run, self._attached
         match message:
             case Track():
@@ -117,15 +158,11 @@ class Dashboard(Parts):
                 self.phase, self.reason = "ended", message.reason
                 self._mark_changed("status")
 
-    def mark_silent(self, reason: str) -> None:
+    def mark_silent(self, reason: str, now: float) -> None:
         """Record that the pipeline is silent or does not exist."""
-        if self.phase == "running":
-            self.phase = "silent"
-        if self.phase != "ended":
-            self.reason = reason
+        super().mark_silent(reason, now)
         self.health.clear()
         self.last_reports.clear()
-        self._mark_changed("status")
 
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
@@ -281,40 +318,34 @@ class FleetDashboard(Parts):
 
     Attributes
     ----------
-    status : the last status, None before the first
-    phase, reason : phase of the fleet, and the reason why it does not answer
+    status : the last status, without a stream before the first
     age : seconds since the last status arrived, 0 while the fleet answers
     """
 
     def __init__(self) -> None:
-        self._streams: dict[str, dict[str, Any]] = {}
-        self._nodes: dict[str, dict[str, Any]] = {}
         super().__init__(
-            {"fleet": self._fleet_part, "streams": lambda _: self._streams, "nodes": lambda _: self._nodes}
+            {
+                "status": self._status_part,
+                "streams": lambda _: {name: _stream(each) for name, each in self.status.streams.items()},
+                "nodes": lambda _: {name: _node(each) for name, each in self.status.nodes.items()},
+            }
         )
-        self.status: FleetStatus | None = None
-        self.phase: Phase = "waiting"
-        self.reason = ""
+        self.status = FleetStatus("", 0.0)
         self.age = self._arrived = 0.0
-        self._mark_changed("fleet")
 
     def take(self, status: FleetStatus, now: float) -> None:
         """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""
         self.status, self.phase, self.reason, self.age, self._arrived = status, "running", "", 0.0, now
-        self._streams = {name: _stream(each) for name, each in status.streams.items()}
-        self._nodes = {name: _node(each) for name, each in status.nodes.items()}
-        self._mark_changed("fleet", "streams", "nodes")
+        self._mark_changed(*self._parts)
 
     def mark_silent(self, reason: str, now: float) -> None:
         """Record that the fleet did not answer at the time `now`."""
-        self.reason = reason
-        if self.status is not None:
-            self.phase, self.age = "silent", now - self._arrived
-        self._mark_changed("fleet")
+        super().mark_silent(reason, now)
+        if self.phase == "silent":
+            self.age = now - self._arrived
 
-    def _fleet_part(self, _: int) -> dict[str, object]:
-        name = self.status.name if self.status is not None else ""
-        return {"name": name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
+    def _status_part(self, _: int) -> dict[str, object]:
+        return {"name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
 
 
 def _stream(stream: StreamStatus) -> dict[str, Any]:

@@ -2,14 +2,13 @@
 
 import { BoxForm } from "./boxform.js";
 import { Charts } from "./charts.js";
-import { write } from "./dom.js";
+import { $, write } from "./dom.js";
 import { Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
 
 const MESSAGE = { delay: 8000, duration: 1000 }; // milliseconds that a message is shown, and fades
-const $ = (selector) => document.querySelector(selector);
 
 export class StreamPage {
   /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
@@ -44,16 +43,10 @@ export class StreamPage {
     addEventListener("resize", () => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
   }
 
-  /** Whether the page must stay connected, although it is hidden. */
-  get busy() {
-    return this.stage.drawing;
-  }
-
-  /** Show the parts that have changed; `pipeline` is sent if all that was shown is of another one. */
+  /** Show the parts that have changed; `pipeline` is sent, with all of them, if all that was shown is of another one. */
   take({ pipeline, status, tracks, picture, points, trees, surprising }) {
     if (pipeline !== undefined) this.clear();
     if (status) {
-      if (status.phase !== "running" && this.status.phase === "running") this.stage.cancel(false);
       this.status = status;
       this.showPaused(Boolean(status.paused));
     }
@@ -73,17 +66,7 @@ export class StreamPage {
   clear() {
     this.stage.clear();
     this.charts.clear();
-    this.surprising.show({ measured: 0, frames: [] });
-    this.objects.show([]);
-    this.frame = null;
     this.showMessage("");
-    this.showFrame();
-  }
-
-  /** The server does not answer. */
-  lose() {
-    this.stage.cancel(false);
-    this.showState();
   }
 
   /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
@@ -199,6 +182,7 @@ export class StreamPage {
   showState() {
     const { status, stage, server } = this;
     const running = status.phase === "running" && server.silent === null;
+    if (!running) stage.cancel(false);
     const [state, words] = this.state(running);
     $("#state").dataset.state = state;
     write($("#state b"), words);
