@@ -25,7 +25,7 @@ RUNNING = ("running", "waiting", "paused")
 _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
-_PICTURES = 64  # number of pictures that a page may still request, for slow connections
+_PICTURES = 64  # number of pictures that a page may still request, for slow connections, or whose features may arrive
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
@@ -78,8 +78,8 @@ class Parts:
 class Dashboard(Parts):
     """Receives messages, and returns the updates for each open page.
 
-    It shows one pipeline. It keeps the last picture and figures until the first track or health report of another
-    pipeline arrives; then it drops all state of the previous one.
+    It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
+    then it drops all state of the previous one.
 
     endpoint, source : endpoint of the pipeline, and its source of frames
     health : last health report of each process
@@ -111,8 +111,8 @@ class Dashboard(Parts):
         self.objects = Objects()
         self.health: dict[str, Health] = {}
         self.last_reports: dict[str, float] = {}
-        self.surprising = SurprisingFrames()
         self.pictures = Recent[int, Preview](_PICTURES)
+        self.surprising = SurprisingFrames(self.pictures)
         self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
@@ -142,6 +142,9 @@ class Dashboard(Parts):
                 self._reset()
                 self._mark_changed(*self._parts)
             self._run, self.endpoint = run, self._attached
+        if self.phase in ("waiting", "silent") and not isinstance(message, End):
+            self.phase, self.reason = "running", ""
+            self._mark_changed("status")
         match message:
             case Track():
                 self._add_track(message, now)
@@ -199,8 +202,6 @@ class Dashboard(Parts):
         self.last_reports = {name: last for name, last in times.items() if now - last <= SILENCE_SECONDS}
         self._last[health.process] = health
         self.source = health.source or self.source
-        if self.phase in ("waiting", "silent"):
-            self.phase, self.reason = "running", ""
         if health.process == "detector":
             self._add_objects(health)
         self._add_point(now)
@@ -216,9 +217,6 @@ class Dashboard(Parts):
             self._mark_changed("tracks")
 
     def _add_track(self, track: Track, now: float) -> None:
-        if self.phase != "running":
-            self.phase, self.reason = "running", ""
-            self._mark_changed("status")
         if self.objects.add_track(track):
             self.surprising.drop({track.object})
             self._mark_changed("surprising")
@@ -235,7 +233,7 @@ class Dashboard(Parts):
 
     def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview
-        if self.surprising.add_preview(preview):
+        if self.surprising.measure(preview.frame):
             self._mark_changed("surprising")
         self._mark_changed("picture")
 

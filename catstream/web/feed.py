@@ -23,9 +23,9 @@ __all__ = ["Feed", "PipelineFeed"]
 
 _log = logging.getLogger(__name__)
 
-#: Channels that show that a pipeline runs; those that are read while it runs; and those that are read only while a page
-#: is open, because they cost the pipeline processor time.
-_LIVENESS, _PERMANENT, _FOR_VIEWERS = ("tracks", "health"), ("models",), ("previews", "features")
+#: Channels that are always read, and those that are read only while a page is open, because they cost the pipeline
+#: processor time.
+_PERMANENT, _FOR_VIEWERS = ("tracks", "health", "models"), ("previews", "features")
 
 
 class Feed(ABC):
@@ -118,7 +118,6 @@ class PipelineFeed(Feed):
         self._endpoint, self._keys = endpoint, keys
         self.dashboard = Dashboard()
         self.place: Endpoint | None = None
-        self._is_running = asyncio.Event()
 
     @property
     def problem(self) -> str:
@@ -139,10 +138,7 @@ class PipelineFeed(Feed):
 
     async def _receive(self, place: Endpoint) -> None:
         """Receive all channels until the pipeline ends or is silent."""
-        self._is_running.clear()
-        tasks = [
-            asyncio.create_task(self._forward(place, channel)) for channel in (*_LIVENESS, *_PERMANENT, *_FOR_VIEWERS)
-        ]
+        tasks = [asyncio.create_task(self._forward(place, channel)) for channel in (*_PERMANENT, *_FOR_VIEWERS)]
         try:
             done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -156,22 +152,14 @@ class PipelineFeed(Feed):
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _forward(self, place: Endpoint, channel: str) -> End | None:
-        """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers.
-
-        The other channels are read only once the pipeline runs: before, they could give the last message of the
-        previous pipeline at the same endpoint.
-        """
+        """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers."""
         timeout = SILENCE_SECONDS if channel == "health" else None
         while True:
-            if channel not in _LIVENESS:
-                await self._is_running.wait()
             if channel in _FOR_VIEWERS:
                 await self._has_viewers.wait()
             with Subscription[AnyMessage](place, channel, timeout=timeout) as messages:
                 async for message in messages:
                     self.dashboard.take(message, monotonic(), messages.run)
-                    if self.dashboard.phase == "running":
-                        self._is_running.set()
                     if channel in _FOR_VIEWERS and not self.viewers:
                         break
                 else:

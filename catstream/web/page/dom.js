@@ -58,7 +58,7 @@ export class Items {
     let next = this.parent.firstElementChild;
     for (const [name, value] of pairs) {
       const item = items.get(name), text = JSON.stringify(value);
-      if (item.text !== text) this.fill?.(item, value);
+      if (item.text !== text) this.fill(item, value);
       item.text = text;
       if (item.element === next) next = next.nextElementSibling;
       else this.parent.insertBefore(item.element, next);

@@ -22,7 +22,6 @@ export class FleetPage {
     this.fleet = status ?? this.fleet;
     if (nodes) this.nodes.show(nodes);
     if (streams) this.streams.show(streams, this.nodes.rows);
-    this.search.offer(this.streams.cards);
     this.showMatching();
     this.showState();
     this.restorePosition();
@@ -30,6 +29,7 @@ export class FleetPage {
 
   showMatching() {
     const { streams, search, fleet } = this;
+    search.offer(streams.cards);
     const shown = streams.filter((card) => search.matches(card));
     const empty = fleet.phase === "running" && !streams.cards.length;
     $(".find").hidden = !streams.cards.length;

@@ -15,9 +15,8 @@ export class StreamPage {
   constructor(server) {
     this.server = server;
     this.name = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // empty if there is one stream
-    this.status = { phase: "waiting" };
+    this.status = { phase: "waiting", paused: false };
     this.frame = null; // number and time of the newest frame
-    this.paused = false;
     this.charts = new Charts($(".charts"));
     this.trees = new Trees($(".trees"), $("#tree-summary"));
     this.surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
@@ -34,7 +33,7 @@ export class StreamPage {
   /** Attach the handlers of the controls. */
   listen() {
     $("#draw").onclick = () => { $("#stage").focus(); this.stage.begin(); };
-    $("#pause").onclick = () => this.send(this.paused ? "resume" : "pause");
+    $("#pause").onclick = () => this.send(this.status.paused ? "resume" : "pause");
     $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
       "Stop it", "Continue", () => this.send("stop"));
     const trees = $("#trees details");
@@ -48,7 +47,7 @@ export class StreamPage {
     if (pipeline !== undefined) this.clear();
     if (status) {
       this.status = status;
-      this.showPaused(Boolean(status.paused));
+      this.showState();
     }
     if (tracks) {
       this.frame = tracks.frame === null ? null : { number: tracks.frame, time: tracks.time };
@@ -85,14 +84,15 @@ export class StreamPage {
     }
     this.showMessage(answer.reason, !answer.done);
     if (!answer.done) return null;
-    if (verb === "pause" || verb === "resume") this.showPaused(verb === "pause");
+    if (verb === "pause" || verb === "resume") this.status.paused = verb === "pause";
+    this.showState();
     return answer;
   }
 
   /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
   async pause() {
     if (this.isWaiting) return { frame: Infinity, leave: null };
-    const before = this.paused;
+    const before = this.status.paused;
     const answer = await this.send("pause");
     if (!answer) return null;
     this.showMessage("Paused for your box.", false, false);
@@ -172,13 +172,6 @@ export class StreamPage {
     write($("#frame"), this.frame ? `frame ${number}, ${time.toFixed(1)} s${model === undefined ? "" : `, model ${model}`}` : "");
   }
 
-  showPaused(now) {
-    this.paused = now;
-    write($("#pause"), now ? "Resume" : "Pause");
-    $("#pause").setAttribute("aria-pressed", String(now));
-    this.showState();
-  }
-
   showState() {
     const { status, stage, server } = this;
     const running = status.phase === "running" && server.silent === null;
@@ -190,6 +183,8 @@ export class StreamPage {
     write($("#overlay"), this.overlay(running));
     $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
     $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
+    write($("#pause"), status.paused ? "Resume" : "Pause");
+    $("#pause").setAttribute("aria-pressed", String(status.paused));
     for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
   }
 
@@ -202,7 +197,7 @@ export class StreamPage {
     if (this.isWaiting) return ["waiting", "waiting for a box"];
     const state = ["present", "bootstrapping", "absent"].find((each) => list.some((one) => one.state === each)) ?? "waiting";
     const words = list.length > 1 ? `${list.filter((one) => one.state !== "absent").length} of ${list.length} present` : state;
-    return [state, this.paused ? `paused, ${words}` : words];
+    return [state, status.paused ? `paused, ${words}` : words];
   }
 
   /** Whether there is no object. The status is one of each second, so after the first box the tracks are newer. */
