@@ -21,11 +21,13 @@ of a fleet only
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import Annotated, Literal
 
 from starlette.applications import Starlette
@@ -46,7 +48,7 @@ from catstream.web.connections import body_of
 from catstream.web.feed import Feed, PipelineFeed
 from catstream.web.server import Site
 from catstream.web.streams import FleetFeed
-from catstream.web.timing import UPDATE_SECONDS
+from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
 from catstream.wire.codec import decode_json
 
 __all__ = ["fleet_site", "pipeline_site"]
@@ -76,12 +78,12 @@ def _site(feed: PipelineFeed | FleetFeed) -> Site:
         yield
         await asyncio.wait([feed.stop()])
 
-    app = Starlette(lifespan=lifespan, routes=_routes(feed), exception_handlers={CatstreamError: _failed})
-    return Site(app, feed.close_viewers)
-
-
-def _routes(feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
     pages = _Pages(feed)
+    app = Starlette(lifespan=lifespan, routes=_routes(feed, pages), exception_handlers={CatstreamError: _failed})
+    return Site(app, pages.close)
+
+
+def _routes(feed: PipelineFeed | FleetFeed, pages: _Pages) -> list[BaseRoute]:
     common = [
         Route("/", pages.index),
         Route("/events", pages.events),
@@ -110,14 +112,18 @@ class _Pages:
 
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
+        self._closed = False
+
+    def close(self) -> None:
+        """End the streams of all open pages."""
+        self._closed = True
 
     async def index(self, request: Request) -> Response:
         self._feed_of(request)
         return FileResponse(_PAGE / "index.html")
 
     async def events(self, request: Request) -> Response:
-        feed = self._feed_of(request)
-        return feed.viewers.events(feed.dashboard)
+        return StreamingResponse(self._updates(self._feed_of(request)), media_type="text/event-stream")
 
     async def metrics(self, request: Request) -> Response:
         text = metrics.text(self._feed_of(request))
@@ -137,8 +143,8 @@ class _Pages:
         return Response(preview.jpeg, media_type="image/jpeg")
 
     async def live(self, request: Request) -> Response:
-        stream = _annotated_stream(self._pipeline(request))
-        return StreamingResponse(stream, media_type="multipart/x-mixed-replace; boundary=picture")
+        pictures = self._annotated_pictures(self._pipeline(request))
+        return StreamingResponse(pictures, media_type="multipart/x-mixed-replace; boundary=picture")
 
     async def control(self, request: Request) -> Response:
         feed = self._pipeline(request)
@@ -160,25 +166,47 @@ class _Pages:
         """Return the feed of the stream that a request names, or of the only one."""
         return self._feed.pipeline(request.path_params.get("stream", ""))
 
+    async def _updates(self, feed: Feed) -> AsyncIterator[str]:
+        """Yield the parts of a page that have changed, as server-sent events."""
+        seen: dict[str, int] = {}
+        last_sent = monotonic()
+        with feed.viewed():
+            yield f"retry: {1000 * RETRY_SECONDS:.0f}\n\n"
+            while not self._closed:
+                if parts := feed.dashboard.updates(seen):
+                    last_sent = monotonic()
+                    yield _event(parts)
+                elif monotonic() - last_sent > KEEP_ALIVE_SECONDS:
+                    last_sent = monotonic()
+                    yield ":\n\n"
+                await asyncio.sleep(UPDATE_SECONDS)
+            yield _event({**feed.dashboard.updates(seen), "closed": True})
+
+    async def _annotated_pictures(self, feed: PipelineFeed) -> AsyncIterator[bytes]:
+        """Yield the parts of an MJPEG stream."""
+        shown = None
+        with feed.viewed():
+            yield b"--picture\r\n"
+            while not self._closed:
+                newest = feed.dashboard.newest
+                if newest is not None and newest != shown:
+                    shown = newest
+                    jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.objects.colours)
+                    # The boundary after the picture is sent with it: many clients show a picture only after it.
+                    yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
+                        len(jpeg),
+                        jpeg,
+                    )
+                await asyncio.sleep(UPDATE_SECONDS)
+
+
+def _event(parts: dict[str, object]) -> str:
+    return f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
+
 
 async def _small_picture(feed: FleetFeed, request: Request) -> Response:
     jpeg = await feed.picture(request.path_params["stream"])
     return Response(status_code=204) if jpeg is None else Response(jpeg, media_type="image/jpeg")
-
-
-async def _annotated_stream(feed: PipelineFeed) -> AsyncIterator[bytes]:
-    """Yield the parts of an MJPEG stream."""
-    shown = None
-    with feed.viewers.counted():
-        yield b"--picture\r\n"
-        while not feed.viewers.closed:
-            newest = feed.dashboard.newest
-            if newest is not None and newest != shown:
-                shown = newest
-                jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.objects.colours)
-                # The boundary after the picture is sent with it: many clients show a picture only after it.
-                yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (len(jpeg), jpeg)
-            await asyncio.sleep(UPDATE_SECONDS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from itertools import takewhile
 from typing import Any, Literal
 
@@ -12,9 +13,8 @@ from catstream.web.objects import Objects
 from catstream.web.recent import Recent
 from catstream.web.surprising import SurprisingFrames
 from catstream.web.timing import POINT_SECONDS, RATE_SECONDS, SILENCE_SECONDS
-from catstream.web.viewers import Parts
 
-__all__ = ["RUNNING", "Dashboard", "FleetDashboard"]
+__all__ = ["RUNNING", "Dashboard", "FleetDashboard", "Parts"]
 
 #: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
@@ -25,20 +25,62 @@ RUNNING = ("running", "waiting", "paused")
 _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
-_PICTURES = 64  # number of pictures that a page may still request, for slow connections
+_PICTURES = 64  # number of pictures that a page may still request, for slow connections, or whose features may arrive
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
 _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
+class Parts:
+    """The state of a page, in parts that are sent to each open page when they have changed.
+
+    Parameters
+    ----------
+    parts : of each part the function that returns it as JSON values; its argument is the number of changes since the
+        page has received it. The parts are sent in this order
+
+    Attributes
+    ----------
+    phase, reason : phase of the pipeline or the fleet, and the reason of its end or silence
+    """
+
+    def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
+        self._parts = parts
+        self._revisions: Counter[str] = Counter()
+        self.phase: Phase = "waiting"
+        self.reason = ""
+        self._mark_changed(*parts)
+
+    def updates(self, seen: dict[str, int]) -> dict[str, object]:
+        """Return the parts that have changed since the last call for this page; all at first.
+
+        Parameters
+        ----------
+        seen : revisions that the page has received; empty at first, updated by this call
+        """
+        news = {name: self._revisions[name] - seen.get(name, 0) for name in self._parts}
+        seen.update(self._revisions)
+        return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
+
+    def mark_silent(self, reason: str, now: float) -> None:  # noqa: ARG002  # a fleet keeps its age
+        """Record that nothing arrives, at the time `now` in seconds of a monotonic clock."""
+        if self.phase == "running":
+            self.phase = "silent"
+        if self.phase != "ended":
+            self.reason = reason
+        self._mark_changed("status")
+
+    def _mark_changed(self, *parts: str) -> None:
+        self._revisions.update(parts)
+
+
 class Dashboard(Parts):
     """Receives messages, and returns the updates for each open page.
 
-    It shows one pipeline. It keeps the last picture and figures until the first track or health report of another
-    pipeline arrives; then it drops all state of the previous one.
+    It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
+    then it drops all state of the previous one.
 
-    phase, reason : phase of the pipeline, and the reason of its end or silence
     endpoint, source : endpoint of the pipeline, and its source of frames
     health : last health report of each process
     last_reports : arrival time of the last health report of each process that is not silent
@@ -57,7 +99,6 @@ class Dashboard(Parts):
                 "surprising": self._surprising_part,
             }
         )
-        self._mark_changed("pipeline", "trees")
         self.endpoint = self._attached = ""
         self._run = ""  # id of the run that is shown
         self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
@@ -70,8 +111,8 @@ class Dashboard(Parts):
         self.objects = Objects()
         self.health: dict[str, Health] = {}
         self.last_reports: dict[str, float] = {}
-        self.surprising = SurprisingFrames()
         self.pictures = Recent[int, Preview](_PICTURES)
+        self.surprising = SurprisingFrames(self.pictures)
         self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
@@ -99,8 +140,11 @@ class Dashboard(Parts):
             if self._run:
                 self._runs_before.add(self._run)
                 self._reset()
-                self._mark_changed("pipeline", "status", "tracks", "picture", "trees", "surprising")
+                self._mark_changed(*self._parts)
             self._run, self.endpoint = run, self._attached
+        if self.phase in ("waiting", "silent") and not isinstance(message, End):
+            self.phase, self.reason = "running", ""
+            self._mark_changed("status")
         match message:
             case Track():
                 self._add_track(message, now)
@@ -117,15 +161,11 @@ class Dashboard(Parts):
                 self.phase, self.reason = "ended", message.reason
                 self._mark_changed("status")
 
-    def mark_silent(self, reason: str) -> None:
+    def mark_silent(self, reason: str, now: float) -> None:
         """Record that the pipeline is silent or does not exist."""
-        if self.phase == "running":
-            self.phase = "silent"
-        if self.phase != "ended":
-            self.reason = reason
+        super().mark_silent(reason, now)
         self.health.clear()
         self.last_reports.clear()
-        self._mark_changed("status")
 
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
@@ -162,8 +202,6 @@ class Dashboard(Parts):
         self.last_reports = {name: last for name, last in times.items() if now - last <= SILENCE_SECONDS}
         self._last[health.process] = health
         self.source = health.source or self.source
-        if self.phase in ("waiting", "silent"):
-            self.phase, self.reason = "running", ""
         if health.process == "detector":
             self._add_objects(health)
         self._add_point(now)
@@ -179,9 +217,6 @@ class Dashboard(Parts):
             self._mark_changed("tracks")
 
     def _add_track(self, track: Track, now: float) -> None:
-        if self.phase != "running":
-            self.phase, self.reason = "running", ""
-            self._mark_changed("status")
         if self.objects.add_track(track):
             self.surprising.drop({track.object})
             self._mark_changed("surprising")
@@ -198,7 +233,7 @@ class Dashboard(Parts):
 
     def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview
-        if self.surprising.add_preview(preview):
+        if self.surprising.measure(preview.frame):
             self._mark_changed("surprising")
         self._mark_changed("picture")
 
@@ -281,40 +316,34 @@ class FleetDashboard(Parts):
 
     Attributes
     ----------
-    status : the last status, None before the first
-    phase, reason : phase of the fleet, and the reason why it does not answer
+    status : the last status, without a stream before the first
     age : seconds since the last status arrived, 0 while the fleet answers
     """
 
     def __init__(self) -> None:
-        self._streams: dict[str, dict[str, Any]] = {}
-        self._nodes: dict[str, dict[str, Any]] = {}
         super().__init__(
-            {"fleet": self._fleet_part, "streams": lambda _: self._streams, "nodes": lambda _: self._nodes}
+            {
+                "status": self._status_part,
+                "streams": lambda _: {name: _stream(each) for name, each in self.status.streams.items()},
+                "nodes": lambda _: {name: _node(each) for name, each in self.status.nodes.items()},
+            }
         )
-        self.status: FleetStatus | None = None
-        self.phase: Phase = "waiting"
-        self.reason = ""
+        self.status = FleetStatus("", 0.0)
         self.age = self._arrived = 0.0
-        self._mark_changed("fleet")
 
     def take(self, status: FleetStatus, now: float) -> None:
         """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""
         self.status, self.phase, self.reason, self.age, self._arrived = status, "running", "", 0.0, now
-        self._streams = {name: _stream(each) for name, each in status.streams.items()}
-        self._nodes = {name: _node(each) for name, each in status.nodes.items()}
-        self._mark_changed("fleet", "streams", "nodes")
+        self._mark_changed(*self._parts)
 
     def mark_silent(self, reason: str, now: float) -> None:
         """Record that the fleet did not answer at the time `now`."""
-        self.reason = reason
-        if self.status is not None:
-            self.phase, self.age = "silent", now - self._arrived
-        self._mark_changed("fleet")
+        super().mark_silent(reason, now)
+        if self.phase == "silent":
+            self.age = now - self._arrived
 
-    def _fleet_part(self, _: int) -> dict[str, object]:
-        name = self.status.name if self.status is not None else ""
-        return {"name": name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
+    def _status_part(self, _: int) -> dict[str, object]:
+        return {"name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
 
 
 def _stream(stream: StreamStatus) -> dict[str, Any]:

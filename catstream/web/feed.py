@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from time import monotonic
 
 from catstream.client.control import Control
@@ -12,9 +14,8 @@ from catstream.client.registry import locate
 from catstream.client.subscription import AnyMessage, Subscription
 from catstream.errors import CatstreamError
 from catstream.messages.kinds import End
-from catstream.web.dashboard import Dashboard
+from catstream.web.dashboard import Dashboard, Parts
 from catstream.web.timing import DRAIN_SECONDS, PAUSE_SECONDS, SILENCE_SECONDS
-from catstream.web.viewers import Parts, Viewers
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
@@ -22,18 +23,18 @@ __all__ = ["Feed", "PipelineFeed"]
 
 _log = logging.getLogger(__name__)
 
-#: Channels that show that a pipeline runs; those that are read while it runs; and those that are read only while a page
-#: is open, because they cost the pipeline processor time.
-_LIVENESS, _PERMANENT, _FOR_VIEWERS = ("tracks", "health"), ("models",), ("previews", "features")
+#: Channels that are always read, and those that are read only while a page is open, because they cost the pipeline
+#: processor time.
+_PERMANENT, _FOR_VIEWERS = ("tracks", "health", "models"), ("previews", "features")
 
 
 class Feed(ABC):
-    """Keeps a dashboard up to date while it runs.
+    """Keeps a dashboard up to date while it runs, and counts the open pages.
 
     Attributes
     ----------
     dashboard : the state of the page
-    viewers : the open pages
+    viewers : number of open pages
     used : time of the last request to the page
     """
 
@@ -41,8 +42,9 @@ class Feed(ABC):
     _task: asyncio.Task[None]
 
     def __init__(self) -> None:
-        self.viewers = Viewers()
+        self.viewers = 0
         self.used = 0.0
+        self._has_viewers = asyncio.Event()
 
     @property
     @abstractmethod
@@ -53,9 +55,17 @@ class Feed(ABC):
     def pipeline(self, stream: str) -> PipelineFeed:
         """Return the feed of a stream; this one, if it is that of a pipeline."""
 
-    def close_viewers(self) -> None:
-        """End the updates of open pages."""
-        self.viewers.closed = True
+    @contextmanager
+    def viewed(self) -> Iterator[None]:
+        """Count an open page inside a `with`."""
+        self.viewers += 1
+        self._has_viewers.set()
+        try:
+            yield
+        finally:
+            self.viewers -= 1
+            if not self.viewers:
+                self._has_viewers.clear()
 
     def start(self) -> None:
         """Feed the dashboard in a task, until `stop`."""
@@ -72,10 +82,10 @@ class Feed(ABC):
             try:
                 await self._feed()
             except CatstreamError as error:
-                self._mark_silent(str(error))
+                self.dashboard.mark_silent(str(error), monotonic())
             except Exception as error:  # an unexpected error must not end the feed silently
                 _log.exception("The page lost what it shows, and tries again.")
-                self._mark_silent(f"{type(error).__name__}: {error}")
+                self.dashboard.mark_silent(f"{type(error).__name__}: {error}", monotonic())
             await asyncio.sleep(self._pause)
 
     #: Seconds between two calls of `_feed`.
@@ -84,10 +94,6 @@ class Feed(ABC):
     @abstractmethod
     async def _feed(self) -> None:
         """Feed the dashboard, until the connection is lost or the answer is complete."""
-
-    @abstractmethod
-    def _mark_silent(self, reason: str) -> None:
-        """Tell the dashboard that nothing arrives."""
 
 
 class PipelineFeed(Feed):
@@ -112,7 +118,6 @@ class PipelineFeed(Feed):
         self._endpoint, self._keys = endpoint, keys
         self.dashboard = Dashboard()
         self.place: Endpoint | None = None
-        self._is_running = asyncio.Event()
 
     @property
     def problem(self) -> str:
@@ -126,9 +131,6 @@ class PipelineFeed(Feed):
         """Connect to the pipeline to send commands."""
         return Control(self.place or self._endpoint, keys=self._keys)
 
-    def _mark_silent(self, reason: str) -> None:
-        self.dashboard.mark_silent(reason)
-
     async def _feed(self) -> None:
         self.place = await asyncio.to_thread(locate, self._endpoint, self._keys)
         self.dashboard.attach(str(self.place))
@@ -136,10 +138,7 @@ class PipelineFeed(Feed):
 
     async def _receive(self, place: Endpoint) -> None:
         """Receive all channels until the pipeline ends or is silent."""
-        self._is_running.clear()
-        tasks = [
-            asyncio.create_task(self._forward(place, channel)) for channel in (*_LIVENESS, *_PERMANENT, *_FOR_VIEWERS)
-        ]
+        tasks = [asyncio.create_task(self._forward(place, channel)) for channel in (*_PERMANENT, *_FOR_VIEWERS)]
         try:
             done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -153,23 +152,15 @@ class PipelineFeed(Feed):
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _forward(self, place: Endpoint, channel: str) -> End | None:
-        """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers.
-
-        The other channels are read only once the pipeline runs: before, they could give the last message of the
-        previous pipeline at the same endpoint.
-        """
+        """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers."""
         timeout = SILENCE_SECONDS if channel == "health" else None
         while True:
-            if channel not in _LIVENESS:
-                await self._is_running.wait()
             if channel in _FOR_VIEWERS:
-                await self.viewers.wait()
+                await self._has_viewers.wait()
             with Subscription[AnyMessage](place, channel, timeout=timeout) as messages:
                 async for message in messages:
                     self.dashboard.take(message, monotonic(), messages.run)
-                    if self.dashboard.phase == "running":
-                        self._is_running.set()
-                    if channel in _FOR_VIEWERS and not self.viewers.count:
+                    if channel in _FOR_VIEWERS and not self.viewers:
                         break
                 else:
                     return messages.end

@@ -56,7 +56,7 @@ def _of_pipeline(feed: PipelineFeed) -> Iterator[_Row]:
     waiting = None if sent is None or taken is None else sent - taken
     rate = dashboard.rate(monotonic()) if dashboard.objects.shown else None
     yield _GAUGE, "up", (), "Whether the pipeline sends messages.", {(): dashboard.phase == "running"}
-    yield _GAUGE, "viewers", (), "Open pages.", {(): feed.viewers.count}
+    yield _GAUGE, "viewers", (), "Open pages.", {(): feed.viewers}
     yield _GAUGE, "frames_per_second", (), "Frames per second over the last two seconds.", {(): rate}
     yield _GAUGE, "features_waiting", (), "Features messages that the compressor has not received yet.", {(): waiting}
     for kind, name, counter, meaning in (
@@ -107,8 +107,8 @@ def _of_fleet(feed: FleetFeed) -> Iterator[_Row]:
     dashboard = feed.dashboard
     yield _GAUGE, "fleet_up", (), "Whether the fleet answers.", {(): dashboard.phase == "running"}
     yield _GAUGE, "fleet_age_seconds", (), "Age of the state of the fleet, 0 while it answers.", {(): dashboard.age}
-    yield _GAUGE, "viewers", (), "Open pages of the fleet.", {(): feed.viewers.count}
-    if dashboard.phase == "running" and dashboard.status is not None:
+    yield _GAUGE, "viewers", (), "Open pages of the fleet.", {(): feed.viewers}
+    if dashboard.phase == "running":
         yield from _of_streams(dashboard.status)
         yield from _of_nodes(dashboard.status)
 

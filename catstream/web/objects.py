@@ -19,7 +19,6 @@ class ShownObject:
     version        version of the model that scored it
     began          number of its first frame, None before its first track
     seq            number of its newest track, 0 before the first
-    model          its newest model, None before the first
     model_latency  seconds from the track of a frame to the model that was trained on it, None before the first model
     """
 
@@ -29,7 +28,6 @@ class ShownObject:
     version: int = 0
     began: int | None = None
     seq: int = 0
-    model: Model | None = None
     model_latency: float | None = None
 
 
@@ -49,8 +47,12 @@ class Objects:
 
     @property
     def models(self) -> dict[str, Model]:
-        """The newest model of each object that has one."""
-        return {name: each.model for name, each in self.shown.items() if each.model is not None}
+        """The newest model of each object that has one; not that of another object that had the name before."""
+        return {
+            name: model
+            for name, each in self.shown.items()
+            if (model := self._models.get(name)) is not None and model.began == each.began
+        }
 
     def add_track(self, track: Track) -> bool:
         """Add a track; return whether another object of this name begins with it."""
@@ -60,8 +62,7 @@ class Objects:
             self.shown[name] = ShownObject(self.colours.of(name))
         each = self.shown[name]
         each.state, each.score, each.version, each.seq = track.state, track.score, track.model_version, track.seq
-        each.began, model = track.began, self._models.get(name)
-        each.model = model if model is not None and model.began == track.began else None
+        each.began = track.began
         return begins
 
     def add_model(self, model: Model, latency: float | None) -> None:
@@ -74,10 +75,9 @@ class Objects:
         if each is not None and each.began is not None and model.began < each.began:
             return
         self._models[name] = model
-        if each is not None and each.began == model.began:
-            each.model = model
-            if latency is not None and (before is None or before.version != model.version):
-                each.model_latency = latency
+        is_new = before is None or before.version != model.version
+        if each is not None and each.began == model.began and latency is not None and is_new:
+            each.model_latency = latency
 
     def add_health(self, health: Health) -> set[str]:
         """Add the objects of the detector's health report that have no track yet; drop those that it does not track.

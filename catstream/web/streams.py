@@ -73,15 +73,11 @@ class FleetFeed(Feed):
         """Return a small picture of the newest frame of a stream as a JPEG file, None if there is none yet."""
         return await self._pictures.get(self._status_of(stream))
 
-    def close_viewers(self) -> None:
-        super().close_viewers()
-        self._feeds.close_viewers()
-
     def _status_of(self, stream: str) -> StreamStatus:
-        status = self.dashboard.status
-        if status is None or stream not in status.streams:
+        streams = self.dashboard.status.streams
+        if stream not in streams:
             raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
-        return status.streams[stream]
+        return streams[stream]
 
     def _endpoint_of(self, stream: StreamStatus) -> Endpoint | None:
         """Return the endpoint of the pipeline of a stream, with the keys to connect with; None if it does not run."""
@@ -106,9 +102,6 @@ class FleetFeed(Feed):
         if self._registry is None:
             self._registry = Registry(self._fleet, self._keys, timeout=REGISTRY_SECONDS)
         return self._registry.streams()
-
-    def _mark_silent(self, reason: str) -> None:
-        self.dashboard.mark_silent(reason, monotonic())
 
 
 class StreamFeeds:
@@ -141,13 +134,8 @@ class StreamFeeds:
     def close_unused(self, seconds: float = IDLE_SECONDS) -> None:
         """End the feeds that nobody looks at, and to which the last request was so many seconds ago."""
         for name, feed in list(self._open.items()):
-            if not feed.viewers.count and monotonic() - feed.used >= seconds:
+            if not feed.viewers and monotonic() - feed.used >= seconds:
                 self._open.pop(name).stop()
-
-    def close_viewers(self) -> None:
-        """End the updates of all open pages."""
-        for feed in self._open.values():
-            feed.close_viewers()
 
     async def stop(self) -> None:
         """End all feeds."""

@@ -16,7 +16,7 @@ from catstream.web.timing import APART_SECONDS
 __all__ = ["SurprisingFrame", "SurprisingFrames", "surprise"]
 
 _FRAMES = 12
-_PENDING = 64  # number of frames whose picture or features are waited for
+_PENDING = 64  # number of frames whose picture may still arrive
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +47,17 @@ class SurprisingFrames:
 
     A frame is measured once its features and its picture were received, with the newest model of each object at that
     time. Frames before the first model of an object are not measured for it.
+
+    Parameters
+    ----------
+    pictures : the last pictures that were received, by frame
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pictures: Mapping[int, Preview]) -> None:
         self.frames: list[SurprisingFrame] = []  #: in the order of the video
         self._measured: Counter[str] = Counter()
         self._surprises = Recent[int, tuple[float, dict[str, float]]](_PENDING)  # frame -> time, by object
-        self._pictures = Recent[int, Preview](_PENDING)
+        self._pictures = pictures
 
     @property
     def measured(self) -> int:
@@ -86,21 +90,14 @@ class SurprisingFrames:
         if not surprises:
             return False
         self._surprises[features.frame] = features.time, surprises
-        return self._match(features.frame)
+        return self.measure(features.frame)
 
-    def add_preview(self, preview: Preview) -> bool:
-        """Add the picture of a frame; return whether the selection has changed."""
-        if not preview.boxes:
-            return False
-        self._pictures[preview.frame] = preview
-        return self._match(preview.frame)
-
-    def _match(self, frame: int) -> bool:
+    def measure(self, frame: int) -> bool:
         """Measure a frame if its features and its picture are here; return whether the selection has changed."""
         if frame not in self._surprises or frame not in self._pictures:
             return False
         time, surprises = self._surprises.pop(frame)
-        preview, before = self._pictures.pop(frame), self.frames
+        preview, before = self._pictures[frame], self.frames
         for name in surprises.keys() & preview.boxes.keys():
             self._measured[name] += 1
             self._insert(SurprisingFrame(frame, time, name, surprises[name], preview))

@@ -83,6 +83,7 @@ def test_an_open_page_stays_connected_while_others_open_connections(serve, conne
     with page.stream("GET", "/events") as events:
         lines = events.iter_lines()
         assert next(lines) == "retry: 1000"
+        assert any(line.startswith("data: ") for line in lines), "all parts"
         for _ in range(connections.MAX_CONNECTIONS + 50):
             connect(page).sendall(HALF)
         assert page.get("/healthz").status_code == 200

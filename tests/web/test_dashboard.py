@@ -59,11 +59,11 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     told = {}
     dashboard.take(Health("detector", 1.0, {"sent": 1.0}), 0.0)
     assert dashboard.updates(told)["status"]["phase"] == "running"
-    dashboard.mark_silent("nothing came")
+    dashboard.mark_silent("nothing came", 5.0)
     assert dashboard.updates(told)["status"]["phase"] == "silent"
     dashboard.take(facts.track(0), 10.0)
     dashboard.take(End(2, "the source has ended"), 11.0)
-    dashboard.mark_silent("nothing came")
+    dashboard.mark_silent("nothing came", 15.0)
     status = dashboard.updates(told)["status"]
     assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
 
@@ -79,7 +79,7 @@ def test_a_silent_process_is_not_listed(dashboard):
     assert set(dashboard.last_reports) == names - {"trainer"}
     dashboard.take(Health("trainer", 1.0, {}), 6.0)
     assert set(dashboard.last_reports) == names
-    dashboard.mark_silent("nothing came")
+    dashboard.mark_silent("nothing came", 10.0)
     assert not dashboard.last_reports
 
 
@@ -99,7 +99,7 @@ def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, fac
 def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
     dashboard.take(End(2, "the source has ended"), 10.0)
     dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
-    dashboard.mark_silent("no pipeline is running")
+    dashboard.mark_silent("no pipeline is running", 15.0)
     trees = dashboard.updates({})["trees"]["objects"][""]
     assert (trees["leaves"], trees["rows"]) == ([3.0, *[0.0] * (len(TREES) - 1)], 200.0)
 
@@ -267,7 +267,7 @@ def test_another_object_of_the_same_name_does_not_clear_the_others(dashboard, fa
     dashboard.take(facts.track(6, name="anna", version=7, began=6), 0.1)
     assert [one["object"] for one in dashboard.updates({})["surprising"]["frames"]] == ["ben"]
     dashboard.take(facts.model(4, 5, "anna"), 0.2)
-    assert dashboard.objects.shown["anna"].model is None, "it is of the object before"
+    assert "anna" not in dashboard.objects.models, "it is of the object before"
 
 
 @given(

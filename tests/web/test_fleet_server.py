@@ -151,7 +151,7 @@ def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams
     assert "\ncatstream_fleet_up 0.0\n" in metrics
     assert "cam-7" not in metrics
     told = first_update(page)
-    assert (told["fleet"]["phase"], list(told["streams"])) == ("silent", ["cam-7"])
+    assert (told["status"]["phase"], list(told["streams"])) == ("silent", ["cam-7"])
 
 
 def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypatch):
@@ -165,11 +165,11 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypat
     async def use():
         feeds = StreamFeeds(make_feed)
         first = feeds.open("cam-1")
-        with first.viewers.counted():
+        with first.viewed():
             assert feeds.open("cam-2") is not None
             assert feeds.open("cam-3") is not None, "in place of one that nobody looks at"
             assert feeds.open("cam-1") is first
-            with made["cam-3"].viewers.counted():
+            with made["cam-3"].viewed():
                 assert feeds.open("cam-4") is None
                 feeds.close_unused(0.0)
                 assert len(feeds) == 2

@@ -64,15 +64,16 @@ def pipeline(endpoint):
 
 @pytest.fixture
 def updates(page, turning):
-    """The first part of that name that the page is told, while turns are made; fails where none is."""
+    """The first part of that name about a frame that the page is told, while turns are made; fails where none is."""
 
     def told(name, turn):
         deadline = time.monotonic() + 60
         with turning(turn, 0.05), page.stream("GET", "/events") as events:
             for line in events.iter_lines():
                 assert time.monotonic() < deadline, f"the page was told no {name} in time"
-                if line.startswith("data: ") and name in (parts := json.loads(line.removeprefix("data: "))):
-                    return parts[name]
+                part = json.loads(line.removeprefix("data: ")).get(name) if line.startswith("data: ") else None
+                if part is not None and part["frame"] is not None:
+                    return part
         raise AssertionError("the stream ended")
 
     return told

@@ -10,8 +10,24 @@ from catstream.web.surprising import SurprisingFrames, surprise
 
 
 @pytest.fixture
-def selection():
-    return SurprisingFrames()
+def pictures():
+    return {}
+
+
+@pytest.fixture
+def selection(pictures):
+    return SurprisingFrames(pictures)
+
+
+@pytest.fixture
+def see(selection, pictures):
+    """Adds the picture of a frame; whether the selection has changed."""
+
+    def one(preview):
+        pictures[preview.frame] = preview
+        return selection.measure(preview.frame)
+
+    return one
 
 
 @pytest.fixture
@@ -21,12 +37,12 @@ def models(facts):
 
 
 @pytest.fixture
-def add(selection, facts, models):
+def add(selection, see, facts, models):
     """Adds a frame to the selection: its features, and its picture."""
 
     def both(frame, wrong, *names):
         selection.add_features(facts.features(frame, wrong, *names), models)
-        selection.add_preview(facts.preview(frame, *names))
+        see(facts.preview(frame, *names))
 
     return both
 
@@ -57,11 +73,11 @@ def test_the_twelve_most_surprising_frames_are_kept_in_the_order_of_the_video(se
     assert selection.measured == 40
 
 
-def test_features_and_picture_of_a_frame_may_arrive_in_either_order(selection, facts, models):
-    selection.add_preview(facts.preview(0))
+def test_features_and_picture_of_a_frame_may_arrive_in_either_order(selection, see, facts, models):
+    see(facts.preview(0))
     assert selection.add_features(facts.features(0, 1.0), models)
     assert not selection.add_features(facts.features(50, 1.0), models)
-    assert selection.add_preview(facts.preview(50))
+    assert see(facts.preview(50))
     assert frames(selection) == [0, 50]
 
 
@@ -71,11 +87,11 @@ def test_before_the_first_model_nothing_is_measured(selection, add, models):
     assert (frames(selection), selection.measured) == ([], 0)
 
 
-def test_features_without_a_picture_are_dropped(selection, facts, models):
+def test_features_without_a_picture_are_dropped(selection, see, facts, models):
     for frame in range(1000):
         selection.add_features(facts.features(frame, 1.0), models)
-    assert not selection.add_preview(facts.preview(0))
-    assert selection.add_preview(facts.preview(999))
+    assert not see(facts.preview(0))
+    assert see(facts.preview(999))
 
 
 def test_one_frame_may_be_the_most_surprising_one_of_two_objects(selection, add):
@@ -85,18 +101,18 @@ def test_one_frame_may_be_the_most_surprising_one_of_two_objects(selection, add)
     assert selection.measured == 3
 
 
-def test_an_object_that_is_not_in_the_picture_is_not_measured(selection, facts, models):
+def test_an_object_that_is_not_in_the_picture_is_not_measured(selection, see, facts, models):
     selection.add_features(facts.features(10, 1.0, "anna", "ben"), models)
-    selection.add_preview(facts.preview(10, "ben"))
+    see(facts.preview(10, "ben"))
     assert [(one.frame, one.object) for one in selection.frames] == [(10, "ben")]
 
 
-def test_nothing_of_a_dropped_object_is_kept(selection, facts, add, models):
+def test_nothing_of_a_dropped_object_is_kept(selection, see, facts, add, models):
     add(10, 1.0, "anna", "ben")
     selection.add_features(facts.features(30, 1.0, "anna", "ben"), models)
     selection.drop({"anna"})
     del models["anna"]
-    selection.add_preview(facts.preview(30, "anna", "ben"))
+    see(facts.preview(30, "anna", "ben"))
     add(50, 1.0, "anna", "ben")
     assert {one.object for one in selection.frames} == {"ben"}
     assert selection.measured == 3

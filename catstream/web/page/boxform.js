@@ -1,6 +1,6 @@
 // Asks what a drawn box is: a new object with a name, the chosen one, or another one in its place.
 
-const $ = (selector) => document.querySelector(selector);
+import { $ } from "./dom.js";
 
 export class BoxForm {
   /** actions: accept() and cancel() are called if the user confirms or cancels. */

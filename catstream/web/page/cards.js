@@ -30,7 +30,7 @@ export class Streams {
   constructor(element) {
     this.cards = [];
     this.pictures = new Pictures();
-    this.items = new Items(element, { make: (name) => this.make(name), fill: fillCard, drop: (item) => this.pictures.remove(item) });
+    this.items = new Items(element, { make: (name) => this.make(name), fill: fillCard });
   }
 
   /** Show all streams; a card is found by its `words`: name, state, node with its labels, and objects. */

@@ -40,27 +40,23 @@ export class Charts {
 
   draw() {
     const points = this.rows.filter((row) => this.name in row[2]).map(([second, rate, { [this.name]: [score, ...more] }]) => [second, score, rate, ...more]);
-    if (points.length) for (const chart of this.charts) this.plot(chart, points, this.rows.at(-1)[0]);
-    else this.blank();
-  }
-
-  blank() {
-    for (const chart of this.charts) {
-      chart.drawing.replaceChildren();
-      chart.drawing.setAttribute("aria-label", `${chart.title}: nothing yet`);
-      chart.right.textContent = "–";
-    }
+    for (const chart of this.charts) this.plot(chart, points);
   }
 
   /** Plot one column of points of [second, score, frames a second, latency, model, present]. */
-  plot({ drawing, right, column, least, show, unit, title }, all, now) {
+  plot({ drawing, right, column, least, show, unit, title }, all) {
     const points = all.filter((point) => point[column] !== null);
-    const last = points.at(-1)?.[column];
-    right.textContent = last === undefined ? "–" : `${show(last)}${unit && ` ${unit}`}`;
+    const values = points.map((point) => point[column]);
+    right.textContent = values.length ? `${show(values.at(-1))}${unit && ` ${unit}`}` : "–";
+    drawing.replaceChildren();
+    drawing.setAttribute("aria-label", values.length ? `${title}: ${right.textContent}, from ${show(Math.min(...values))} to `
+      + `${show(Math.max(...values))} in the last two minutes; shaded: the object was absent` : `${title}: nothing yet`);
+    if (!all.length) return;
+    const now = this.rows.at(-1)[0];
     const [wide, tall] = [drawing.clientWidth, drawing.clientHeight];
     const seconds = Math.min(SECONDS, Math.max(FEWEST, now - all[0][0]));
-    const low = Math.min(0, ...points.map((point) => point[column]));
-    const high = round(Math.max(least, ...points.map((point) => point[column])));
+    const low = Math.min(0, ...values);
+    const high = round(Math.max(least, ...values));
     const x = (second) => LEFT + (wide - LEFT) * (1 - (now - second) / seconds);
     const y = (value) => TOP + (tall - TOP - BOTTOM) * (1 - (value - low) / (high - low));
     const grid = [0, high].flatMap((value) => [
@@ -73,9 +69,7 @@ export class Charts {
       make("rect", { class: "away", x: x(from), y: TOP, width: Math.max(1, x(to) - x(from)), height: tall - TOP - BOTTOM }));
     const line = pieces(points).map((piece) =>
       make("polyline", { points: piece.map((point) => `${x(point[0]).toFixed(1)},${y(point[column]).toFixed(1)}`).join(" ") }));
-    drawing.replaceChildren(...away, ...grid, ...line);
-    drawing.setAttribute("aria-label", `${title}: ${right.textContent}, from ${show(Math.min(...points.map((p) => p[column])))}`
-      + ` to ${show(Math.max(...points.map((p) => p[column])))} in the last two minutes; shaded: the object was absent`);
+    drawing.append(...away, ...grid, ...line);
   }
 }
 

@@ -1,5 +1,8 @@
 // Helpers for the elements of the page.
 
+/** The first element that a selector of CSS selects. */
+export const $ = (selector) => document.querySelector(selector);
+
 /** Append a new element, with some of its properties. */
 export function add(parent, tag, properties = {}) {
   const child = Object.assign(document.createElement(tag), properties);
@@ -42,24 +45,20 @@ export function figure(parent, className, title) {
 
 /** The children of an element by name: each is made when its name is first shown, and removed when it is shown no longer. */
 export class Items {
-  /** make(name, value) returns an item with its `element`; fill(item, value) shows a value in it; drop(item) is called when it is removed. */
-  constructor(parent, { make, fill, drop }) {
-    Object.assign(this, { parent, make, fill, drop, items: new Map() });
+  /** make(name, value) returns an item with its `element`; fill(item, value) shows a value in it. */
+  constructor(parent, { make, fill }) {
+    Object.assign(this, { parent, make, fill, items: new Map() });
   }
 
   /** Show these pairs of name and value, in this order; only values and places that have changed are touched. */
   show(pairs) {
     const items = new Map(pairs.map(([name, value]) => [name, this.items.get(name) ?? this.make(name, value)]));
-    for (const [name, item] of this.items) {
-      if (items.has(name)) continue;
-      this.drop?.(item);
-      item.element.remove();
-    }
+    for (const [name, item] of this.items) if (!items.has(name)) item.element.remove();
     this.items = items;
     let next = this.parent.firstElementChild;
     for (const [name, value] of pairs) {
       const item = items.get(name), text = JSON.stringify(value);
-      if (item.text !== text) this.fill?.(item, value);
+      if (item.text !== text) this.fill(item, value);
       item.text = text;
       if (item.element === next) next = next.nextElementSibling;
       else this.parent.insertBefore(item.element, next);

@@ -1,10 +1,8 @@
 // The page of a fleet: passes updates to the cards of the streams and to the table of the nodes.
 
 import { Nodes, Streams } from "./cards.js";
-import { duration, write } from "./dom.js";
+import { $, duration, write } from "./dom.js";
 import { Search } from "./search.js";
-
-const $ = (selector) => document.querySelector(selector);
 
 export class FleetPage {
   /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
@@ -20,27 +18,18 @@ export class FleetPage {
     this.showState();
   }
 
-  get busy() {
-    return false;
-  }
-
-  take({ fleet, streams, nodes }) {
-    this.fleet = fleet ?? this.fleet;
+  take({ status, streams, nodes }) {
+    this.fleet = status ?? this.fleet;
     if (nodes) this.nodes.show(nodes);
     if (streams) this.streams.show(streams, this.nodes.rows);
-    this.search.offer(this.streams.cards);
     this.showMatching();
     this.showState();
     this.restorePosition();
   }
 
-  /** The server does not answer. */
-  lose() {
-    this.showState();
-  }
-
   showMatching() {
     const { streams, search, fleet } = this;
+    search.offer(streams.cards);
     const shown = streams.filter((card) => search.matches(card));
     const empty = fleet.phase === "running" && !streams.cards.length;
     $(".find").hidden = !streams.cards.length;

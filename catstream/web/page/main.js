@@ -1,6 +1,6 @@
 // Connects to the server, and passes its updates to the page of a stream or to that of a fleet.
 
-import { write } from "./dom.js";
+import { $, write } from "./dom.js";
 import { FleetPage } from "./fleet.js";
 import { StreamPage } from "./stream.js";
 
@@ -9,7 +9,7 @@ let events = null; // the connection to the server, null while the page is hidde
 const server = { closed: false, silent: null }; // whether it has announced its shutdown; time since which it does not answer
 
 function take({ closed, ...parts }) {
-  page ??= "fleet" in parts ? new FleetPage(server) : new StreamPage(server);
+  page ??= "streams" in parts ? new FleetPage(server) : new StreamPage(server);
   if (closed) server.closed = true;
   page.take(parts);
 }
@@ -23,8 +23,8 @@ function listen() {
   events.onmessage = (event) => take(JSON.parse(event.data));
   events.onerror = () => {
     server.silent ??= Date.now();
-    if (page) page.lose();
-    else write(document.querySelector("#state b"), "page stopped");
+    if (page) page.showState();
+    else write($("#state b"), "page stopped");
     if (events?.readyState !== EventSource.CLOSED) return;
     stop();
     setTimeout(async () => {
@@ -41,7 +41,7 @@ function stop() {
 }
 
 document.addEventListener("visibilitychange", () => { // a browser opens few connections to a server, over all its tabs
-  if (document.hidden && !page?.busy) stop();
+  if (document.hidden && !page?.stage?.drawing) stop();
   else if (!document.hidden && !events) listen();
 });
 addEventListener("pageshow", (event) => event.persisted && !events && listen());

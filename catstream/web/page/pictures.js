@@ -8,8 +8,8 @@ const AFTER_AN_ERROR = 5000;
 export class Pictures {
   constructor() {
     this.paused = false;
-    this.items = new Map(); // element -> the card: its name, what it shows, its image, and a time before which it is not loaded again
-    this.visible = new Set();
+    this.items = new WeakMap(); // element -> the card: its name, what it shows, its image, and a time before which it is not loaded again
+    this.visible = new Set(); // elements; one that is removed from the page is no longer visible
     this.observer = new IntersectionObserver((entries) => {
       for (const { target, isIntersecting } of entries) this.visible[isIntersecting ? "add" : "delete"](target);
     });
@@ -19,12 +19,6 @@ export class Pictures {
   add(item) {
     this.items.set(item.element, Object.assign(item, { after: 0 }));
     this.observer.observe(item.element);
-  }
-
-  remove({ element }) {
-    this.observer.unobserve(element);
-    this.visible.delete(element);
-    this.items.delete(element);
   }
 
   /** Load, again and again, the picture that has waited longest. */

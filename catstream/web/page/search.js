@@ -8,7 +8,7 @@ export class Search {
   /** changed() is called whenever another search is made. */
   constructor(field, buttons, changed) {
     Object.assign(this, { field, changed });
-    this.buttons = new Items(buttons, { make: (state) => this.make(state), fill: ({ element }, text) => write(element, text) });
+    this.buttons = new Items(buttons, { make: (state) => this.make(state), fill: fillButton });
     field.value = new URLSearchParams(location.search).get("search") ?? "";
     field.addEventListener("input", () => this.tell());
     field.addEventListener("keydown", (event) => event.key === "Escape" && this.ask(""));
@@ -35,7 +35,6 @@ export class Search {
 
   tell() {
     history.replaceState(null, "", this.text ? `?${new URLSearchParams({ search: this.text })}` : location.pathname);
-    this.mark();
     this.changed();
   }
 
@@ -44,12 +43,11 @@ export class Search {
     return this.words.every((word) => (word.includes("=") ? ` ${card.words} `.includes(` ${word} `) : card.words.includes(word)));
   }
 
-  /** Show a button for each state that streams are in, and how many there are. */
+  /** Show a button for each state that streams are in, how many there are, and whether they are searched for. */
   offer(cards) {
     const counts = STATES.map((state) => [state, cards.filter((card) => (state === "trouble" ? card.level : card.state === state)).length]);
-    const shown = counts.filter(([state, count]) => count || this.words.includes(state));
-    this.buttons.show(shown.map(([state, count]) => [state, `${state === "trouble" ? "in trouble" : state} ${count}`]));
-    this.mark();
+    const shown = counts.map(([state, count]) => [state, { count, pressed: this.words.includes(state) }]);
+    this.buttons.show(shown.filter(([, { count, pressed }]) => count || pressed));
   }
 
   /** A button that adds its state to the words, in place of another one, or removes it. */
@@ -59,8 +57,10 @@ export class Search {
     element.dataset.state = state;
     return { element };
   }
+}
 
-  mark() {
-    for (const [state, { element }] of this.buttons.items) element.setAttribute("aria-pressed", String(this.words.includes(state)));
-  }
+function fillButton({ element }, { count, pressed }) {
+  const { state } = element.dataset;
+  write(element, `${state === "trouble" ? "in trouble" : state} ${count}`);
+  element.setAttribute("aria-pressed", String(pressed));
 }

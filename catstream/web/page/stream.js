@@ -2,23 +2,21 @@
 
 import { BoxForm } from "./boxform.js";
 import { Charts } from "./charts.js";
-import { write } from "./dom.js";
+import { $, write } from "./dom.js";
 import { Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
 
 const MESSAGE = { delay: 8000, duration: 1000 }; // milliseconds that a message is shown, and fades
-const $ = (selector) => document.querySelector(selector);
 
 export class StreamPage {
   /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
   constructor(server) {
     this.server = server;
     this.name = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // empty if there is one stream
-    this.status = { phase: "waiting" };
+    this.status = { phase: "waiting", paused: false };
     this.frame = null; // number and time of the newest frame
-    this.paused = false;
     this.charts = new Charts($(".charts"));
     this.trees = new Trees($(".trees"), $("#tree-summary"));
     this.surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
@@ -35,7 +33,7 @@ export class StreamPage {
   /** Attach the handlers of the controls. */
   listen() {
     $("#draw").onclick = () => { $("#stage").focus(); this.stage.begin(); };
-    $("#pause").onclick = () => this.send(this.paused ? "resume" : "pause");
+    $("#pause").onclick = () => this.send(this.status.paused ? "resume" : "pause");
     $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
       "Stop it", "Continue", () => this.send("stop"));
     const trees = $("#trees details");
@@ -44,18 +42,12 @@ export class StreamPage {
     addEventListener("resize", () => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
   }
 
-  /** Whether the page must stay connected, although it is hidden. */
-  get busy() {
-    return this.stage.drawing;
-  }
-
-  /** Show the parts that have changed; `pipeline` is sent if all that was shown is of another one. */
+  /** Show the parts that have changed; `pipeline` is sent, with all of them, if all that was shown is of another one. */
   take({ pipeline, status, tracks, picture, points, trees, surprising }) {
     if (pipeline !== undefined) this.clear();
     if (status) {
-      if (status.phase !== "running" && this.status.phase === "running") this.stage.cancel(false);
       this.status = status;
-      this.showPaused(Boolean(status.paused));
+      this.showState();
     }
     if (tracks) {
       this.frame = tracks.frame === null ? null : { number: tracks.frame, time: tracks.time };
@@ -73,17 +65,7 @@ export class StreamPage {
   clear() {
     this.stage.clear();
     this.charts.clear();
-    this.surprising.show({ measured: 0, frames: [] });
-    this.objects.show([]);
-    this.frame = null;
     this.showMessage("");
-    this.showFrame();
-  }
-
-  /** The server does not answer. */
-  lose() {
-    this.stage.cancel(false);
-    this.showState();
   }
 
   /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
@@ -102,14 +84,15 @@ export class StreamPage {
     }
     this.showMessage(answer.reason, !answer.done);
     if (!answer.done) return null;
-    if (verb === "pause" || verb === "resume") this.showPaused(verb === "pause");
+    if (verb === "pause" || verb === "resume") this.status.paused = verb === "pause";
+    this.showState();
     return answer;
   }
 
   /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
   async pause() {
     if (this.isWaiting) return { frame: Infinity, leave: null };
-    const before = this.paused;
+    const before = this.status.paused;
     const answer = await this.send("pause");
     if (!answer) return null;
     this.showMessage("Paused for your box.", false, false);
@@ -189,16 +172,10 @@ export class StreamPage {
     write($("#frame"), this.frame ? `frame ${number}, ${time.toFixed(1)} s${model === undefined ? "" : `, model ${model}`}` : "");
   }
 
-  showPaused(now) {
-    this.paused = now;
-    write($("#pause"), now ? "Resume" : "Pause");
-    $("#pause").setAttribute("aria-pressed", String(now));
-    this.showState();
-  }
-
   showState() {
     const { status, stage, server } = this;
     const running = status.phase === "running" && server.silent === null;
+    if (!running) stage.cancel(false);
     const [state, words] = this.state(running);
     $("#state").dataset.state = state;
     write($("#state b"), words);
@@ -206,6 +183,8 @@ export class StreamPage {
     write($("#overlay"), this.overlay(running));
     $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
     $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
+    write($("#pause"), status.paused ? "Resume" : "Pause");
+    $("#pause").setAttribute("aria-pressed", String(status.paused));
     for (const button of [$("#draw"), $("#pause"), $("#stop")]) button.disabled = !running;
   }
 
@@ -218,7 +197,7 @@ export class StreamPage {
     if (this.isWaiting) return ["waiting", "waiting for a box"];
     const state = ["present", "bootstrapping", "absent"].find((each) => list.some((one) => one.state === each)) ?? "waiting";
     const words = list.length > 1 ? `${list.filter((one) => one.state !== "absent").length} of ${list.length} present` : state;
-    return [state, this.paused ? `paused, ${words}` : words];
+    return [state, status.paused ? `paused, ${words}` : words];
   }
 
   /** Whether there is no object. The status is one of each second, so after the first box the tracks are newer. */
