@@ -26,7 +26,6 @@ import catstream
 from catstream.cli import COMMANDS, load_command
 from catstream.fleet import life
 from catstream.settings import PRESETS, describe
-from catstream.wire.channels import CHANNELS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -117,11 +116,6 @@ def test_every_setting_and_preset_has_its_row_on_the_page_of_settings():
     assert not built("api.md").strip()
 
 
-@pytest.mark.parametrize("name", CHANNELS)
-def test_every_channel_has_its_row(name):
-    assert f"`{name}`" in page("docs/protocol.md"), f"docs/protocol.md: add the channel {name}"
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_is_shown(name):
     assert f"`{name}`" in page("README.md") or f"catstream {name}" in page("README.md"), f"README.md: add {name}"
@@ -134,10 +128,11 @@ def test_the_index_of_decisions_lists_every_record():
     assert len(shown) == len([*DOCS.glob("decisions/0*.md")])
 
 
-def test_every_command_and_option_has_help():
+def test_every_command_and_option_has_help_and_a_name_of_its_own():
     """The page of the command line is made from it when the documentation is built."""
     for words, command in every_command().items():
         assert command.help, f"{words}: write its docstring"
+        assert len({option.name for option in command.params}) == len(command.params), f"{words}: two of one name"
         for option in command.params:
             assert not isinstance(option, click.Option) or option.help, f"{words} --{option.name}: add help"
 

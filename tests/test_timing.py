@@ -9,14 +9,24 @@ import pytest
 
 import catstream
 from catstream.fleet import timing as fleet
+from catstream.services import timing as services
 from catstream.web import timing as web
+from catstream.wire import timing as wire
 
 CATSTREAM = Path(catstream.__file__).parent
-HOW_TO = CATSTREAM.parent / "docs" / "how-to"
+DOCS = CATSTREAM.parent / "docs"
 
-ORDER = [*web.ORDER, *fleet.ORDER]
+ORDER = [*wire.ORDER, *services.ORDER, *web.ORDER, *fleet.ORDER]
 #: The files whose time limits are in one table, and what a time limit looks like there.
 LIMITS = {
+    "wire": (
+        [*CATSTREAM.glob("wire/*.py"), *CATSTREAM.glob("client/*.py")],
+        r"^\s*\w*(?:_SECONDS|_MILLISECONDS|PATIENCE)(?:: \w+)? = [0-9.]|: float = [1-9]",
+    ),
+    "services": (
+        [*Path(services.__file__).parent.glob("*.py")],
+        r"^\s*\w*(?:_SECONDS|_PERIOD)(?:: \w+)? = [0-9.(]|(?:receive|wait|sleep)\([0-9]*[.1-9]",
+    ),
     "web": ([*CATSTREAM.glob("web/*.py")], r"^\s*\w*(?:_SECONDS|_pause)(?:: \w+)? = [0-9.]"),
     "fleet": (
         [*CATSTREAM.glob("fleet/*.py"), CATSTREAM / "cli" / "fleet.py"],
@@ -36,6 +46,13 @@ def test_every_time_limit_is_in_the_table(files, limit):
 
 
 def test_the_docs_say_after_which_time_a_process_is_silent_and_a_stream_is_started_again():
-    assert f"within {web.SILENCE_SECONDS:g} s" in (HOW_TO / "view.md").read_text()
+    assert f"within {web.SILENCE_SECONDS:g} s" in (DOCS / "how-to" / "view.md").read_text()
     pause = f"a pause of {fleet.FIRST_PAUSE_SECONDS:g} s to {fleet.LONGEST_PAUSE_SECONDS:g} s"
-    assert pause in (HOW_TO / "fleet.md").read_text()
+    assert pause in (DOCS / "how-to" / "fleet.md").read_text()
+
+
+def test_a_host_that_disappears_is_noticed_after_the_time_that_the_docs_say():
+    page = (DOCS / "architecture.md").read_text()
+    seconds = wire.KEEPALIVE_SECONDS + wire.KEEPALIVE_PROBES * wire.KEEPALIVE_PROBE_SECONDS
+    assert f"starts after {wire.KEEPALIVE_SECONDS:g} s without traffic" in page
+    assert f"closed after {seconds:g}" in page

@@ -71,11 +71,6 @@ def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared
     assert_within_the_bound(grown(stream), stream, subspaces, squared_distance)
 
 
-def test_kept_and_dropped_energy_add_up_to_all_of_it(stream):
-    tree = grown(stream)
-    assert_allclose(energy(summary(tree)) + tree.dropped_energy, energy(stream), rtol=1e-12)
-
-
 def test_a_stream_that_stands_still_loses_nothing(rng):
     """Equal rows make a Gram matrix of equal eigenvalues, on which less careful solvers fail."""
     rows = np.tile(rng.uniform(size=30), (SIZE * 32, 1)).astype(np.float32)

@@ -41,18 +41,6 @@ def test_predicts_the_next_centre_of_steady_motion(motion):
     assert centre(predicted(estimate, motion)) == pytest.approx((283, 139), abs=0.01)
 
 
-def test_estimates_are_nearer_than_measurements(motion, rng):
-    estimate = at_rest((0, 0), motion)
-    errors = []
-    for frame in range(1, 400):
-        true = (frame, 2 * frame)
-        measurement = tuple(true + rng.normal(scale=2, size=2))
-        estimate = measured(predicted(estimate, motion), motion, measurement)
-        errors.append((distance(centre(estimate), true), distance(measurement, true)))
-    estimated, measurements = np.mean(errors, axis=0)
-    assert estimated < 0.6 * measurements
-
-
 def test_a_lost_object_coasts_to_a_stop(motion):
     estimate = moving(motion)
     start, speed = centre(estimate), np.hypot(*velocity(estimate))
@@ -85,12 +73,6 @@ def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(m
 def test_a_jump_is_a_new_start_at_rest(motion):
     estimate = measured(predicted(moving(motion), motion), motion, (40, 40))
     np.testing.assert_array_equal(estimate, at_rest((40, 40), motion))
-
-
-def test_other_covariances_change_the_trust_and_not_the_estimate(motion):
-    doubting = Motion(motion.process, 100 * motion.observation)
-    moved = [measured(predicted(moving(motion), each), each, (286, 139)) for each in (motion, doubting)]
-    assert distance(centre(moved[1]), (283, 139)) < 0.2 * distance(centre(moved[0]), (283, 139))
 
 
 def test_nothing_is_changed_in_place(motion):

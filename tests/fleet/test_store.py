@@ -70,15 +70,6 @@ def test_a_state_is_read_as_it_was_written(store):
     assert (found.files, found.facts) == (STATE, {"frame": 12})
 
 
-def test_a_claim_continues_from_the_newest_state_and_has_a_higher_token(store):
-    first = store.claim("cam-7", "node-1")
-    first.write(STATE, {"frame": 1})
-    first.write(STATE, {"frame": 2})
-    second = store.claim("cam-7", "node-2")
-    assert (first.state, second.state.facts) == (None, {"frame": 2})
-    assert second.token > first.token
-
-
 def test_a_fenced_holder_writes_no_more_and_is_told_by_whom(store):
     paused = store.claim("cam-7", "node-1")
     paused.write(STATE, {"frame": 1})
@@ -87,18 +78,6 @@ def test_a_fenced_holder_writes_no_more_and_is_told_by_whom(store):
         with pytest.raises(FencedError, match=r"streams/cam-7 was claimed by node-2 after node-1"):
             paused.write(STATE, {"frame": 3})
     assert store.newest("cam-7").facts == {"frame": 2}
-
-
-def test_a_holder_is_fenced_although_its_claim_and_its_states_were_removed(store):
-    paused = store.claim("cam-7", "node-1")
-    for turn in range(5):
-        newest = store.claim("cam-7", f"node-{turn}")
-    newest.write(STATE, {"frame": 1})
-    newest.write(STATE, {"frame": 2})
-    with pytest.raises(FencedError):
-        paused.write(STATE, {"frame": 3})
-    assert store.newest("cam-7").facts == {"frame": 2}
-    assert store.claim("cam-7", "node-2").state.facts == {"frame": 2}
 
 
 def test_two_states_stay_however_many_are_written(store):
@@ -115,14 +94,6 @@ def test_a_later_holder_removes_the_states_and_the_claim_of_an_earlier_one(store
     assert listed(store) == ([1, 2], [(1, 1), (2, 1)])
     claim.write(STATE, {"frame": 3})
     assert listed(store) == ([2], [(2, 1), (2, 2)])
-
-
-def test_a_damaged_state_is_passed_over(store):
-    claim = store.claim("cam-7", "node-1")
-    claim.write(STATE, {"frame": 1})
-    store._objects.create(f"streams/cam-7/{claim.token:08}/00000002", b"half of a sta")
-    assert store.newest("cam-7").facts == {"frame": 1}
-    assert store.claim("cam-7", "node-2").state.facts == {"frame": 1}
 
 
 def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):

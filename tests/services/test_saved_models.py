@@ -14,7 +14,6 @@ from catstream.run.learned import Learned
 from catstream.services.saved_models import SavedModels
 from catstream.settings import Settings
 from catstream.wire.channels import SAVED_MODELS
-from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
 SETTINGS = Settings(coreset={"size": 4})
@@ -33,11 +32,6 @@ def compressor(name, rng, frames=6):
     return found
 
 
-@pytest.fixture
-def place(folder):
-    return Endpoint.parse(str(folder))
-
-
 def received(publisher, compressors, reader):
     """The first message that a subscriber receives while the publisher takes its turns."""
     for _ in range(200):
@@ -47,36 +41,39 @@ def received(publisher, compressors, reader):
     raise AssertionError("nothing was received")
 
 
-def test_a_subscriber_receives_the_whole_trees_of_its_object(place, rng):
+def test_a_subscriber_receives_the_whole_trees_of_its_object(endpoint, rng):
     compressors = {name: compressor(name, rng) for name in ("anna", "ben")}
-    with SavedModels(place, SETTINGS) as publisher, Subscriber(SAVED_MODELS, place, SavedModel, about="ben") as reader:
+    with (
+        SavedModels(endpoint, SETTINGS) as publisher,
+        Subscriber(SAVED_MODELS, endpoint, SavedModel, about="ben") as reader,
+    ):
         message = received(publisher, compressors, reader)
     assert (message.object, message.version) == ("ben", compressors["ben"].version)
     assert message.file == Learned.of(compressors["ben"], SETTINGS).to_bytes()
 
 
-def test_no_file_is_made_without_a_subscriber(place, rng, monkeypatch):
+def test_no_file_is_made_without_a_subscriber(endpoint, rng, monkeypatch):
     monkeypatch.setattr(Learned, "of", lambda *_: pytest.fail("a file was made"))
-    with SavedModels(place, SETTINGS) as publisher:
+    with SavedModels(endpoint, SETTINGS) as publisher:
         for _ in range(3):
             publisher.turn({"": compressor("", rng)})
 
 
-def test_an_object_that_was_not_found_yet_has_no_file(place, rng):
+def test_an_object_that_was_not_found_yet_has_no_file(endpoint, rng):
     compressors = {"anna": Compressor(SETTINGS, "anna"), "ben": compressor("ben", rng)}
-    with SavedModels(place, SETTINGS) as publisher, Subscriber(SAVED_MODELS, place) as reader:
+    with SavedModels(endpoint, SETTINGS) as publisher, Subscriber(SAVED_MODELS, endpoint) as reader:
         assert received(publisher, compressors, reader).object == "ben"
         assert reader.receive(0.1) is None
 
 
-def test_a_later_subscriber_receives_the_newest_trees(place, rng):
+def test_a_later_subscriber_receives_the_newest_trees(endpoint, rng):
     compressors = {"": compressor("", rng)}
-    with SavedModels(place, SETTINGS) as publisher:
-        with Subscriber(SAVED_MODELS, place) as reader:
+    with SavedModels(endpoint, SETTINGS) as publisher:
+        with Subscriber(SAVED_MODELS, endpoint) as reader:
             first = received(publisher, compressors, reader)
         while publisher.has_subscribers:
             publisher.turn(compressors)
         compressors[""] = compressor("", rng, frames=30)
         publisher.turn(compressors)
-        with Subscriber(SAVED_MODELS, place) as reader:
+        with Subscriber(SAVED_MODELS, endpoint) as reader:
             assert received(publisher, compressors, reader).version == compressors[""].version > first.version

@@ -95,21 +95,14 @@ def test_the_server_has_one_thread(server, start):
     assert psutil.Process(server.pid).num_threads() == 1
 
 
-def test_the_exit_code_of_a_process_is_known(start, until):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGKILL, -signal.SIGKILL)])
+def test_how_a_process_has_ended_is_known(start, until, number, code):
     process, watchdog, _ = start()
     until(lambda: watchdog.turns > 0)
     assert process.poll() is None
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     assert process.wait(60)
-    assert process.poll() == 0
-
-
-def test_the_signal_that_ended_a_process_is_known(start):
-    process, _, _ = start()
-    assert process.pid
-    process.send_signal(signal.SIGKILL)
-    assert process.wait(60)
-    assert process.poll() == -signal.SIGKILL
+    assert process.poll() == code
 
 
 def test_a_process_that_is_ended_before_it_was_started_does_not_run(server, start, until):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
+from contextlib import ExitStack
 
+import pytest
+import zmq
+
+from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
 
@@ -11,3 +15,17 @@ from catstream.wire.endpoint import Endpoint
 def endpoint(request, folder):
     """Where to meet, over each transport."""
     return Endpoint.parse(str(folder) if request.param == "ipc" else request.getfixturevalue("tcp"))
+
+
+@pytest.fixture
+def stranger(endpoint):
+    """A raw socket of a given kind at a channel's address."""
+    with ExitStack() as stack:
+
+        def connect(kind, name):
+            socket = stack.enter_context(zmq.Context.instance().socket(kind))
+            socket.linger = 0
+            socket.connect(endpoint.address(CHANNELS[name]))
+            return socket
+
+        yield connect

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from threading import Event
 
 import pytest
 import zmq
@@ -21,28 +20,26 @@ from catstream.wire.commands import Requester, Responder
 PAUSE = Command("one", "pause")
 
 
-@contextmanager
-def answering(endpoint, answer):
-    """Answers commands in a thread; gives the responder, and a list of the commands as they come."""
-    heard, over = [], Event()
+def done(command):
+    return Answer(command.id, True, "so it is", 7, Box(1.0, 2.0, 3.0, 4.0), 5)
 
-    def serve():
-        while not over.wait(0.01):
+
+@pytest.fixture
+def answering(endpoint, turning):
+    """Answers commands in a thread; gives the responder, and a list of the commands as they come."""
+
+    @contextmanager
+    def serve(answer=done):
+        def turn():
             for command in responder.receive_all():
                 heard.append(command)
                 responder.answer(answer(command))
 
-    with Responder(CONTROL, endpoint) as responder, ThreadPoolExecutor(1) as pool:
-        serving = pool.submit(serve)
-        try:
+        heard = []
+        with Responder(CONTROL, endpoint) as responder, turning(turn):
             yield responder, heard
-        finally:
-            over.set()
-            serving.result(20)
 
-
-def done(command):
-    return Answer(command.id, True, "so it is", 7, Box(1.0, 2.0, 3.0, 4.0), 5)
+    return serve
 
 
 @pytest.fixture
@@ -54,17 +51,17 @@ def raw(endpoint):
         yield client
 
 
-def test_a_command_gets_its_answer(endpoint):
-    with answering(endpoint, done) as (_, heard), Requester(CONTROL, endpoint) as requester:
+def test_a_command_gets_its_answer(endpoint, answering):
+    with answering() as (_, heard), Requester(CONTROL, endpoint) as requester:
         assert requester.ask(PAUSE, 20) == done(PAUSE)
     assert heard == [PAUSE]
 
 
-def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(endpoint):
+def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(endpoint, answering):
     with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
         assert requester.ask(PAUSE, 0.3) is None
         answer = pool.submit(requester.ask, PAUSE, 20)
-        with answering(endpoint, done) as (_, heard):
+        with answering() as (_, heard):
             assert answer.result(20) == done(PAUSE)
     assert heard == [PAUSE]
 
@@ -76,22 +73,22 @@ def slow_network(monkeypatch):
 
 
 @pytest.mark.usefixtures("slow_network")
-def test_a_question_that_nobody_was_connected_for_is_sent_as_soon_as_somebody_is(endpoint):
+def test_a_question_that_nobody_was_connected_for_is_sent_as_soon_as_somebody_is(endpoint, answering):
     with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
         answer = pool.submit(requester.ask, PAUSE, 60)
         assert not wait([answer], 0.2).done
-        with answering(endpoint, done) as (_, heard):
+        with answering() as (_, heard):
             assert answer.result(60) == done(PAUSE)
     assert heard == [PAUSE]
 
 
 @pytest.mark.usefixtures("slow_network")
-def test_a_question_whose_connection_broke_is_sent_again_as_soon_as_there_is_another(endpoint, until):
+def test_a_question_whose_connection_broke_is_sent_again_as_soon_as_there_is_another(endpoint, answering, until):
     with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
         with Responder(CONTROL, endpoint) as dies:
             answer = pool.submit(requester.ask, PAUSE, 60)
             assert until(lambda: dies.receive_all(0.1)) == [PAUSE]
-        with answering(endpoint, done) as (_, heard):
+        with answering() as (_, heard):
             assert answer.result(60) == done(PAUSE)
     assert heard == [PAUSE]
 
@@ -116,9 +113,9 @@ def test_a_repeated_command_is_answered_again_and_executed_once(endpoint, raw, u
     assert answers == [done(PAUSE)] * 2
 
 
-def test_two_requesters_each_receive_their_own_answer(endpoint):
+def test_two_requesters_each_receive_their_own_answer(endpoint, answering):
     with (
-        answering(endpoint, done),
+        answering(),
         Requester(CONTROL, endpoint) as one,
         Requester(CONTROL, endpoint) as two,
         ThreadPoolExecutor(2) as pool,
@@ -132,8 +129,8 @@ def test_two_requesters_each_receive_their_own_answer(endpoint):
     [[b""], [b"\xc1"], [b"", b"", b""], [encode(PAUSE), b"more"], [encode(done(PAUSE))]],
     ids=["nothing", "no msgpack", "many parts", "two parts", "an answer"],
 )
-def test_an_invalid_command_is_counted_and_the_next_one_is_answered(endpoint, raw, parts):
-    with answering(endpoint, done) as (responder, heard):
+def test_an_invalid_command_is_counted_and_the_next_one_is_answered(answering, raw, parts):
+    with answering() as (responder, heard):
         raw.send_multipart(parts)
         raw.send(encode(PAUSE))
         assert raw.poll(20_000)
@@ -158,8 +155,8 @@ def test_a_flood_of_commands_is_bounded_and_dropped_commands_may_be_repeated(end
     assert len(heard) == 65
 
 
-def test_control_sends_each_command_with_an_id_of_its_own(endpoint):
-    with answering(endpoint, done) as (_, heard), Control(str(endpoint), timeout=20) as control:
+def test_control_sends_each_command_with_an_id_of_its_own(endpoint, answering):
+    with answering() as (_, heard), Control(str(endpoint), timeout=20) as control:
         for answer in (control.set_box((1, 2, 3, 4), keep=True), control.pause(), control.resume(), control.stop()):
             assert (answer.done, answer.frame) == (True, 7)
     assert len({command.id for command in heard}) == 4
@@ -168,12 +165,12 @@ def test_control_sends_each_command_with_an_id_of_its_own(endpoint):
     ]  # fmt: skip
 
 
-def test_a_rejected_command_raises_an_error_with_the_reason(endpoint):
+def test_a_rejected_command_raises_an_error_with_the_reason(endpoint, answering):
     def refuse(command):
         return Answer(command.id, False, "it is no time for that")
 
     with (
-        answering(endpoint, refuse),
+        answering(refuse),
         Control(str(endpoint), timeout=20) as control,
         pytest.raises(CommandRejectedError, match=r"^pause: it is no time for that$"),
     ):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-import pytest
 import zmq
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -27,11 +26,6 @@ def model(version, name):
 
 def track(name):
     return Track(1, 0, 0.0, "absent", None, 0.0, 0, object=name)
-
-
-@pytest.fixture
-def endpoint(folder):
-    return Endpoint.parse(str(folder))
 
 
 def joined(publisher, count, until):

@@ -7,16 +7,14 @@ import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 
 import numpy as np
 import pytest
 import zmq
 
-from catstream.errors import ProtocolError, ServiceError
+from catstream.errors import ServiceError
 from catstream.messages.kinds import (
     End,
-    Health,
     Model,
     ObjectPosition,
     Position,
@@ -27,7 +25,7 @@ from catstream.messages.kinds import (
     Tracks,
 )
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import CHANNELS, FEATURES, HEALTH, MODELS, RESULTS, SAMPLES, TRACKS
+from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.codec import decode, encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher, Subscriber
@@ -68,28 +66,6 @@ def take(receiver, taken, *, store):
         receiver.acknowledge(Position(message.seq if store else 0))
     if receiver.window.position_requested:
         receiver.answer(Position(receiver.window.taken if store else 0))
-
-
-def first(publisher, endpoint, until):
-    """What a new reader hears first."""
-    heard = []
-    with Subscriber(publisher.channel, endpoint) as reader:
-        until(lambda: heard, lambda: (publisher.serve_late_joiners(), heard.extend(reader.receive_all())))
-    return heard[0]
-
-
-@pytest.fixture
-def stranger(endpoint):
-    """A raw socket of a given kind at a channel's address."""
-    with ExitStack() as stack:
-
-        def connect(kind, channel):
-            stranger = stack.enter_context(zmq.Context.instance().socket(kind))
-            stranger.linger = 0
-            stranger.connect(endpoint.address(CHANNELS[channel]))
-            return stranger
-
-        yield connect
 
 
 def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, until):
@@ -135,24 +111,6 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint,
             turn()
         until(lambda: sender.window.taken == 1, turn)
     assert taken == [1]
-
-
-def test_a_sender_knows_which_sample_its_messages_led_to(endpoint, until):
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-
-        def turn():
-            message = receiver.receive(0.05)
-            if message is not None:  # every other message leads to a sample
-                receiver.acknowledge(Position(message.seq, objects=made(message.seq // 2)))
-            sender.poll(0)
-
-        led_to = []
-        for seq in range(1, 8):
-            sender.send(tracks(seq))
-            until(lambda seq=seq: sender.window.taken == seq, turn)
-        for seq in range(1, 8):
-            led_to.append(sender.window.count_samples(seq).get("", 0))
-    assert led_to == [0, 1, 1, 2, 2, 3, 3]
 
 
 def test_a_full_window_accepts_no_more_messages(endpoint, until):
@@ -231,49 +189,6 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
     assert taken == list(range(1, 10))
 
 
-def test_a_restarted_sender_accepts_a_position_that_advanced_after_its_request(endpoint, until):
-    taken, found = [], []
-    with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
-        with Sender(RESULTS, endpoint, 10) as sender:
-            for seq in range(1, 6):
-                sender.send(tracks(seq))
-            until(lambda: len(taken) == 5, lambda: (sender.poll(0), take(receiver, taken, store=False)))
-        with Sender(RESULTS, endpoint, 10) as sender:
-            until(
-                lambda: found and found[-1] is not None,
-                lambda: (found.append(sender.ask_position()), take(receiver, taken, store=False)),
-            )
-            sender.window.resume(0, found[-1])
-            receiver.acknowledge(Position(5))
-
-            def on():
-                send_up_to(9, sender)
-                take(receiver, taken, store=True)
-
-            until(lambda: sender.window.stored == 9, on)
-    assert taken == list(range(1, 10))
-
-
-def test_a_receiver_stores_its_messages_in_a_separate_step_if_the_position_is_requested(endpoint, until):
-    taken, found = [], []
-    with Receiver(RESULTS, endpoint, Position(), 10) as receiver:
-
-        def turn():
-            found.append(sender.ask_position())
-            assert receiver.receive(0) is None
-            if receiver.window.position_requested:
-                receiver.answer(Position(len(taken), objects=made(7)))
-                assert not receiver.window.position_requested
-
-        with Sender(RESULTS, endpoint, 10) as sender:
-            for seq in range(1, 6):
-                sender.send(tracks(seq))
-            until(lambda: len(taken) == 5, lambda: (sender.poll(0), take(receiver, taken, store=False)))
-        with Sender(RESULTS, endpoint, 10) as sender:
-            until(lambda: found and found[-1], turn)
-    assert found[-1] == Position(5, objects=made(7))
-
-
 def test_a_repeated_message_receives_the_same_answer(endpoint, stranger, until):
     told = []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
@@ -289,44 +204,6 @@ def test_a_repeated_message_receives_the_same_answer(endpoint, stranger, until):
 
         until(lambda: len(told) == 2, turn)
     assert told == [Stored(1, 1, {"": 7}, unsaved=1)] * 2
-
-
-def test_a_receiver_of_another_stream_is_noticed(endpoint, until):
-    with Receiver(RESULTS, endpoint, Position(99), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        sender.send(tracks(1))
-
-        def turn():
-            receiver.receive(0.05)
-            sender.poll(0.05)
-
-        with pytest.raises(ProtocolError, match="another stream"):
-            until(lambda: False, turn)
-
-
-JUNK = [
-    [b"\x00"],
-    [b"not msgpack"],
-    [b"", b"two parts"],
-    [encode(Health("trainer", 0.0))],
-    [b"\x95\x04" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80"],
-]
-
-
-def test_the_bytes_of_a_stranger_are_counted_and_dropped(endpoint, stranger, until):
-    taken = []
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        other = stranger(zmq.DEALER, "results")
-        for parts in JUNK:
-            other.send_multipart(parts)
-
-        def turn():
-            sender.poll(0)
-            take(receiver, taken, store=True)
-
-        until(lambda: receiver.rejected == len(JUNK), turn)
-        sender.send(tracks(1))
-        until(lambda: sender.window.stored == 1, turn)
-    assert taken == [1]
 
 
 #: Takes nothing while its queue is full and the sender dies, for longer than any timer of ZeroMQ.
@@ -358,23 +235,6 @@ def test_a_receiver_with_a_full_queue_survives_its_sender(endpoint, until):
     assert busy.returncode == 0
 
 
-def test_a_message_above_the_limit_is_not_even_read(endpoint, stranger, until):
-    taken = []
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        other = stranger(zmq.DEALER, "results")
-        other.send(bytes(CHANNELS["results"].limit + 1))
-        sender.send(tracks(1))
-
-        def turn():
-            sender.poll(0)
-            take(receiver, taken, store=True)
-
-        until(lambda: sender.window.stored == 1, turn)
-        assert not other.poll(0)
-    assert taken == [1]
-    assert not receiver.rejected
-
-
 def test_a_reader_that_never_reads_blocks_nobody(endpoint, until):
     messages, long = 8000, "x" * 4000  # more than all buffers on the way hold
     with Publisher(TRACKS, endpoint) as publisher, Subscriber(TRACKS, endpoint) as idle:
@@ -402,16 +262,6 @@ def test_a_slow_reader_of_models_skips_to_the_newest(endpoint, until):
     assert len(seen) < 100
 
 
-def test_a_late_subscriber_receives_the_last_model(endpoint, until):
-    with Publisher(MODELS, endpoint) as models:
-        models.send(model(1))
-        models.send(model(2))
-        assert first(models, endpoint, until).version == 2
-        late = first(models, endpoint, until)
-    assert late.version == 2
-    assert late.weights.tolist() == [2] * 5
-
-
 def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):
     with Publisher(TRACKS, endpoint) as publisher:
         publisher.send(track(1))
@@ -426,27 +276,6 @@ def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):
 
             until(lambda: got, turn)
     assert got[0] > 1
-
-
-def test_one_channel_receives_from_all_three_processes(endpoint, until):
-    with ExitStack() as stack:
-        names = CHANNELS["health"].senders
-        publishers = {name: stack.enter_context(Publisher(HEALTH, endpoint, name)) for name in names}
-        reader = stack.enter_context(Subscriber(HEALTH, endpoint))
-        heard = set()
-
-        def turn():
-            for name, publisher in publishers.items():
-                publisher.send(Health(name, 0.0))
-            heard.update(message.process for message in reader.receive_all())
-
-        until(lambda: heard == set(names), turn)
-
-
-def test_the_end_is_received_like_any_other_message(endpoint, until):
-    with Publisher(SAMPLES, endpoint) as samples:
-        samples.send(End(1, "the source has ended"))
-        assert first(samples, endpoint, until).reason == "the source has ended"
 
 
 def test_the_last_message_arrives_even_if_its_sender_closes_at_once(endpoint, until):
