@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from time import monotonic
 from typing import Protocol, TypeVar
 
@@ -50,6 +51,7 @@ class Sender(ChannelSocket[Message]):
     def __init__(self, channel: Channel[Message], endpoint: Endpoint, window: int) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=window + 1)
         self.window = SendWindow(channel.name, window, monotonic())
+        self._send_frame = partial(self._socket.send, flags=zmq.NOBLOCK, copy=False)
         self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the receiver is connected
         self._connect()
 
@@ -98,8 +100,7 @@ class Sender(ChannelSocket[Message]):
 
     def _transmit(self) -> None:
         with contextlib.suppress(zmq.Again):  # tried again at the next poll
-            for frame in self.window.frames():
-                self._socket.send(frame, zmq.NOBLOCK, copy=False)
+            self.window.transmit(self._send_frame)
 
     def _say_hello(self) -> None:
         self.window.position_requested(monotonic())

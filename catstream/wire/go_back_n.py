@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from catstream.errors import ProtocolError, StreamRewoundError
@@ -109,10 +109,10 @@ class SendWindow:
         self._unacknowledged.append((seq, frame))
         self.sent = seq
 
-    def frames(self) -> Iterator[bytes]:
-        """The frames that were not transmitted yet; each counts as transmitted once the next one is asked for."""
+    def transmit(self, send: Callable[[bytes], object]) -> None:
+        """Send each frame that was not transmitted yet, until all were or `send` raises an error."""
         while self._in_flight < len(self._unacknowledged):
-            yield self._unacknowledged[self._in_flight][1]
+            send(self._unacknowledged[self._in_flight][1])
             self._in_flight += 1
 
     def must_ask(self, now: float) -> bool:

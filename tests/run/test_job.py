@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from catstream.box import Box
 from catstream.errors import ObjectError, ProtocolError, ServiceError, SettingsError
+from catstream.messages import storage
 from catstream.run.job import Job, Results
 from catstream.settings import Settings
 
@@ -71,6 +72,16 @@ def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_
     file.write_bytes(file.read_bytes().replace(b"320", b"321"))
     with pytest.raises(ProtocolError, match="checksum"):
         Job.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("size", [320]), ("owned", "yes"), ("models", ["ben"]), ("boxes", {"": [1, 2]}), ("part", 3)]
+)
+def test_a_field_of_another_type_is_an_error(tmp_path, field, value):
+    file = JOB.save(tmp_path)
+    storage.write(file, {}, storage.read_metadata(file) | {field: value})
+    with pytest.raises(ProtocolError, match="is not a valid job of a pipeline"):
+        Job.load(file)
 
 
 def test_a_run_is_continued_only_with_the_same_frames_and_training_settings():
