@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from catstream.errors import ProtocolError, ServiceError
+from catstream.errors import CatstreamError, ProtocolError, ServiceError
 
 __all__ = [
     "ABANDONED_SECONDS",
@@ -124,18 +124,18 @@ def remove_parts(folder: Path, name: str = "") -> None:
 
 
 @contextlib.contextmanager
-def writing(path: str | os.PathLike[str]) -> Iterator[None]:
-    """A block that writes a file, or into a folder.
+def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceError) -> Iterator[None]:
+    """A block that writes a file, or into a folder: an OSError in it is reported in one line, for a person.
 
     Raises
     ------
-    ServiceError
-        If the block raises an OSError: one line, for a person.
+    CatstreamError
+        Of this kind, if the block raises an OSError.
     """
     try:
         yield
     except OSError as error:
-        raise ServiceError(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
+        raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
 
 
 def is_writable(folder: Path) -> bool:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from glob import escape
 from pathlib import Path
 from typing import Self, TypeVar
@@ -24,7 +24,7 @@ from typing import Self, TypeVar
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, is_name
-from catstream.messages.storage import name_fits
+from catstream.messages.storage import name_fits, writing
 from catstream.sinks.formats import CsvSink, format_box
 from catstream.sinks.lines import LineFile
 
@@ -101,7 +101,7 @@ class ResultsWriter:
         self._continues = self._again = again
         self._objects: dict[str, list[LineFile]] = {}  # the files of each object that has appeared
         self._files = contextlib.ExitStack()
-        with self._opening():
+        with writing(self.directory, VideoError):
             self.directory.mkdir(parents=True, exist_ok=True)
             self._table = self._open(CsvSink(self.directory / table_file(name), again=again))
 
@@ -142,23 +142,13 @@ class ResultsWriter:
             _log.warning("%s %s: the boxes of %s are in %s only", paths[0], reason, thing, table_file(self.name))
             return
         for path, nothing in reversed([*zip(paths, _NOTHING, strict=True)]):
-            with self._opening():
+            with writing(path, VideoError):
                 file = self._open(LineFile(path, again=self._again))
             file.add(self.rows * f"{nothing}\n")
             self._objects[thing].insert(0, file)
 
     def _open(self, file: _File) -> _File:
         return self._files.enter_context(contextlib.closing(file))
-
-    @contextlib.contextmanager
-    def _opening(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise VideoError(
-                f"cannot write results to {str(self.directory)!r} ({error.strerror}): "
-                "give a folder that exists or can be made, and that you have permission to write to"
-            ) from None
 
     def __enter__(self) -> Self:
         return self

@@ -16,7 +16,7 @@ from typing import Protocol
 
 from catstream.errors import VideoError, require_extra
 from catstream.messages.kinds import Track
-from catstream.messages.storage import why_not_writable
+from catstream.messages.storage import why_not_writable, writing
 from catstream.sinks.formats import CsvSink, MotSink, NdjsonSink, StdoutSink
 from catstream.sinks.lines import LineSink
 from catstream.sinks.made import MADE, make
@@ -127,10 +127,8 @@ def _open(path: Path, source: str | None, part: slice, image_rate: float, again:
         if source is None:
             raise VideoError(f"{path} needs the frames: give their source (--source)")
         return VideoSink(path, source, part, image_rate)
-    try:
+    with writing(path, VideoError):
         return _FORMATS[path.suffix](path, again=again)
-    except OSError as error:
-        raise VideoError(f"cannot write {path} ({error.strerror}): give a path that you may write to") from None
 
 
 def discard(path: Path) -> None:
@@ -141,11 +139,9 @@ def discard(path: Path) -> None:
     VideoError
         If it cannot be removed.
     """
-    try:
-        if path != STDOUT:
+    if path != STDOUT:
+        with writing(path, VideoError):
             path.unlink(missing_ok=True)
-    except OSError as error:
-        raise VideoError(f"cannot replace {path} ({error.strerror}): give another name") from None
 
 
 def _log(path: Path) -> Path:
