@@ -10,7 +10,7 @@ from catstream.cli.attach import with_endpoint
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 
 if TYPE_CHECKING:
-    from catstream.web.server import Site
+    from catstream.web.app import Site
 
 __all__ = ["fleet_view", "view"]
 
