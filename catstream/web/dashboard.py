@@ -291,7 +291,7 @@ class Dashboard(Parts):
 
     def _surprising_part(self, _: int) -> dict[str, object]:
         frames = [
-            {"frame": one.frame, "time": one.time, "object": one.object}
+            {"frame": one.frame, "object": one.object}
             | {"surprise": round(one.surprise, 3), "colour": self.objects.colours.of(one.object)}
             | {"box": one.preview.boxes[one.object], "width": one.preview.width, "height": one.preview.height}
             for one in self.surprising.frames

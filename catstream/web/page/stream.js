@@ -156,13 +156,10 @@ export class StreamPage {
 
   /** Show the list, unless the only object has no name. */
   showObjects() {
-    const { single, chosen, list } = this.objects;
-    const shown = [single, chosen, ...list.map((one) => one.name)].join();
-    if (shown === this.shown) return;
-    this.shown = shown;
+    const { single, chosen } = this.objects;
     $("#objects").hidden = single;
     $("#stream").classList.toggle("several", !single);
-    for (const target of document.querySelectorAll(".of")) target.textContent = single ? "" : ` of ${chosen || "the object without a name"}`;
+    for (const target of document.querySelectorAll(".of")) write(target, single ? "" : ` of ${chosen || "the object without a name"}`);
     this.stage.draw();
   }
 
