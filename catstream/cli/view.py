@@ -11,7 +11,7 @@ from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.services.options import with_keys
 
 if TYPE_CHECKING:
-    from catstream.web.server import Site
+    from catstream.web.app import Site
 
 __all__ = ["fleet_view", "view"]
 

@@ -46,12 +46,11 @@ from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.connections import body_of
 from catstream.web.feed import Feed, PipelineFeed
-from catstream.web.server import Site
 from catstream.web.streams import FleetFeed
 from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
 from catstream.wire.codec import decode_json
 
-__all__ = ["fleet_site", "pipeline_site"]
+__all__ = ["Site", "fleet_site", "pipeline_site"]
 
 _PAGE = Path(__file__).with_name("page")
 
@@ -61,92 +60,90 @@ _CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, Cats
 
 def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
     """Return the site of the pipeline at an endpoint, as in `PipelineFeed`."""
-    return _site(PipelineFeed(endpoint, keys))
+    return Site(PipelineFeed(endpoint, keys))
 
 
 def fleet_site(fleet: str = "", keys: str = "") -> Site:
     """Return the site of a fleet, which may start later; the arguments are those of `FleetFeed`."""
-    return _site(FleetFeed(fleet, keys))
+    return Site(FleetFeed(fleet, keys))
 
 
-def _site(feed: PipelineFeed | FleetFeed) -> Site:
-    """Return the site whose first page shows what this feed has."""
+class Site:
+    """The web application of a pipeline or of a fleet, without access control; `Server` serves it.
 
-    @asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        feed.start()
-        yield
-        await asyncio.wait([feed.stop()])
+    Attributes
+    ----------
+    app : the application
+    """
 
-    pages = _Pages(feed)
-    app = Starlette(lifespan=lifespan, routes=_routes(feed, pages), exception_handlers={CatstreamError: _failed})
-    return Site(app, pages.close)
-
-
-def _routes(feed: PipelineFeed | FleetFeed, pages: _Pages) -> list[BaseRoute]:
-    common = [
-        Route("/", pages.index),
-        Route("/events", pages.events),
-        Route("/metrics", pages.metrics),
-        Route("/healthz", pages.healthz),
-        Route("/readyz", pages.readyz),
-        Mount("/page", StaticFiles(directory=_PAGE)),
-    ]
-    of_pipeline = [
-        *common,
-        Route("/pictures/{frame:int}.jpg", pages.picture),
-        Route("/live.mjpeg", pages.live),
-        Route("/control", pages.control, methods=["POST"]),
-    ]
-    if isinstance(feed, PipelineFeed):
-        return of_pipeline
-    return [
-        *common,
-        Route("/streams/{stream}/picture.jpg", partial(_small_picture, feed)),
-        Mount("/streams/{stream}", routes=of_pipeline),
-    ]
-
-
-class _Pages:
-    """The handlers of the routes."""
-
-    def __init__(self, feed: Feed) -> None:
+    def __init__(self, feed: PipelineFeed | FleetFeed) -> None:
         self._feed = feed
         self._closed = False
+        routes = self._routes(feed)
+        self.app = Starlette(lifespan=self._lifespan, routes=routes, exception_handlers={CatstreamError: _failed})
 
     def close(self) -> None:
-        """End the streams of all open pages."""
+        """End the streams of all open pages; called before the shutdown of a server, which waits for them."""
         self._closed = True
 
-    async def index(self, request: Request) -> Response:
+    @asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        self._feed.start()
+        yield
+        await asyncio.wait([self._feed.stop()])
+
+    def _routes(self, feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
+        common = [
+            Route("/", self._index),
+            Route("/events", self._events),
+            Route("/metrics", self._metrics),
+            Route("/healthz", self._healthz),
+            Route("/readyz", self._readyz),
+            Mount("/page", StaticFiles(directory=_PAGE)),
+        ]
+        of_pipeline = [
+            *common,
+            Route("/pictures/{frame:int}.jpg", self._picture),
+            Route("/live.mjpeg", self._live),
+            Route("/control", self._control, methods=["POST"]),
+        ]
+        if isinstance(feed, PipelineFeed):
+            return of_pipeline
+        return [
+            *common,
+            Route("/streams/{stream}/picture.jpg", partial(_small_picture, feed)),
+            Mount("/streams/{stream}", routes=of_pipeline),
+        ]
+
+    async def _index(self, request: Request) -> Response:
         self._feed_of(request)
         return FileResponse(_PAGE / "index.html")
 
-    async def events(self, request: Request) -> Response:
+    async def _events(self, request: Request) -> Response:
         return StreamingResponse(self._updates(self._feed_of(request)), media_type="text/event-stream")
 
-    async def metrics(self, request: Request) -> Response:
+    async def _metrics(self, request: Request) -> Response:
         text = metrics.text(self._feed_of(request))
         return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    async def healthz(self, _: Request) -> Response:
+    async def _healthz(self, _: Request) -> Response:
         return PlainTextResponse("ok\n")
 
-    async def readyz(self, request: Request) -> Response:
+    async def _readyz(self, request: Request) -> Response:
         problem = self._feed_of(request).problem
         return PlainTextResponse(f"{problem or 'ok'}\n", 503 if problem else 200)
 
-    async def picture(self, request: Request) -> Response:
+    async def _picture(self, request: Request) -> Response:
         preview = self._pipeline(request).dashboard.picture(request.path_params["frame"])
         if preview is None:
             return PlainTextResponse("this picture is no longer available\n", 404)
         return Response(preview.jpeg, media_type="image/jpeg")
 
-    async def live(self, request: Request) -> Response:
+    async def _live(self, request: Request) -> Response:
         pictures = self._annotated_pictures(self._pipeline(request))
         return StreamingResponse(pictures, media_type="multipart/x-mixed-replace; boundary=picture")
 
-    async def control(self, request: Request) -> Response:
+    async def _control(self, request: Request) -> Response:
         feed = self._pipeline(request)
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":

@@ -113,7 +113,6 @@ class Dashboard(Parts):
         self.last_reports: dict[str, float] = {}
         self.pictures = Recent[int, Preview](_PICTURES)
         self.surprising = SurprisingFrames(self.pictures)
-        self._last: dict[str, Health] = {}  # like `health`, but kept while the pipeline is silent
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
         self._arrivals = Recent[int, float](_FRAMES)  # of the first track of each frame
@@ -164,7 +163,6 @@ class Dashboard(Parts):
     def mark_silent(self, reason: str, now: float) -> None:
         """Record that the pipeline is silent or does not exist."""
         super().mark_silent(reason, now)
-        self.health.clear()
         self.last_reports.clear()
 
     def rate(self, now: float) -> float:
@@ -200,7 +198,6 @@ class Dashboard(Parts):
         self.health[health.process] = health
         times = self.last_reports | {health.process: now}
         self.last_reports = {name: last for name, last in times.items() if now - last <= SILENCE_SECONDS}
-        self._last[health.process] = health
         self.source = health.source or self.source
         if health.process == "detector":
             self._add_objects(health)
@@ -229,7 +226,7 @@ class Dashboard(Parts):
 
     def _add_model(self, model: Model, now: float) -> None:
         arrived = self._arrivals.get(model.frame)
-        self.objects.add_model(model, None if arrived is None else now - arrived)
+        self.objects.add_model(model, None if arrived is None else round(now - arrived, 3))
 
     def _add_preview(self, preview: Preview) -> None:
         self.pictures[preview.frame] = preview
@@ -242,10 +239,10 @@ class Dashboard(Parts):
             return
         self._last_point = now
         objects = {
-            name: (each.score, each.model_latency, each.version, each.state != "absent")
+            name: (round(each.score, 3), each.model_latency, each.version, each.state != "absent")
             for name, each in self.objects.shown.items()
         }
-        self._points.append((now, self.rate(now), objects))
+        self._points.append((round(now, 3), self.rate(now), objects))
         self._mark_changed("points")
 
     def _status_part(self, _: int) -> dict[str, object]:
@@ -274,14 +271,11 @@ class Dashboard(Parts):
         preview = self.newest[0]
         return {"frame": preview.frame, "width": preview.width, "height": preview.height, "boxes": preview.boxes}
 
-    def _points_part(self, new: int) -> list[list[object]]:
-        return [
-            [round(now, 3), rate, {name: list(map(_rounded, values)) for name, values in objects.items()}]
-            for now, rate, objects in list(self._points)[-new:]
-        ]
+    def _points_part(self, new: int) -> list[_Point]:
+        return list(self._points)[-new:]
 
     def _trees_part(self, _: int) -> dict[str, object]:
-        counted = self._last["compressor"].objects if "compressor" in self._last else {}
+        counted = self.health["compressor"].objects if "compressor" in self.health else {}
         objects = {
             name: {
                 "leaves": [counters.get(f"{tree}_leaves", 0.0) for tree in TREES],
@@ -297,16 +291,12 @@ class Dashboard(Parts):
 
     def _surprising_part(self, _: int) -> dict[str, object]:
         frames = [
-            {"frame": one.frame, "time": one.time, "object": one.object}
+            {"frame": one.frame, "object": one.object}
             | {"surprise": round(one.surprise, 3), "colour": self.objects.colours.of(one.object)}
             | {"box": one.preview.boxes[one.object], "width": one.preview.width, "height": one.preview.height}
             for one in self.surprising.frames
         ]
         return {"measured": self.surprising.measured, "frames": frames}
-
-
-def _rounded(value: float | None) -> float | None:
-    return round(value, 3) if isinstance(value, float) else value
 
 
 class FleetDashboard(Parts):

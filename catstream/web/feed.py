@@ -35,7 +35,6 @@ class Feed(ABC):
     ----------
     dashboard : the state of the page
     viewers : number of open pages
-    used : time of the last request to the page
     """
 
     dashboard: Parts
@@ -43,7 +42,6 @@ class Feed(ABC):
 
     def __init__(self) -> None:
         self.viewers = 0
-        self.used = 0.0
         self._has_viewers = asyncio.Event()
 
     @property
@@ -108,6 +106,7 @@ class PipelineFeed(Feed):
     Attributes
     ----------
     place : endpoint of the current connection, with its keys; None if there is none
+    used : time of the last request to the page, of the monotonic clock
     """
 
     dashboard: Dashboard
@@ -118,6 +117,7 @@ class PipelineFeed(Feed):
         self._endpoint, self._keys = endpoint, keys
         self.dashboard = Dashboard()
         self.place: Endpoint | None = None
+        self.used = monotonic()
 
     @property
     def problem(self) -> str:

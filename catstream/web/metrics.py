@@ -52,11 +52,13 @@ class _Collected(Collector):
 def _of_pipeline(feed: PipelineFeed) -> Iterator[_Row]:
     """The metrics of a pipeline; the label of an object without a name is empty."""
     dashboard = feed.dashboard
+    yield _GAUGE, "up", (), "Whether the pipeline sends messages.", {(): dashboard.phase == "running"}
+    yield _GAUGE, "viewers", (), "Open pages.", {(): feed.viewers}
+    if dashboard.phase != "running":
+        return
     sent, taken = dashboard.counter("detector", "sent"), dashboard.counter("detector", "taken")
     waiting = None if sent is None or taken is None else sent - taken
     rate = dashboard.rate(monotonic()) if dashboard.objects.shown else None
-    yield _GAUGE, "up", (), "Whether the pipeline sends messages.", {(): dashboard.phase == "running"}
-    yield _GAUGE, "viewers", (), "Open pages.", {(): feed.viewers}
     yield _GAUGE, "frames_per_second", (), "Frames per second over the last two seconds.", {(): rate}
     yield _GAUGE, "features_waiting", (), "Features messages that the compressor has not received yet.", {(): waiting}
     for kind, name, counter, meaning in (

@@ -9,34 +9,21 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import cast
 from urllib.parse import quote
 
 import uvicorn
-from starlette.types import ASGIApp
 
 from catstream.errors import ServiceError
+from catstream.web.app import Site
 from catstream.web.connections import MAX_CONNECTIONS, Connections
 from catstream.web.guard import Guard, is_loopback
 from catstream.web.timing import SHUTDOWN_SECONDS
 
-__all__ = ["Server", "Site"]
+__all__ = ["Server"]
 
 _ALL_ADDRESSES = ("0.0.0.0", "::")  # bind addresses that include all interfaces
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """A web application, without access control.
-
-    app    the application
-    close  ends the streams of open pages; called before the shutdown of the server, which waits for all connections
-    """
-
-    app: ASGIApp
-    close: Callable[[], None]
 
 
 class Server:

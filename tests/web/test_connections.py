@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from contextlib import ExitStack, suppress
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import pytest
@@ -12,7 +13,6 @@ import pytest
 from catstream.messages.kinds import Preview
 from catstream.web import connections
 from catstream.web.dashboard import Dashboard
-from catstream.web.server import Site
 
 TOKEN = "correct-horse-battery"
 HALF = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-"
@@ -107,6 +107,6 @@ async def late(scope, receive, send):  # noqa: ARG001
 
 def test_a_response_is_not_cut_off_if_the_application_returns_late_from_the_request_before(serve_site, monkeypatch):
     monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.3)
-    client = serve_site(Site(late, lambda: None))
+    client = serve_site(SimpleNamespace(app=late, close=lambda: None))
     assert client.get("/healthz").text == "ok"
     assert client.get("/parts").text.endswith("partthe end")

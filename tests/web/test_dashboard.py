@@ -68,6 +68,13 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
 
 
+def test_the_number_of_skipped_frames_is_shown_after_the_end(dashboard):
+    dashboard.take(Health("detector", 1.0, {"sent": 1.0, "skipped": 40.0}), 0.0)
+    dashboard.take(End(2, "the source has ended"), 1.0)
+    dashboard.mark_silent("no pipeline is running", 5.0)
+    assert dashboard.updates({})["status"]["skipped"] == 40.0
+
+
 def test_a_silent_process_is_not_listed(dashboard):
     names = {"compressor", "detector", "trainer"}
     for name in names:
@@ -213,7 +220,7 @@ def test_a_point_of_the_charts_has_each_object(dashboard, facts):
     dashboard.take(facts.track(5, name="ben", state="absent", score=0.1, version=3), 1.0)
     dashboard.take(facts.track(6, name="anna", score=0.25), 2.0)
     now, rate, objects = dashboard.updates({})["points"][-1]
-    assert (now, rate, objects) == (2.0, 1.0, {"anna": [0.25, None, 1, True], "ben": [0.1, None, 3, False]})
+    assert (now, rate, objects) == (2.0, 1.0, {"anna": (0.25, None, 1, True), "ben": (0.1, None, 3, False)})
 
 
 def test_latency_is_measured_from_a_track_to_the_model_trained_on_its_frame_for_each_object(dashboard, facts):

@@ -59,6 +59,16 @@ def labels(found):
     return {name: set(re.findall(r"(\w+)=", some[0][0])) for name, some in found.items()}
 
 
+def test_a_pipeline_that_does_not_run_has_no_old_values(facts):
+    feed = PipelineFeed()
+    feed.dashboard.take(facts.tracking(6.0, "anna"), 0.0)
+    assert "catstream_score" in samples(feed)
+    feed.dashboard.mark_silent("nothing came", 5.0)
+    assert samples(feed) == {"catstream_up": [("", 0.0)], "catstream_viewers": [("", 0.0)]}
+    feed.dashboard.take(facts.track(7, name="anna"), 6.0)
+    assert samples(feed)["catstream_up"] == [("", 1.0)]
+
+
 @pytest.mark.parametrize("kind", ["pipeline", "fleet"])
 def test_the_page_documents_each_metric_with_its_labels(kind, request):
     page = (DOCS / "how-to" / "view.md").read_text()

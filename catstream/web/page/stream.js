@@ -38,8 +38,8 @@ export class StreamPage {
       "Stop it", "Continue", () => this.send("stop"));
     const trees = $("#trees details");
     trees.open = matchMedia("(min-width: 40rem)").matches; // on a phone, they are much longer than the rest
-    trees.ontoggle = () => this.trees.redraw();
-    addEventListener("resize", () => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
+    const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
+    for (const drawn of [$("#stage"), $(".charts"), $(".trees")]) sizes.observe(drawn);
   }
 
   /** Show the parts that have changed; `pipeline` is sent, with all of them, if all that was shown is of another one. */
@@ -156,13 +156,10 @@ export class StreamPage {
 
   /** Show the list, unless the only object has no name. */
   showObjects() {
-    const { single, chosen, list } = this.objects;
-    const shown = [single, chosen, ...list.map((one) => one.name)].join();
-    if (shown === this.shown) return;
-    this.shown = shown;
+    const { single, chosen } = this.objects;
     $("#objects").hidden = single;
     $("#stream").classList.toggle("several", !single);
-    for (const target of document.querySelectorAll(".of")) target.textContent = single ? "" : ` of ${chosen || "the object without a name"}`;
+    for (const target of document.querySelectorAll(".of")) write(target, single ? "" : ` of ${chosen || "the object without a name"}`);
     this.stage.draw();
   }
 
