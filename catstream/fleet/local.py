@@ -30,6 +30,7 @@ from catstream.fleet.timing import (
     HEALTH_FAILURES,
     HEALTH_SECONDS,
     NODES_SECONDS,
+    RETURN_SECONDS,
 )
 from catstream.messages.storage import is_locked, lock, write_atomically
 from catstream.services import start
@@ -200,16 +201,18 @@ def _keep(folder: Path, count: int, cores: int, ends: threading.Event) -> None:
     cluster: Any = Cluster(initialize_head=True, head_node_args=options(1) | {"include_dashboard": False})
     try:
         nodes = {number: cluster.add_node(**options(number)) for number in range(2, count + 1)}
+        due: dict[int, float] = {}  # moment from which a node that has died is started again
         write_atomically(folder / "address", cluster.address.encode(), mode=0o600)
         while not ends.wait(NODES_SECONDS):
             if _has_died(cluster.head_node):
                 print("the head, node-1, has died", flush=True)
                 return
             for number, node in nodes.items():
-                if node is None or _has_died(node):
+                if node is not None and _has_died(node):
                     print(f"node-{number} has died, and is started again", flush=True)
-                    if node is not None:
-                        cluster.remove_node(node, allow_graceful=False)
+                    cluster.remove_node(node, allow_graceful=False)
+                    nodes[number], due[number] = None, time.monotonic() + RETURN_SECONDS
+                elif node is None and time.monotonic() >= due[number]:
                     nodes[number] = _start_again(cluster, options(number))
     finally:  # Ray ends this process on SIGTERM
         (folder / "address").unlink(missing_ok=True)

@@ -45,6 +45,7 @@ CLUSTER_START_SECONDS = 150.0  #: limit for Ray to start, on a machine that is b
 CLUSTER_END_SECONDS = 30.0  #: limit for it to end before it is killed
 CLUSTER_LOOK_SECONDS = 0.05  #: between two looks whether it has started or ended
 NODES_SECONDS = 0.5  #: between two looks at its nodes
+RETURN_SECONDS = 3.0  #: from the death of a node to its next start: its streams, which start elsewhere, come first
 HEALTH_DELAY_SECONDS = 1.0  #: before the first health check of a node
 HEALTH_SECONDS = 0.5  #: between two of them
 HEALTH_ANSWER_SECONDS = 1.5  #: limit for an answer
@@ -73,5 +74,6 @@ ORDER: tuple[tuple[float, float, str], ...] = (
     (TRACKS_SECONDS, RATE_SECONDS, "rates are measured over no frame"),
     (CLUSTER_LOOK_SECONDS, CLUSTER_END_SECONDS, "a cluster that has ended is killed"),
     (CLUSTER_END_SECONDS, CLUSTER_START_SECONDS, "a cluster that starts while another one ends does not wait for it"),
+    (NODES_SECONDS, RETURN_SECONDS, "a node starts again while the streams that it had start elsewhere"),
     (SHOW_SECONDS, UP_SECONDS, "`up` shows no stream"),
 )
