@@ -151,7 +151,7 @@ def small_buffers(monkeypatch):
 
 @pytest.mark.usefixtures("small_buffers")
 def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks):
-    count = 30_000  # more than all buffers on the way hold
+    count = 10_000  # more than all buffers on the way hold
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, count):
             tracks.send(track(seq))
