@@ -97,15 +97,6 @@ def test_a_tracker_says_what_it_is(video):
     assert repr(started(video)) == "<catstream.Tracker, at frame 0: the object bootstrapping>"
 
 
-def test_a_rejected_box_does_not_change_the_tracked_object(video):
-    (frames, boxes), tracker = video, started(video)
-    with pytest.raises(BoxError):
-        tracker.init(frames[1], (-500, 0, 10, 10))
-    found, box = tracker.update(frames[1])
-    assert found
-    assert box.overlap(Box(*boxes[1])) > 0.5
-
-
 def test_frames_of_other_libraries_give_the_boxes_of_the_same_frames(video, boxes_found):
     frames, boxes = video
     read_only = [np.frombuffer(frame.tobytes(), np.uint8).reshape(frame.shape) for frame in frames]

@@ -13,21 +13,20 @@ from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.services.previews import Previews
 from catstream.video.demo import render
-from catstream.wire.endpoint import Endpoint
 
 
 @pytest.fixture
-def previews(folder):
-    with Previews(Endpoint.parse(str(folder))) as previews:
+def previews(endpoint):
+    with Previews(endpoint) as previews:
         yield previews
 
 
 @pytest.fixture
-def looks(folder, previews, until):
+def looks(endpoint, previews, until):
     """Somebody begins to look."""
 
     def begin():
-        reader = subscribe(str(folder), "previews", timeout=60)
+        reader = subscribe(str(endpoint), "previews", timeout=60)
         until(lambda: previews.has_subscribers, previews.turn)
         return reader
 

@@ -709,29 +709,27 @@ def test_the_object_of_a_saved_model_is_still_searched_for_unless_it_was_found()
 # The file of events
 
 
+def replayed(history, file):
+    """How many events are in the file, and the state after them: they lead to the same actions again."""
+    history.write(file)
+    state, steps = History.read(file)
+    for event, orders in steps:
+        state, found = handle(state, event)
+        assert msgspec.json.decode(msgspec.json.encode(found, enc_hook=np.ndarray.tolist)) == orders
+    return len(steps), state
+
+
 def test_the_last_events_are_written_and_lead_to_the_same_actions_again(two, tmp_path):
     for number in range(400):
         reply(two, "pause" if number % 2 else "resume")
         two.command("search", "anna", saved=SAVED)
         two.frame()
         two.receive_all()
-    file = tmp_path / "events.ndjson"
-    two.history.write(file)
-    state, steps = History.read(file)
-    assert len(steps) == 1000
-    for event, orders in steps:
-        state, found = handle(state, event)
-        assert msgspec.json.decode(msgspec.json.encode(found)) == orders
-    assert state == two.state
+    assert replayed(two.history, tmp_path / "events.ndjson") == (1000, two.state)
 
 
 def test_the_positions_of_the_receivers_are_written_with_the_states_of_the_detectors(repeating, tmp_path):
-    repeating.history.write(tmp_path / "events.ndjson")
-    state, steps = History.read(tmp_path / "events.ndjson")
-    for event, orders in steps:
-        state, found = handle(state, event)
-        assert msgspec.json.decode(msgspec.json.encode(found, enc_hook=np.ndarray.tolist)) == orders
-    assert state == repeating.state
+    assert replayed(repeating.history, tmp_path / "events.ndjson")[1] == repeating.state
 
 
 def test_an_event_that_leads_to_an_error_is_written_too(two, tmp_path):

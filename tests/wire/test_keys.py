@@ -6,7 +6,6 @@ import os
 import stat
 from contextlib import ExitStack, suppress
 
-import numpy as np
 import pytest
 import zmq
 
@@ -16,13 +15,7 @@ from catstream.messages.kinds import (
     Answer,
     Command,
     End,
-    Health,
-    Model,
     Position,
-    Preview,
-    Run,
-    Sample,
-    SavedModel,
     Track,
     Tracks,
 )
@@ -52,18 +45,6 @@ def track(seq):
     return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
 
 
-#: What is said on a watched channel, by its first kind.
-SAID = {
-    Track: track(1),
-    Sample: End(1, "nothing was learned"),
-    Model: Model(1, 1, np.ones(3, np.float32), 0.0),
-    Health: Health("detector", 0.0),
-    Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
-    SavedModel: SavedModel(1, b"the bytes of a file"),
-    Run: End(1, "nothing was learned"),
-}
-
-
 def rejected(reason):
     return rejects().get(f"rejected_{reason}", 0)
 
@@ -90,7 +71,7 @@ def place(keys, tcp):
 
 
 @pytest.fixture
-def listener(place):
+def listener(place, message_of):
     """The listening side of a channel, and one turn of it: what it took."""
     with ExitStack() as stack:
 
@@ -103,7 +84,7 @@ def listener(place):
                 responder = stack.enter_context(Responder(CONTROL, place()))
                 return lambda: responder.receive_all() or None
             publisher = stack.enter_context(Publisher(CHANNELS[name], place(), channel.senders[0]))
-            return lambda: publisher.send(SAID[channel.messages[0]])
+            return lambda: publisher.send(message_of(name))
 
         yield listen
 
@@ -313,11 +294,11 @@ def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_after
         until(lambda: heard, turn)
 
 
-def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, folder, until):
+def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, folder, message_of, until):
     create(folder / "second")
     second = str(folder / "second.d"), str(folder / "second")
     (folder / "second.d").mkdir(mode=0o700)
-    model, heard = SAID[Model], []
+    model, heard = message_of("models"), []
     with (
         Publisher(MODELS, place()) as one,
         Publisher(MODELS, Endpoint.parse(*second)) as two,

@@ -170,15 +170,15 @@ def test_of_a_burst_that_no_queue_holds_the_newest_of_each_object_still_arrives(
 
 def test_a_publisher_remembers_the_last_messages_of_a_limited_number_of_names(endpoint):
     with Publisher(MODELS, endpoint) as models:
-        for version in range(1, 2000):
+        for version in range(1, 600):
             models.send(model(version, f"o{version}"))
-        assert list(models._last) == [opening(Model, f"o{version}") for version in range(1744, 2000)]
+        assert list(models._last) == [opening(Model, f"o{version}") for version in range(344, 600)]
 
 
 def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_that_arrive():
     turns = Turns()
     try:
-        turns.queue.extend(encode(model(version, f"o{version}")) for version in range(1, 3000))
+        turns.queue.extend(encode(model(version, f"o{version}")) for version in range(1, 1500))
         turns.queue.append(b"no message" * 100)
         versions = []
         while (message := turns.subscriber.receive(0)) is not None:
@@ -187,7 +187,7 @@ def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_that_
             assert len(turns.subscriber._last) <= 1024
     finally:
         turns.teardown()
-    assert versions == list(range(1, 3000))
+    assert versions == list(range(1, 1500))
 
 
 def test_a_flood_of_subscriptions_is_counted_and_the_others_are_served(endpoint, until):
@@ -197,9 +197,9 @@ def test_a_flood_of_subscriptions_is_counted_and_the_others_are_served(endpoint,
         with zmq.Context.instance().socket(zmq.SUB) as stranger:
             stranger.linger = stranger.sndhwm = 0
             stranger.connect(endpoint.address(TRACKS))
-            for number in range(3000):
+            for number in range(1500):
                 stranger.subscribe(opening(Track, f"o{number}"))
-            until(lambda: rejects().get("rejected_subscription", 0) >= before + 3000 - 1023, tracks.serve_late_joiners)
+            until(lambda: rejects().get("rejected_subscription", 0) >= before + 1500 - 1023, tracks.serve_late_joiners)
             assert len(tracks._subscribed) == 1024
             tracks.send(track("anna"))
             assert honest.receive(30) == track("anna")

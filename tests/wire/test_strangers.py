@@ -15,13 +15,8 @@ from catstream.messages.kinds import (
     End,
     Features,
     Health,
-    Model,
     ObjectFeatures,
     Position,
-    Preview,
-    Run,
-    Sample,
-    SavedModel,
     Stored,
     Track,
     TrainingRows,
@@ -152,16 +147,10 @@ def test_a_repeated_acknowledgement_does_not_undo_a_later_one(endpoint, until):
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(name, endpoint, stranger, until):
-    said = {
-        Track: Track(1, 0, 0.0, "absent", None, 0.0, 0),
-        Sample: End(1, "nothing was learned"),
-        Model: Model(1, 1, np.ones(3, np.float32), 0.0),
-        Health: Health("detector", 0.0),
-        Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
-        SavedModel: SavedModel(1, b"the bytes of a file"),
-        Run: End(1, "nothing was learned"),
-    }[CHANNELS[name].messages[0]]
+def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(
+    name, endpoint, stranger, message_of, until
+):
+    said = message_of(name)
     before, heard = rejected("subscription"), []
     with (
         Publisher(CHANNELS[name], endpoint, CHANNELS[name].senders[0]) as publisher,

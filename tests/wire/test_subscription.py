@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import shutil
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -151,7 +150,7 @@ def small_buffers(monkeypatch):
 
 @pytest.mark.usefixtures("small_buffers")
 def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks):
-    count = 30_000  # more than all buffers on the way hold
+    count = 10_000  # more than all buffers on the way hold
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, count):
             tracks.send(track(seq))
@@ -161,27 +160,20 @@ def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks)
         assert len(heard) + subscription.missed == count - 2
 
 
-def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(endpoint, tracks):
+def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(endpoint, tracks, turning):
+    seen = []
+
+    def turn():
+        models.serve_late_joiners()
+        if seen:  # the subscriber is there
+            tracks.send(End(2, "the source has ended"))
+
     with Publisher(MODELS, endpoint) as models:
         models.send(model(1))
         models.send(model(2))
-        ended, seen = threading.Event(), []
-
-        def publish():
-            while not ended.wait(0.01):
-                models.serve_late_joiners()
-                if seen:  # the subscriber is there
-                    tracks.send(End(2, "the source has ended"))
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        try:
-            with catstream.subscribe(str(endpoint), "models", timeout=20) as subscription:
-                for message in subscription:
-                    seen.append(message.version)
-        finally:
-            ended.set()
-            thread.join()
+        with turning(turn), catstream.subscribe(str(endpoint), "models", timeout=20) as subscription:
+            for message in subscription:
+                seen.append(message.version)
     assert seen == [2]
     assert subscription.end.reason == "the source has ended"
 
