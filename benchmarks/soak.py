@@ -153,13 +153,13 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
         ):
             seen, part, begin = psutil.Process(process.pid), messages // 5, 0.0
             for seq in range(1, messages + 1):
-                message = stream.message(seq)
-                while not sender.send(message):
+                while sender.window.full:
                     sender.poll(0.05)
                     if process.poll() is not None:
                         raise ServiceError(
                             f"the compressor ended with {process.returncode}: run it in a terminal to see why"
                         )
+                sender.send(stream.message(seq))
                 if seq == 1:  # the imports are finished once the process has answered
                     wait(sender, 1)
                     begin = perf_counter()

@@ -72,8 +72,9 @@ def delivered(endpoint: str, features: Features, messages: int) -> float:
             receiver.join(0.01)
         begin = perf_counter()
         for seq in range(1, messages + 1):
-            while not sender.send(replace(features, seq=seq)):
+            while sender.window.full:
                 sender.poll(0.01)
+            sender.send(replace(features, seq=seq))
         while sender.window.stored < messages:
             sender.poll(0.01)
         seconds = perf_counter() - begin

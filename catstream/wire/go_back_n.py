@@ -96,6 +96,11 @@ class SendWindow:
         self.stored = min(seq, position.seq - position.unsaved)
         self._sent_before = position.seq + self._size  # a whole window of the earlier sender may still be on its way
 
+    @property
+    def full(self) -> bool:
+        """Whether no message can be pushed now."""
+        return len(self._unacknowledged) >= self._size
+
     def push(self, seq: int, frame: bytes) -> None:
         """Accept the next message for transmission.
 
@@ -104,7 +109,7 @@ class SendWindow:
         ValueError
             If the window is full.
         """
-        if len(self._unacknowledged) >= self._size:
+        if self.full:
             raise ValueError(f"message {seq} of {self._channel} was pushed while {self._size} are not acknowledged")
         self._unacknowledged.append((seq, frame))
         self.sent = seq

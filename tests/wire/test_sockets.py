@@ -54,7 +54,7 @@ def send_up_to(last, sender):
     """One turn of a sender: the next message, up to the last one and if the window has room for it."""
     sender.poll(0)
     window = sender.window
-    if window.sent < last and window.sent - window.acknowledged < window._size:
+    if window.sent < last and not window.full:
         sender.send(tracks(window.sent + 1))
 
 
