@@ -100,10 +100,11 @@ class Trial:
         self.fleet.up(cores=CORES, detach=True)
 
     def processes(self, node: str) -> list[psutil.Process]:
-        """The processes of a node, its raylet first, with its start server and what that has started."""
+        """The processes of a node, its raylet first, with its start server and what that has started; none if it died."""
         keeper = psutil.Process(int((self.local.folder / "pid").read_text()))
-        raylet = next(each for each in keeper.children() if f"--node-name={node}" in each.cmdline())
-        return [raylet, *(each for each in psutil.process_iter() if _raylet_of(each) == str(raylet.pid))]
+        raylets = [each for each in keeper.children() if f"--node-name={node}" in each.cmdline()]
+        pids = {str(raylet.pid) for raylet in raylets}
+        return [*raylets, *(each for each in psutil.process_iter() if _raylet_of(each) in pids)]
 
     def send(self, number: signal.Signals, *nodes: str) -> None:
         """Send a signal to all processes of nodes."""
@@ -153,7 +154,10 @@ class Trial:
 
     def settle(self) -> None:
         """Wait until all nodes live and all streams run; films that have ended are checked and begin anew."""
-        self.until(lambda status: all(each.state == "alive" for each in status.nodes.values()), "all nodes alive")
+        self.until(
+            lambda status: all(each.state == "alive" and self.processes(name) for name, each in status.nodes.items()),
+            "all nodes alive",  # Ray may not have noticed yet that one has died
+        )
         self.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams running")
         status = self.status()
         for name in self.lockstep:
