@@ -100,7 +100,7 @@ class Trial:
         self.fleet.up(cores=CORES, detach=True)
 
     def processes(self, node: str) -> list[psutil.Process]:
-        """The processes of a node, its raylet first, with its start server and what that has started; none if it died."""
+        """The processes of a node, its raylet first, with its start server and its children; none if it has died."""
         keeper = psutil.Process(int((self.local.folder / "pid").read_text()))
         raylets = [each for each in keeper.children() if f"--node-name={node}" in each.cmdline()]
         pids = {str(raylet.pid) for raylet in raylets}
