@@ -101,10 +101,14 @@ class Trial:
 
     def processes(self, node: str) -> list[psutil.Process]:
         """The processes of a node, its raylet first, with its start server and its children; none if it has died."""
-        keeper = psutil.Process(int((self.local.folder / "pid").read_text()))
-        raylets = [each for each in keeper.children() if f"--node-name={node}" in each.cmdline()]
+        raylets = self.raylets(node)
         pids = {str(raylet.pid) for raylet in raylets}
         return [*raylets, *(each for each in psutil.process_iter() if _raylet_of(each) in pids)]
+
+    def raylets(self, node: str) -> list[psutil.Process]:
+        """The process of Ray that is a node; none while it is dead."""
+        keeper = psutil.Process(int((self.local.folder / "pid").read_text()))
+        return [each for each in keeper.children() if _is_raylet(each, node)]
 
     def send(self, number: signal.Signals, *nodes: str) -> None:
         """Send a signal to all processes of nodes."""
@@ -155,7 +159,7 @@ class Trial:
     def settle(self) -> None:
         """Wait until all nodes live and all streams run; films that have ended are checked and begin anew."""
         self.until(
-            lambda status: all(each.state == "alive" and self.processes(name) for name, each in status.nodes.items()),
+            lambda status: all(each.state == "alive" and self.raylets(name) for name, each in status.nodes.items()),
             "all nodes alive",  # Ray may not have noticed yet that one has died
         )
         self.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams running")
@@ -200,6 +204,12 @@ class Trial:
             return not waiting
 
         self.until(step, f"{fault}: the recovery of {', '.join(waiting)}")
+
+
+def _is_raylet(process: psutil.Process, node: str) -> bool:
+    with suppress(psutil.Error):  # it has ended
+        return f"--node-name={node}" in process.cmdline()
+    return False
 
 
 def _raylet_of(process: psutil.Process) -> str:
