@@ -710,7 +710,7 @@ def test_the_object_of_a_saved_model_is_still_searched_for_unless_it_was_found()
 
 
 def replayed(history, file):
-    """How many events are in the file, and the state after them: they lead to the same actions again."""
+    """The number of events in the file, and the state after them; fails unless they lead to the same actions again."""
     history.write(file)
     state, steps = History.read(file)
     for event, orders in steps:

@@ -64,7 +64,7 @@ def pipeline(endpoint):
 
 @pytest.fixture
 def updates(page, turning):
-    """The first part of that name about a frame that the page is told, while turns are made; fails where none is."""
+    """The first part of this name that the page receives about a frame, while turns are made; fails if none arrives."""
 
     def told(name, turn):
         deadline = time.monotonic() + 60

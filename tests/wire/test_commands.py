@@ -32,12 +32,12 @@ def answering(endpoint, turning):
     def serve(answer=done):
         def turn():
             for command in responder.receive_all():
-                heard.append(command)
+                received.append(command)
                 responder.answer(answer(command))
 
-        heard = []
+        received: list[Command] = []
         with Responder(CONTROL, endpoint) as responder, turning(turn):
-            yield responder, heard
+            yield responder, received
 
     return serve
 
