@@ -198,6 +198,8 @@ class Trial:
                 if now.token > before.token and now.state == "running":  # it has tracked a frame
                     self.recovery[fault].append(monotonic() - since)
                     self.noticed[fault].append(monotonic() - noticed[name])
+                    times = self.recovery[fault][-1], self.noticed[fault][-1]
+                    print(f"  {name} after {times[0]:.1f} s, {times[1]:.1f} s from Ray's notice", file=sys.stderr)
                     del waiting[name]
                 elif now.state == "ended":
                     del waiting[name]
@@ -358,16 +360,18 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         trial = Trial(stack, options.seed, quick=options.quick)
         order = trial.random.permutation(len(faults))
         begin = monotonic()
-        for number, place in enumerate(order, start=1):
-            trial.settle()
-            sleep(float(trial.random.uniform(*CALM)))
-            status = trial.status()
-            if status is None:
-                trial.wrong.append("the registry did not answer")
-                continue
-            faults[place](trial, status)
-            print(f"{number} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
-            print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
+        done = 0
+        with suppress(KeyboardInterrupt):  # the tables then show the faults until here
+            for done, place in enumerate(order, start=1):
+                trial.settle()
+                sleep(float(trial.random.uniform(*CALM)))
+                status = trial.status()
+                if status is None:
+                    trial.wrong.append("the registry did not answer")
+                    continue
+                faults[place](trial, status)
+                print(f"{done} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
+                print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
         films = trial.lockstep
         trial.until(lambda status: all(status.streams[name].state == "ended" for name in films), "the end of all films")
         trial.settle()
@@ -375,7 +379,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         status = trial.status() or replace(FleetStatus(NAME, 0.0))
         lost = [each for name, each in status.streams.items() if name in trial.live]
     yield Table(
-        f"Recovery of {len(faults)} faults, 3 nodes, {len(trial.live) + len(trial.lockstep)} streams",
+        f"Recovery of {done} faults, 3 nodes, {len(trial.live) + len(trial.lockstep)} streams",
         ("fault", "times", "p50 s", "p99 s", "slowest s"),
         list(quantiles(trial.recovery)),
         "killed, frozen: from the fault to the next track of each stream that it hit; head: from `up`; "
