@@ -2,10 +2,11 @@
 
 Nodes are killed or frozen with all of their processes, also two at once; the head is killed, which takes the fleet with
 it, and `up` continues it; the process of a stream and the controller are killed; nobody can reach the store, which is a
-real S3 server. Three streams are live, and three are short films in lockstep: whenever a film ends, its trees must be
-equal, bit for bit, to those of a run in one process without faults, and it begins anew. Recovery is the time until the
-next track of a stream, from the fault, and from the moment at which Ray has noticed it, both as the registry shows it:
-the controller looks twice a second.
+real S3 server. Some of six streams are live, others are short films in lockstep: whenever a film ends, its trees must
+be equal, bit for bit, to those of a run in one process without faults, and it begins anew. Recovery is the time until
+the next track of a stream, from the fault, and from the moment at which Ray has noticed it, both as the registry shows
+it: the controller looks twice a second. The films take all cores of a small machine; without them, `--films 0 --rate 2`
+leaves one of two cores free.
 """
 
 from __future__ import annotations
@@ -56,8 +57,7 @@ FROZEN = (4.0, 8.0)  # seconds
 UNREACHABLE = 60.0
 CALM = (1.5, 4.0)  # seconds between a recovery and the next fault
 PATIENCE = 180.0
-LIVE = {"live-1": "demo:1?rate=5", "live-2": "demo:2?rate=5", "live-3": "demo:3?rate=5"}
-FILMS = ("film-1", "film-2", "film-3")
+STREAMS = 6
 
 
 class Trial:
@@ -70,9 +70,9 @@ class Trial:
     wrong     descriptions of what must not happen
     """
 
-    def __init__(self, stack: ExitStack, seed: int, *, quick: bool) -> None:
-        self.live = dict(list(LIVE.items())[:1]) if quick else LIVE
-        self.lockstep = FILMS[:1] if quick else FILMS
+    def __init__(self, stack: ExitStack, seed: int, live: int, films: int, rate: float) -> None:
+        self.live = {f"live-{number}": f"demo:{number}?rate={rate:g}" for number in range(1, live + 1)}
+        self.lockstep = tuple(f"film-{number}" for number in range(1, films + 1))
         self.random = np.random.default_rng(seed)
         self.recovery: dict[str, list[float]] = defaultdict(list)
         self.noticed: dict[str, list[float]] = defaultdict(list)
@@ -356,8 +356,9 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         if options.quick
         else [fault for fault, often in FAULTS.items() for _ in range(max(1, round(often * cycles / 100)))]
     )
+    live, films = (1, 1) if options.quick else (STREAMS - options.films, options.films)
     with ExitStack() as stack:
-        trial = Trial(stack, options.seed, quick=options.quick)
+        trial = Trial(stack, options.seed, live, films, options.rate)
         order = trial.random.permutation(len(faults))
         begin = monotonic()
         done = 0
@@ -372,8 +373,9 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
                 faults[place](trial, status)
                 print(f"{done} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
                 print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
-        films = trial.lockstep
-        trial.until(lambda status: all(status.streams[name].state == "ended" for name in films), "the end of all films")
+        trial.until(
+            lambda status: all(status.streams[name].state == "ended" for name in trial.lockstep), "the end of all films"
+        )
         trial.settle()
         minutes = (monotonic() - begin) / 60
         status = trial.status() or replace(FleetStatus(NAME, 0.0))
@@ -412,6 +414,14 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--cycles", type=int, default=100, help="number of faults (default: %(default)s)")
+    parser.add_argument(
+        "--films",
+        type=int,
+        choices=range(STREAMS + 1),
+        default=3,
+        help="films among the six streams (default: %(default)s)",
+    )
+    parser.add_argument("--rate", type=float, default=5.0, help="frames/s of the live streams (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
     options = parser.parse_args()
     publish(figures(options), options)
