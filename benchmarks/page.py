@@ -306,11 +306,15 @@ _ACROSS = """
 _FLEET = """
     Three nodes and six streams on one machine with two cores, with a real S3 server as the store. In the first run
     three streams are live, and three are short films in lockstep, as fast as the cores allow, whose trees are compared,
-    bit for bit, with those of a run without faults whenever a film ends. In the second run all six are live, and a core
-    is free. The second table of each run begins when Ray has noticed the fault. `wrong` counts streams that were
+    bit for bit, with those of a run without faults whenever a film ends. In the second run all six are live, at two
+    frames a second, and a core is free. The second table of each run begins when Ray has noticed the fault. `wrong` counts streams that were
     started again or stood still when they should not, other trees, and what did not happen in three minutes. Frames and
     seconds lost are those of the live streams. See [Run a fleet of
     streams](../docs/how-to/fleet.md#what-is-kept-and-what-is-lost)."""
+_SCALE_HEAD = """
+    This page says what one machine pays for a fleet of many streams, and what breaks first. **No fleet of these sizes
+    was run**: the decisions, answers and writes below are the real ones, of streams that do not run; what they add up
+    to is arithmetic."""
 _HEAD_OF_A_FLEET = """
     The controller looks at all streams twice a second, so the decisions of a turn have to stay well below 0.5 s. To
     that come the calls of Ray that ask each stream for its figures, about 0.3 ms of processor each: with more than

@@ -39,6 +39,7 @@ __all__ = ["Controller"]
 #: Contents of saved models, by stream and object.
 Models = dict[tuple[str, str], bytes]
 
+_INIT = 1  # process that becomes the parent of those whose parent has ended
 _log = logging.getLogger(__name__)
 
 
@@ -47,9 +48,16 @@ def warm() -> None:
 
     It has imported what the processes of a stream need, so that a stream is quickly there whose node has died. It ends
     with the node: the process that starts those of Ray.
+
+    Raises
+    ------
+    FleetError
+        If the node has just died: a process of it then has another parent, with which the server would not end.
     """
+    if (node := os.getppid()) == _INIT:
+        raise FleetError("the node of this process has died")
     os.environ["OMP_NUM_THREADS"] = "1"  # Ray sets the cores of an actor: there would be a server for each number
-    share_start_server(os.getppid())
+    share_start_server(node)
     start_server()
 
 

@@ -209,7 +209,7 @@ def _keep(folder: Path, count: int, cores: int, ends: threading.Event) -> None:
                 return
             for number, node in nodes.items():
                 if node is not None and _has_died(node):
-                    print(f"node-{number} has died, and is started again", flush=True)
+                    print(f"node-{number} has died, and starts again in {RETURN_SECONDS:g} s", flush=True)
                     cluster.remove_node(node, allow_graceful=False)
                     nodes[number], due[number] = None, time.monotonic() + RETURN_SECONDS
                 elif node is None and time.monotonic() >= due[number]:

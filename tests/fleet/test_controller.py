@@ -215,6 +215,13 @@ def test_each_node_gets_its_start_server_once_before_there_is_a_stream_for_it(si
     assert ray.warmed == ["1", "2", "3"]
 
 
+def test_a_process_of_a_node_that_has_died_starts_no_server_that_would_outlive_it(monkeypatch):
+    monkeypatch.setattr(module.os, "getppid", lambda: 1)
+    monkeypatch.setattr(module, "start_server", lambda: pytest.fail("it was started"))
+    with pytest.raises(FleetError, match="has died"):
+        module.warm()
+
+
 def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
     running(site, ray, "gate")
     site.change("moved", "gate", ray.nodes[1])
