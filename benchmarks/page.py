@@ -301,16 +301,15 @@ _ACROSS = """
     that a fleet merges in pairs, and by one tree that has seen the frames of all three. The cameras are four parts of a
     long sequence, or rendered scenes with four backgrounds in four lights. `recall` is the share of frames in which the
     box overlaps the true one by half, `wrong` the share with another box, and `stranger` the share of frames of a
-    camera without the object in which a box is reported. See [The same object at several
-    cameras](../docs/how-to/fleet.md#the-same-object-at-several-cameras)."""
+    camera without the object in which a box is reported. See [the
+    how-to](../docs/how-to/fleet.md)."""
 _FLEET = """
-    Three nodes and six streams on one machine with two cores, with a real S3 server as the store. In the first run
-    three streams are live, and three are short films in lockstep, as fast as the cores allow, whose trees are compared,
-    bit for bit, with those of a run without faults whenever a film ends. In the second run all six are live, at two
-    frames a second, and a core is free. The second table of each run begins when Ray has noticed the fault. `wrong` counts streams that were
-    started again or stood still when they should not, other trees, and what did not happen in three minutes. Frames and
-    seconds lost are those of the live streams. See [Run a fleet of
-    streams](../docs/how-to/fleet.md#what-is-kept-and-what-is-lost)."""
+    Six streams on three nodes of one machine with two cores, and a real S3 server as the store. First, three are live,
+    and three are short films, as fast as the cores allow, whose trees are compared, bit for bit, with those without
+    faults; `wrong` counts other trees, streams that stood still or were started again when they should not, and what
+    did not happen in three minutes; frames lost are of the live streams. Then all are live and slow, so that a core is
+    free. The second and the last table begin when Ray has noticed the fault. See [the
+    how-to](../docs/how-to/fleet.md)."""
 _SCALE_HEAD = """
     This page says what one machine pays for a fleet of many streams, and what breaks first. **No fleet of these sizes
     was run**: the decisions, answers and writes below are the real ones, of streams that do not run; what they add up
@@ -335,9 +334,8 @@ _FOUND = """
     wrong, and a false alarm is a sighting in a frame without the object. The second table has the objects of the check
     list. Template matching and ORB know the first frame. In the paper's setting, a
     rendered object is learned in 76 frames before a plain background, and searched before other backgrounds, turned,
-    scaled and in other lights. A plain scan searches for each model by itself and scores every window to the end. The
-    machine was busy: of the times, only the ratios count. See [Find objects in other
-    videos](../docs/how-to/find.md)."""
+    scaled and in other lights. A plain scan scores every window by each model. The
+    machine was busy: only the ratios of times count. See [the how-to](../docs/how-to/find.md)."""
 _INGREDIENTS = """
     The loss of AUC without one component, on the tuning sequences with three first boxes each; the largest losses. A
     loss of less than two standard errors may be chance."""
@@ -440,7 +438,7 @@ MORE = (
     Section("Summaries", _SUMMARIES, (Shown("summary", every),)),
     Section("Saved models", _SAVED, (Shown("merge", merged), Shown("saved_models", means_only))),
     Section("Across cameras", _ACROSS, (Shown("across_cameras", across),)),
-    Section("A fleet under faults", _FLEET, (Shown("fleet_faults", every), Shown("fleet_faults-free", every))),
+    Section("A fleet under faults", _FLEET, (Shown("fleet_faults", every), Shown("fleet_faults-free", select(1)))),
     Section("Objects found again", _FOUND, (Shown("instance", recognised),)),
 )
 
