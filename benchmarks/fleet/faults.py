@@ -414,13 +414,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--cycles", type=int, default=100, help="number of faults (default: %(default)s)")
-    parser.add_argument(
-        "--films",
-        type=int,
-        choices=range(STREAMS + 1),
-        default=3,
-        help="films among the six streams (default: %(default)s)",
-    )
+    parser.add_argument("--films", type=int, choices=range(7), default=3, help="of six streams (default: %(default)s)")
     parser.add_argument("--rate", type=float, default=5.0, help="frames/s of the live streams (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
     options = parser.parse_args()
