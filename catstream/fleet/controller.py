@@ -48,16 +48,10 @@ def warm() -> None:
 
     It has imported what the processes of a stream need, so that a stream is quickly there whose node has died. It ends
     with the node: the process that starts those of Ray.
-
-    Raises
-    ------
-    FleetError
-        If the node has just died: a process of it then has another parent, with which the server would not end.
     """
-    if (node := os.getppid()) == _INIT:
-        raise FleetError("the node of this process has died")
     os.environ["OMP_NUM_THREADS"] = "1"  # Ray sets the cores of an actor: there would be a server for each number
-    share_start_server(node)
+    if (node := os.getppid()) != _INIT:  # otherwise the node has just died, and a shared server would never end
+        share_start_server(node)
     start_server()
 
 

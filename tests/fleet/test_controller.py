@@ -215,11 +215,15 @@ def test_each_node_gets_its_start_server_once_before_there_is_a_stream_for_it(si
     assert ray.warmed == ["1", "2", "3"]
 
 
-def test_a_process_of_a_node_that_has_died_starts_no_server_that_would_outlive_it(monkeypatch):
-    monkeypatch.setattr(module.os, "getppid", lambda: 1)
-    monkeypatch.setattr(module, "start_server", lambda: pytest.fail("it was started"))
-    with pytest.raises(FleetError, match="has died"):
-        module.warm()
+@pytest.mark.parametrize(("parent", "shared"), [(4711, [4711]), (1, [])], ids=["alive", "dead"])
+def test_no_start_server_outlives_its_node(parent, shared, monkeypatch):
+    found = []
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(module.os, "getppid", lambda: parent)
+    monkeypatch.setattr(module, "share_start_server", found.append)
+    monkeypatch.setattr(module, "start_server", lambda: None)
+    module.warm()
+    assert found == shared
 
 
 def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
