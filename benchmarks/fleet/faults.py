@@ -196,10 +196,10 @@ class Trial:
                 if now.token > before.token or has_died or (is_process and now.state != "running"):
                     noticed.setdefault(name, monotonic())
                 if now.token > before.token and now.state == "running":  # it has tracked a frame
-                    self.recovery[fault].append(monotonic() - since)
-                    self.noticed[fault].append(monotonic() - noticed[name])
-                    times = self.recovery[fault][-1], self.noticed[fault][-1]
-                    print(f"  {name} after {times[0]:.1f} s, {times[1]:.1f} s from Ray's notice", file=sys.stderr)
+                    from_fault, from_notice = monotonic() - since, monotonic() - noticed[name]
+                    self.recovery[fault].append(from_fault)
+                    self.noticed[fault].append(from_notice)
+                    print(f"  {name} after {from_fault:.1f} s, {from_notice:.1f} s from Ray's notice", file=sys.stderr)
                     del waiting[name]
                 elif now.state == "ended":
                     del waiting[name]
@@ -363,7 +363,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         begin = monotonic()
         done = 0
         with suppress(KeyboardInterrupt):  # the tables then show the faults until here
-            for done, place in enumerate(order, start=1):
+            for number, place in enumerate(order, start=1):
                 trial.settle()
                 sleep(float(trial.random.uniform(*CALM)))
                 status = trial.status()
@@ -371,6 +371,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
                     trial.wrong.append("the registry did not answer")
                     continue
                 faults[place](trial, status)
+                done = number
                 print(f"{done} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
                 print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
         trial.until(
@@ -414,7 +415,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 if __name__ == "__main__":
     parser = command(__doc__)
     parser.add_argument("--cycles", type=int, default=100, help="number of faults (default: %(default)s)")
-    parser.add_argument("--films", type=int, choices=range(7), default=3, help="of six streams (default: %(default)s)")
+    parser.add_argument("--films", type=int, choices=range(STREAMS + 1), default=3, help="default: %(default)s")
     parser.add_argument("--rate", type=float, default=5.0, help="frames/s of the live streams (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
     options = parser.parse_args()
