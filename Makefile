@@ -3,7 +3,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/pip install --quiet --quiet --disable-pip-version-check
+# Python compiles what it imports, a small part of what is installed.
+PIP := $(BIN)/pip install --quiet --quiet --disable-pip-version-check --no-compile
 READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
