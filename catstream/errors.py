@@ -119,8 +119,8 @@ EXTRAS = {
     "record": ("a recording", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "supervision": ("to_supervision", ("supervision",)),
-    "fleet": ("a fleet", ("fsspec", "ray")),
-    "s3": ("a store on S3", ("s3fs",)),
+    "fleet": ("a fleet", ("ray",)),
+    "s3": ("a store on S3", ("obstore", "boto3")),
 }
 
 

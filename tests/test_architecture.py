@@ -57,8 +57,8 @@ IMPORTERS = {
     "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
     "safetensors": ["catstream/messages/storage.py"],
-    "fsspec": ["catstream/fleet/objects.py"],
-    "s3fs": ["catstream/fleet/objects.py"],  # fsspec imports it
+    "obstore": ["catstream/fleet/objects.py"],
+    "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/made.py"],
     "supervision": ["catstream/sinks/adapters.py"],
@@ -98,9 +98,8 @@ SLOW = {
     "filterpy",
     "pyarrow",
     "supervision",
-    "fsspec",
     "ray",
-    "s3fs",
+    "obstore",
 }
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.

@@ -268,13 +268,18 @@ class Controller:
             self._recent = self.status()
 
     def _warm_nodes(self) -> None:
-        """Start the start server of each new node, before there is a stream for it."""
+        """Start the start server of each new node, before there is a stream for it.
+
+        Its variables give the task a worker of its own, so that it leaves to the streams those that are idle.
+        """
         import ray
+
+        task = ray.remote(num_cpus=0, max_calls=1, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})(warm)
 
         for node in self._nodes:
             if node.alive and node.id not in self._warmed:
                 self._warmed.add(node.id)
-                ray.remote(warm).options(num_cpus=0, label_selector={NODE_ID: node.id}).remote()
+                task.options(label_selector={NODE_ID: node.id}).remote()
 
     def _wanted(self) -> dict[str, Wanted]:
         """The streams that should run now."""

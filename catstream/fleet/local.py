@@ -93,7 +93,10 @@ class LocalCluster:
         health["RAY_health_check_failure_threshold"] = str(HEALTH_FAILURES)
         # A worker of Ray has a lower priority by default: other programs would starve the streams.
         workers = {"RAY_worker_niceness": "0", "RAY_OBJECT_STORE_ALLOW_SLOW_STORAGE": "1"}
-        return token | loopback | quiet | health | workers
+        # A node starts idle workers that have imported what a stream needs; Ray would start them for one program only.
+        prestart = {"RAY_enable_worker_prestart": "1", "RAY_prestart_worker_first_driver": "0"}
+        prestart["RAY_preload_python_modules"] = "catstream.fleet.controller"
+        return token | loopback | quiet | health | workers | prestart
 
     def start(self, nodes: int, cores: int | None = None, *, detach: bool = True) -> None:
         """Start the nodes node-1, node-2 ... and wait until all have started. Call it with a lock of the folder.

@@ -30,7 +30,6 @@ BEGIN_SECONDS = 2.0  #: from the claim of a stream to its first frame; they coun
 # The store.
 STORE_SECONDS = 10.0  #: limit of a whole call
 CONNECT_SECONDS = 3.0  #: limit to connect to the server
-READ_SECONDS = 5.0  #: without any byte from the server
 
 # Commands.
 REACH_SECONDS = 3.0  #: limit to connect to the head
@@ -68,7 +67,6 @@ ORDER: tuple[tuple[float, float, str], ...] = (
     (LOGS_SECONDS, ANSWER_SECONDS, "a stream that hangs seems to be a controller that hangs"),
     (STORE_SECONDS, ANSWER_SECONDS, "a store that cannot be reached seems to be a controller that hangs"),
     (CONNECT_SECONDS, STORE_SECONDS, "an error of the store does not say that its server cannot be reached"),
-    (READ_SECONDS, STORE_SECONDS, "an error of the store does not say that its server has stopped to answer"),
     (STORE_SECONDS, ABANDONED_SECONDS, "a part of a file is removed while it is written"),
     (FIRST_PAUSE_SECONDS, LONGEST_PAUSE_SECONDS, "the pauses of a stream that fails do not grow"),
     (TRACKS_SECONDS, RATE_SECONDS, "rates are measured over no frame"),

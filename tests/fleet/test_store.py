@@ -11,12 +11,17 @@ import stat
 import threading
 import traceback
 from concurrent.futures import ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import boto3
+import obstore
 import pytest
+from obstore.store import S3Store
 
 from catstream.errors import FencedError, FleetError, StoreError
 from catstream.fleet import objects
+from catstream.fleet.objects import Objects
 from catstream.fleet.store import Listing, Store
 from catstream.messages import storage
 
@@ -41,7 +46,7 @@ def s3_server():
             patch.setenv(name, value)
         patch.setenv("AWS_ENDPOINT_URL", "http://{}:{}".format(*server.get_host_and_port()))
         patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        Store("s3://fleet")._objects._fs.mkdir("fleet")
+        boto3.client("s3", endpoint_url=os.environ["AWS_ENDPOINT_URL"]).create_bucket(Bucket="fleet")
         yield server
     server.stop()
 
@@ -255,7 +260,7 @@ def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
         Store("s3://no-such-bucket").claim("cam-7", "node-1")
     for name in SECRETS:
         monkeypatch.delenv(name)
-    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_METADATA_ENDPOINT", "http://127.0.0.1:9")  # of the machine's role
     monkeypatch.setenv("HOME", "/nowhere")
     with pytest.raises(StoreError, match="no credentials were found: set AWS_PROFILE"):
         Store("s3://fleet").claim("cam-7", "node-1")
@@ -264,7 +269,69 @@ def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
 @pytest.mark.usefixtures("s3_server")
 def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
     store = Store("s3://fleet/overwrites")
-    overwrite = store._objects._fs.pipe_file
-    monkeypatch.setattr(store._objects._fs, "pipe_file", lambda path, data, **_: overwrite(path, data))
+    monkeypatch.setattr(S3Store, "put", lambda *given, **_: obstore.put(*given))
     with pytest.raises(StoreError, match="ignores If-None-Match"):
         store.claim("cam-7", "node-1")
+
+
+@pytest.fixture
+def answering(monkeypatch):
+    """Let a server of S3 answer each request with a status and an error code."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
+        for name, value in SECRETS.items():
+            monkeypatch.setenv(name, value)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+        def answer(status, code):
+            body = f"<Error><Code>{code}</Code></Error>".encode()
+
+            class Handler(BaseHTTPRequestHandler):
+                def do_PUT(self):
+                    self.rfile.read(int(self.headers["Content-Length"]))
+                    self.send_response(status)
+                    self.send_header("Content-Length", str(len(body)))
+                    self.end_headers()
+                    self.wfile.write(body)
+
+                def log_message(self, *_):
+                    pass
+
+            server.RequestHandlerClass = Handler
+
+        yield answer
+        server.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "said"),
+    [
+        (403, "AccessDenied", "answered AccessDenied: check the bucket and its permissions"),
+        (400, "AuthorizationHeaderMalformed", "the bucket is in another region: set AWS_REGION"),
+        (301, "PermanentRedirect", "the bucket is in another region: set AWS_REGION"),
+        (503, "SlowDown", "answered SlowDown"),
+    ],
+)
+def test_an_error_of_the_server_is_named_with_its_remedy(answering, status, code, said):
+    answering(status, code)
+    with pytest.raises(StoreError, match=said):
+        Objects("s3://fleet").create("a", b"")
+
+
+def test_an_object_that_another_process_creates_at_this_moment_exists_already(answering):
+    answering(409, "ConditionalRequestConflict")
+    with pytest.raises(FileExistsError):
+        Objects("s3://fleet").create("a", b"")
+
+
+@pytest.mark.usefixtures("s3_server")
+def test_credentials_of_a_profile_are_used_if_the_environment_has_none(tmp_path, monkeypatch):
+    for name in SECRETS:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
+    (tmp_path / "credentials").write_text("[site]\naws_access_key_id = a\naws_secret_access_key = b\n")
+    monkeypatch.setenv("AWS_PROFILE", "site")
+    Store("s3://fleet/profile").put_fleet(b"spec")
+    monkeypatch.setenv("AWS_PROFILE", "another")
+    with pytest.raises(StoreError, match="set AWS_PROFILE"):
+        Store("s3://fleet/profile").get_fleet()
