@@ -229,10 +229,8 @@ def test_a_type_checker_accepts_the_python_examples(tmp_path):
                 file = tmp_path / f"{page.stem}_{number}.py"
             with file.open("a") as program:
                 program.write(block)
-    strict = ["--strict", "--allow-redefinition", "--no-error-summary", "--cache-dir", str(tmp_path / "cache")]
-    said, errors, _ = mypy.run(
-        [*strict, *map(str, [*sorted(tmp_path.glob("*.py")), *(ROOT / "examples").glob("*.py")])]
-    )
+    programs = [*sorted(tmp_path.glob("*.py")), *(ROOT / "examples").glob("*.py")]
+    said, errors, _ = mypy.run(["--no-error-summary", *map(str, programs)])  # as `make lint`, whose cache it has
     assert (said, errors) == ("", "")
 
 
