@@ -28,7 +28,14 @@ from catstream.fleet.life import NODE_ID, Node, Order, Seen, Step, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Place, Report, Stream, given_model
-from catstream.fleet.timing import CLIENTS_SECONDS, LOGS_SECONDS, QUESTION_SECONDS, QUIET_SECONDS, TURN_SECONDS
+from catstream.fleet.timing import (
+    CLIENTS_SECONDS,
+    LOGS_SECONDS,
+    QUESTION_SECONDS,
+    QUIET_SECONDS,
+    REPORT_SECONDS,
+    TURN_SECONDS,
+)
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
 from catstream.services.start_server import share_start_server, start_server
 from catstream.video.frames import without_password
@@ -247,6 +254,8 @@ class Controller:
 
     def _turn(self) -> None:
         """Look at the cluster and the actors, and do what makes them those that should run."""
+        import ray
+
         found, existing = nodes(), actors(self._name)  # without the lock: they ask the head
         with self._lock:
             self._nodes = self._desired.with_draining(found)
@@ -257,7 +266,13 @@ class Controller:
             for name in existing | self._desired.spec.streams.keys():
                 self._streams.setdefault(name, _Known(Seen("absent")))
             for name, known in self._streams.items():
-                self._look(name, known, exists=name in existing)
+                self._ask(name, known, exists=name in existing)
+            calls = [known.call for known in self._streams.values() if known.call is not None]
+        if calls:  # a stream that runs answers at once
+            ray.wait(calls, num_returns=len(calls), timeout=REPORT_SECONDS)
+        with self._lock:
+            for name, known in self._streams.items():
+                self._hear(name, known)
             if self._phase != "idle":
                 wanted, seen = self._wanted(), {name: known.seen for name, known in self._streams.items()}
                 for name, step in life.diff(wanted, seen, self._nodes, time.monotonic()).items():
@@ -274,24 +289,21 @@ class Controller:
         """
         import ray
 
-        task = ray.remote(num_cpus=0, max_calls=1, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})(warm)
-
-        for node in self._nodes:
-            if node.alive and node.id not in self._warmed:
-                self._warmed.add(node.id)
-                task.options(label_selector={NODE_ID: node.id}).remote()
+        for new in {node.id for node in self._nodes if node.alive} - self._warmed:
+            self._warmed.add(new)
+            own = ray.remote(num_cpus=0, max_calls=1, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})
+            own(warm).options(label_selector={NODE_ID: new}).remote()
 
     def _wanted(self) -> dict[str, Wanted]:
         """The streams that should run now."""
         if self._phase != "up":
             return {}
-        wanted = {name: self._desired.wanted(name) for name in self._desired.spec.streams}
+        wanted = {name: self._desired.wanted(name) for name in self._desired.spec.streams if name in self._streams}
         return {name: each for name, each in wanted.items() if self._streams[name].ended != each.digest}
 
-    def _look(self, name: str, known: _Known, *, exists: bool) -> None:
-        """Take the answer of an actor, if it has arrived, and ask for the next one."""
+    def _ask(self, name: str, known: _Known, *, exists: bool) -> None:
+        """Ask the actor of a stream for a report, unless it has still to answer."""
         import ray
-        from ray.exceptions import RayError
 
         if not exists:
             known.seen = replace(known.seen, happened="gone")
@@ -303,6 +315,15 @@ class Controller:
                 return
             known.seen = Seen("pending", time.monotonic(), time.monotonic())
         known.seen = replace(known.seen, happened="")
+        if known.call is None:
+            spec = self._desired.spec.streams.get(name)
+            known.call = known.handle.report.remote(self._clients, spec.follow if spec is not None else ())
+
+    def _hear(self, name: str, known: _Known) -> None:
+        """Take the answer of the actor of a stream, if it has arrived."""
+        import ray
+        from ray.exceptions import RayError
+
         if known.call is not None and ray.wait([known.call], timeout=0)[0]:
             call, known.call = known.call, None
             try:
@@ -314,9 +335,6 @@ class Controller:
             except RayError as error:
                 _log.warning("%s is interrupted: %s", name, str(error).partition("\n")[0])
                 known.seen = replace(known.seen, happened="interrupted", node="")
-        if known.call is None:
-            spec = self._desired.spec.streams.get(name)
-            known.call = known.handle.report.remote(self._clients, spec.follow if spec is not None else ())
 
     def _take(self, known: _Known, report: Report) -> None:
         """Keep a report."""

@@ -10,6 +10,7 @@ __all__ = ["ORDER"]
 
 # The controller.
 TURN_SECONDS = 0.5  #: between two looks at the actors
+REPORT_SECONDS = 0.1  #: longest wait of a look for the reports of all streams
 QUESTION_SECONDS = 0.1  #: between two looks at the questions of the registry
 CLIENTS_SECONDS = 5.0  #: between two looks at the keys of the clients
 QUIET_SECONDS = 5.0  #: without an answer of a stream, after which the status says so
@@ -53,6 +54,7 @@ HEALTH_FAILURES = 3  #: one after the other, after which a node counts as dead
 #: A limit, a longer one, and what goes wrong otherwise.
 ORDER: tuple[tuple[float, float, str], ...] = (
     (QUESTION_SECONDS, RETRY_SECONDS, "a client repeats each question to the registry"),
+    (REPORT_SECONDS, TURN_SECONDS, "one stream that hangs makes the looks at all others rare"),
     (TURN_SECONDS, QUIET_SECONDS, "a stream that answers in each turn seems not to answer"),
     (QUIET_SECONDS, SILENT_SECONDS, "a stream is started again before the status says that it does not answer"),
     (
