@@ -169,6 +169,7 @@ class _Bucket:
             client_options=limits | {"allow_http": True},  # at an address that begins with http
             retry_config={"max_retries": 0},
             credential_provider=_credentials(),
+            disable_bulk_delete=True,  # one object each time, and not all servers have it
         )
 
     def make(self) -> None:
