@@ -316,7 +316,8 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
       catstream fleet merge --object anna
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
-    merged = running.merge(*names, object=object_name)
+    with Console(stderr=True).status("merging"):
+        merged = running.merge(*names, object=object_name)
     if output is not None:
         with storage.writing(output):
             storage.write_atomically(output, merged.model)

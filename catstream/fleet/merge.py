@@ -126,7 +126,8 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
     from ray.exceptions import RayTaskError
 
     remote: Any = ray.remote
-    load, join = remote(num_returns=2)(saved_part), remote(joined)
+    # Ray reserves a core of one node for a task by default, and waits for it without end if the streams have them all.
+    load, join = remote(num_returns=2, num_cpus=0)(saved_part), remote(num_cpus=0)(joined)
     refs: dict[str, Any] = {stream: load.remote(url, stream, name, named=named) for stream in streams}
     store = Store(url)
     earlier = before.files["model"] if (before := store.get_model(name)) is not None else None
