@@ -159,9 +159,11 @@ class Fleet:
 
     def move(self, name: str, node: str) -> str:
         """Move a stream to a node, where it stays until the node dies or drains."""
-        there, status = self._node(node), self.status()
+        there, streams = self._node(node), self.status().streams
+        if name in streams and streams[name].state == "ended":
+            raise FleetError(f"{name} has ended: it runs on no node")
         self._change(Desired.moved, name, there)
-        before = status.streams[name].node
+        before = streams[name].node
         return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
 
     def drain(self, node: str, *, undo: bool = False) -> str:

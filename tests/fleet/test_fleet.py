@@ -128,7 +128,7 @@ def test_processes_of_the_nodes_have_the_priority_of_the_process_that_starts_the
     assert theirs == os.getpriority(os.PRIO_PROCESS, 0)
 
 
-def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
+def test_what_cannot_be_done_is_refused_and_nothing_is_changed(site, until):
     fleet, spec = site
     with pytest.raises(FleetError, match="gate needs 4 cores, and the largest node"):
         fleet.add(replace(spec.streams["gate"], cores=4.0))
@@ -138,6 +138,9 @@ def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
         fleet.move("cam-8", "node-1")
     with pytest.raises(FleetError, match="no node 'node-9'"):
         fleet.move("gate", "node-9")
+    until(lambda: fleet.status().streams["film"].state == "ended")
+    with pytest.raises(FleetError, match="film has ended"):
+        fleet.move("film", "node-1")
     assert set(fleet.status().streams) == {"film", "gate"}
 
 
@@ -161,9 +164,13 @@ def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     assert fleet.drain(node, undo=True) == f"{node} takes streams again"
 
 
-def test_a_merge_runs_on_the_nodes(site):
+def test_a_merge_runs_on_nodes_whose_cores_are_all_reserved(site, until):
     fleet, spec = site
+    until(lambda: fleet.status().streams["film"].state == "ended")
+    fleet.add(StreamSpec("full", LIVE, cores=0.8))  # on the node without the gate: no core is free as a whole
+    until(lambda: fleet.status().streams["full"].state == "waiting")
     merged = fleet.merge("film")
+    fleet.remove("full", forget=True)
     assert merged.streams == ("film",)
     assert Store(spec.store).get_model("").files["model"] == merged.model
     with pytest.raises(FleetError, match="no stream has learned of 'nobody'"):
