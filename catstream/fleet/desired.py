@@ -81,6 +81,7 @@ class Desired:
 
     def check_fits(self, nodes: Collection[Node]) -> None:
         """Raise FleetError if the nodes cannot run all streams."""
+        nodes = self.with_draining(nodes)
         wanted = {name: self.wanted(name) for name in self.spec.streams}
         reasons = [f"{name} {reason}" for name, each in wanted.items() if (reason := objection(each, nodes))]
         if reasons := reasons or list(filter(None, [shortage(wanted.values(), nodes)])):
@@ -105,7 +106,8 @@ def objection(wanted: Wanted, nodes: Collection[Node]) -> str:
     if not fitting:
         labels = ", ".join(f"{key}={value}" for key, value in wanted.labels.items())
         needed = f"a node with {labels}" if labels else "a node that is not drained"
-        return f"needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
+        names = (f"{node.name}{' (drained)' * node.draining}" for node in alive)
+        return f"needs {needed}, and there is none: there are {', '.join(names) or 'none'}"
     largest = max(fitting, key=lambda node: node.cores)
     if largest.cores < wanted.cores:
         return (

@@ -150,7 +150,7 @@ class Fleet:
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
         """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
-        lines = self._change(Desired.removed, names)
+        lines = self._change(Desired.removed, names, may_wait=True)
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
@@ -162,15 +162,18 @@ class Fleet:
         there, streams = self._node(node), self.status().streams
         if name in streams and streams[name].state == "ended":
             raise FleetError(f"{name} has ended: it runs on no node")
-        self._change(Desired.moved, name, there)
+        self._change(Desired.moved, name, there, may_wait=True)
         before = streams[name].node
         return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
 
     def drain(self, node: str, *, undo: bool = False) -> str:
-        """Move all streams from a node and place none there, for example before it is switched off."""
+        """Move all streams from a node and place none there, for example before it is switched off.
+
+        Streams for which the other nodes have no room wait.
+        """
         self._node(node)
         count = sum(each.node == node for each in self.status().streams.values())
-        self._change(Desired.drained, node, undo=undo)
+        self._change(Desired.drained, node, undo=undo, may_wait=True)
         return f"{node} takes streams again" if undo else f"{node} is draining; streams that leave it: {count}"
 
     def status(self) -> FleetStatus:

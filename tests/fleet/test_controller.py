@@ -254,6 +254,15 @@ def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_st
     assert states(site)["gate"] == "running", "it stays where it is"
 
 
+def test_a_node_that_was_drained_a_moment_ago_has_no_room(site, spec):
+    for node in ("n1", "n2"):
+        site.change("drained", node, undo=False, may_wait=True)
+    with pytest.raises(FleetError, match=r"roof needs a node that is not drained.* n2 \(drained\)"):
+        site.change("applied", spec, "", replace_other=False)
+    site.change("drained", "n1", undo=True)
+    site.change("applied", spec, "", replace_other=False)
+
+
 def test_a_stream_that_was_moved_to_a_node_that_died_is_placed_by_ray_and_stays_there(site, ray):
     site.change("moved", "gate", ray.nodes[1])
     for _ in range(3):

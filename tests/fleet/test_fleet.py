@@ -161,7 +161,14 @@ def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     node = fleet.status().streams["gate"].node
     assert fleet.drain(node).startswith(f"{node} is draining; ")
     until(lambda: (found := fleet.status().streams["gate"]).node not in ("", node) and found.state == "running")
+    other = fleet.status().streams["gate"].node
+    fleet.drain(other)
+    until(
+        lambda: (found := fleet.status().streams["gate"]).state == "unplaced" and f"{node} (drained)" in found.trouble
+    )
     assert fleet.drain(node, undo=True) == f"{node} takes streams again"
+    until(lambda: (found := fleet.status().streams["gate"]).node == node and found.state == "running")
+    fleet.drain(other, undo=True)
 
 
 def test_a_merge_runs_on_nodes_whose_cores_are_all_reserved(site, until):
