@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from catstream.errors import FleetError
 from catstream.fleet.life import Node, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.run.job import changed_setting
+from catstream.settings import Settings
 
 __all__ = ["Desired", "objection", "shortage"]
 
@@ -39,11 +41,11 @@ class Desired:
                 f"the fleet {self.spec.name} runs the streams of {self.origin}, not of {origin}: give this one "
                 "another name (--name), or replace the streams (--replace)"
             )
-        return replace(self, spec=spec, origin=origin or self.origin)
+        return replace(self._with(spec), origin=origin or self.origin)
 
     def added(self, stream: StreamSpec) -> Desired:
         """With one more stream, or with a change of the one of its name."""
-        return replace(self, spec=replace(self.spec, streams=self.spec.streams | {stream.name: stream}))
+        return self._with(replace(self.spec, streams=self.spec.streams | {stream.name: stream}))
 
     def removed(self, names: Collection[str]) -> Desired:
         """Without streams, of which nothing is left."""
@@ -72,6 +74,17 @@ class Desired:
         """A stream as it should run."""
         spec = self.spec.streams[name]
         return Wanted(spec.digest, spec.cores, spec.labels, self.pins.get(name, ""))
+
+    def _with(self, spec: FleetSpec) -> Desired:
+        """With other streams; each that is there already has to continue with the settings of its trees."""
+        for name in self.spec.streams.keys() & spec.streams.keys():
+            before, after = (Settings.from_values(each.streams[name].settings) for each in (self.spec, spec))
+            if changed := changed_setting(before, after):
+                raise FleetError(
+                    f"nothing was changed: {name} was started with {changed}: keep the setting, or first remove the "
+                    f"stream with what it has learned (catstream fleet remove {name} --forget)"
+                )
+        return replace(self, spec=spec)
 
     def check_stream(self, name: str) -> None:
         """Raise FleetError if there is no such stream."""

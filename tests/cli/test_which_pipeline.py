@@ -103,7 +103,7 @@ def test_the_status_of_a_stream_that_does_not_run_says_why(managing):
     [
         (["--fleet", "site"], "give the name of its stream, too (--stream NAME)"),
         (["--stream", "cam-7", "--endpoint", "run"], "give one"),
-        (["--stream", "cam-7", "--source", "walk.mp4"], "give one of them"),
+        (["--stream", "cam-7", "--source", "walk.mp4"], "as --endpoint and --stream do: give one of"),
     ],
 )
 def test_a_pipeline_is_selected_in_one_way(words, reason):

@@ -315,6 +315,18 @@ def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, sp
     assert ray.actors["site/stream/gate"].options["scheduling_strategy"] == "SPREAD"
 
 
+def test_a_setting_with_which_a_stream_cannot_continue_is_not_changed(site, spec):
+    assert "gate: starts again" in site.change("added", replace(GATE, settings={"run.lag_frames": 26}))[0]
+    gate = replace(GATE, settings={"coreset.size": 32})
+    changed = replace(spec, streams={"gate": gate, "roof": ROOF})
+    for change in (("added", gate), ("applied", changed, "")):
+        more = {"replace_other": False} if change[0] == "applied" else {}
+        with pytest.raises(FleetError, match=r"gate was started with coreset.size=64, not 32: .*remove gate --forget"):
+            site.change(*change, **more)
+    site.change("removed", ["gate"])
+    site.change("applied", changed, "", replace_other=False)
+
+
 def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, ray, monkeypatch):
     def fails(*_):
         raise StoreError("the store cannot be reached")
