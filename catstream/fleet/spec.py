@@ -225,7 +225,7 @@ class FleetSpec:
             return cls(**values | {"streams": streams})
 
     def changes(self, new: FleetSpec, *, are_running: bool) -> list[str]:
-        """Describe the change of each stream if another spec takes the place of this one, a line for each."""
+        """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
         same = "is unchanged" if are_running else "continues from its last state"
         lines = []
         for name in sorted(self.streams.keys() | new.streams.keys()):
@@ -236,7 +236,8 @@ class FleetSpec:
                 lines.append(f"{name}: starts again with its changes")
             else:
                 lines.append(f"{name}: {same if before == after else 'continues with its changes'}")
-        return lines
+        later = [key for key in _FLEET if key != "streams" and getattr(self, key) != getattr(new, key)]
+        return lines + [f"{key} changes at the next start, after catstream fleet down" for key in later if are_running]
 
 
 def to_json(stored: object) -> bytes:

@@ -180,6 +180,13 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
         FleetSpec.load(tmp_path / "a.toml")
 
 
+def test_a_key_that_changes_only_at_the_next_start_is_said():
+    old, new = FleetSpec("site"), FleetSpec("site", every=1.0, nodes=3)
+    later = "changes at the next start, after catstream fleet down"
+    assert old.changes(new, are_running=True) == [f"every {later}", f"nodes {later}"]
+    assert old.changes(new, are_running=False) == []
+
+
 def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
     def spec(**streams):
         return FleetSpec("site", streams={name: StreamSpec(name, *given) for name, given in streams.items()})
