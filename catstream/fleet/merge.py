@@ -116,12 +116,16 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
     Raises
     ------
     FleetError
-        If a stream does not know the object, or none does.
+        If a stream does not know the object, or none does, or neither the object nor the streams are named.
     SettingsError
         If the settings of two streams differ.
     StoreError
         If the store cannot be reached.
     """
+    if not name and not named:
+        raise FleetError(
+            "objects without a name may be different ones: name the object (--object NAME), or the streams that show it"
+        )
     import ray
     from ray.exceptions import RayTaskError
 
