@@ -323,6 +323,8 @@ class Fleet:
             cluster.connect(self._address)
         elif address := self._local.address:
             cluster.connect(address, self._local.variables)
+        elif self._local.running:
+            raise FleetError(f"the fleet {self.name} is starting: try again once catstream fleet status shows it")
         else:
             raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
 

@@ -190,6 +190,13 @@ def test_a_fleet_that_does_not_run_cannot_be_ended():
         Fleet(name="other").down()
 
 
+@pytest.mark.usefixtures("home")
+def test_a_fleet_whose_nodes_start_is_said_to_start(monkeypatch):
+    monkeypatch.setattr(LocalCluster, "running", True)
+    with pytest.raises(FleetError, match="the fleet early is starting"):
+        Fleet(name="early").down()
+
+
 def test_a_store_that_cannot_be_used_is_said_before_anything_starts(home, tmp_path):
     (tmp_path / "file").write_text("")
     spec = FleetSpec("nowhere", str(tmp_path / "file" / "store"), streams={"a": StreamSpec("a", LIVE)})
