@@ -55,7 +55,7 @@ class _Target:
 
 def _target(endpoint: str, source: str, keys: str, timeout: float, yes: bool) -> _Target:
     if endpoint and source:
-        raise click.UsageError("--endpoint and --source both select the pipeline: give one of them")
+        raise click.UsageError("--source selects the pipeline, as --endpoint and --stream do: give one of them")
     return _Target(endpoint, source, keys, timeout, yes)
 
 

@@ -280,6 +280,8 @@ def move(running: Fleet, name: str, node: str) -> None:
 def drain(running: Fleet, node: str, undo: bool) -> None:
     """Move all streams from a NODE and place none there, before it is switched off.
 
+    Streams for which the other nodes have no room wait.
+
     \b
     EXAMPLE
       catstream fleet drain node-2
@@ -289,7 +291,7 @@ def drain(running: Fleet, node: str, undo: bool) -> None:
 
 @fleet.command(short_help="Print what a stream has logged.")
 @click.argument("name")
-@click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
+@click.option("--lines", default=100, show_default=True, type=click.IntRange(min=1), help="How many of the last lines.")
 @with_fleet
 def logs(running: Fleet, name: str, lines: int) -> None:
     """Print what the stream NAME has logged on its node since it started there."""
@@ -300,7 +302,11 @@ def logs(running: Fleet, name: str, lines: int) -> None:
 @fleet.command(short_help="Merge what several streams have learned of an object.")
 @click.argument("names", nargs=-1)
 @click.option(
-    "--object", "object_name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one."
+    "--object",
+    "object_name",
+    default=UNNAMED,
+    metavar="NAME",
+    help="Name of the object; default: the only one of NAMES.",
 )
 @click.option("-o", "--output", type=PATH, metavar="FILE", help="Write the model to a file, too.")
 @with_fleet
@@ -316,7 +322,8 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
       catstream fleet merge --object anna
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
-    merged = running.merge(*names, object=object_name)
+    with Console(stderr=True).status("merging"):
+        merged = running.merge(*names, object=object_name)
     if output is not None:
         with storage.writing(output):
             storage.write_atomically(output, merged.model)

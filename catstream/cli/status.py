@@ -12,6 +12,7 @@ from rich.table import Table
 
 from catstream.cli.attach import with_endpoint
 from catstream.cli.output import complain, screen, table
+from catstream.client.registry import locate
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health
@@ -69,6 +70,8 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
             click.echo()
             screen().print(_table(summary["objects"]))
     if silent:
+        if not reports:
+            locate(endpoint, keys)  # its error says why a stream of a fleet does not run
         complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}")
         sys.exit(1)
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from catstream.errors import FleetError
 from catstream.fleet.life import Node, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec
+from catstream.run.job import changed_setting
+from catstream.settings import Settings
 
 __all__ = ["Desired", "objection", "shortage"]
 
@@ -39,11 +41,11 @@ class Desired:
                 f"the fleet {self.spec.name} runs the streams of {self.origin}, not of {origin}: give this one "
                 "another name (--name), or replace the streams (--replace)"
             )
-        return replace(self, spec=spec, origin=origin or self.origin)
+        return replace(self._with(spec), origin=origin or self.origin)
 
     def added(self, stream: StreamSpec) -> Desired:
         """With one more stream, or with a change of the one of its name."""
-        return replace(self, spec=replace(self.spec, streams=self.spec.streams | {stream.name: stream}))
+        return self._with(replace(self.spec, streams=self.spec.streams | {stream.name: stream}))
 
     def removed(self, names: Collection[str]) -> Desired:
         """Without streams, of which nothing is left."""
@@ -73,6 +75,17 @@ class Desired:
         spec = self.spec.streams[name]
         return Wanted(spec.digest, spec.cores, spec.labels, self.pins.get(name, ""))
 
+    def _with(self, spec: FleetSpec) -> Desired:
+        """With other streams; each that is there already has to continue with the settings of its trees."""
+        for name in self.spec.streams.keys() & spec.streams.keys():
+            before, after = (Settings.from_values(each.streams[name].settings) for each in (self.spec, spec))
+            if changed := changed_setting(before, after):
+                raise FleetError(
+                    f"nothing was changed: {name} was started with {changed}: keep the setting, or first remove the "
+                    f"stream with what it has learned (catstream fleet remove {name} --forget)"
+                )
+        return replace(self, spec=spec)
+
     def check_stream(self, name: str) -> None:
         """Raise FleetError if there is no such stream."""
         if name not in self.spec.streams:
@@ -81,6 +94,7 @@ class Desired:
 
     def check_fits(self, nodes: Collection[Node]) -> None:
         """Raise FleetError if the nodes cannot run all streams."""
+        nodes = self.with_draining(nodes)
         wanted = {name: self.wanted(name) for name in self.spec.streams}
         reasons = [f"{name} {reason}" for name, each in wanted.items() if (reason := objection(each, nodes))]
         if reasons := reasons or list(filter(None, [shortage(wanted.values(), nodes)])):
@@ -105,7 +119,8 @@ def objection(wanted: Wanted, nodes: Collection[Node]) -> str:
     if not fitting:
         labels = ", ".join(f"{key}={value}" for key, value in wanted.labels.items())
         needed = f"a node with {labels}" if labels else "a node that is not drained"
-        return f"needs {needed}, and there is none: there are {', '.join(node.name for node in alive) or 'none'}"
+        names = (f"{node.name}{' (drained)' * node.draining}" for node in alive)
+        return f"needs {needed}, and there is none: there are {', '.join(names) or 'none'}"
     largest = max(fitting, key=lambda node: node.cores)
     if largest.cores < wanted.cores:
         return (

@@ -150,7 +150,7 @@ class Fleet:
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
         """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
-        lines = self._change(Desired.removed, names)
+        lines = self._change(Desired.removed, names, may_wait=True)
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
@@ -159,16 +159,21 @@ class Fleet:
 
     def move(self, name: str, node: str) -> str:
         """Move a stream to a node, where it stays until the node dies or drains."""
-        there, status = self._node(node), self.status()
-        self._change(Desired.moved, name, there)
-        before = status.streams[name].node
+        there, streams = self._node(node), self.status().streams
+        if name in streams and streams[name].state == "ended":
+            raise FleetError(f"{name} has ended: it runs on no node")
+        self._change(Desired.moved, name, there, may_wait=True)
+        before = streams[name].node
         return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
 
     def drain(self, node: str, *, undo: bool = False) -> str:
-        """Move all streams from a node and place none there, for example before it is switched off."""
+        """Move all streams from a node and place none there, for example before it is switched off.
+
+        Streams for which the other nodes have no room wait.
+        """
         self._node(node)
         count = sum(each.node == node for each in self.status().streams.values())
-        self._change(Desired.drained, node, undo=undo)
+        self._change(Desired.drained, node, undo=undo, may_wait=True)
         return f"{node} takes streams again" if undo else f"{node} is draining; streams that leave it: {count}"
 
     def status(self) -> FleetStatus:
@@ -318,6 +323,8 @@ class Fleet:
             cluster.connect(self._address)
         elif address := self._local.address:
             cluster.connect(address, self._local.variables)
+        elif self._local.running:
+            raise FleetError(f"the fleet {self.name} is starting: try again once catstream fleet status shows it")
         else:
             raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
 

@@ -116,17 +116,22 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
     Raises
     ------
     FleetError
-        If a stream does not know the object, or none does.
+        If a stream does not know the object, or none does, or neither the object nor the streams are named.
     SettingsError
         If the settings of two streams differ.
     StoreError
         If the store cannot be reached.
     """
+    if not name and not named:
+        raise FleetError(
+            "objects without a name may be different ones: name the object (--object NAME), or the streams that show it"
+        )
     import ray
     from ray.exceptions import RayTaskError
 
     remote: Any = ray.remote
-    load, join = remote(num_returns=2)(saved_part), remote(joined)
+    # Ray reserves a core of one node for a task by default, and waits for it without end if the streams have them all.
+    load, join = remote(num_returns=2, num_cpus=0)(saved_part), remote(num_cpus=0)(joined)
     refs: dict[str, Any] = {stream: load.remote(url, stream, name, named=named) for stream in streams}
     store = Store(url)
     earlier = before.files["model"] if (before := store.get_model(name)) is not None else None

@@ -212,11 +212,11 @@ class FleetSpec:
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise FleetError(f"{path}: {_toml_problem(str(error), text)}") from None
         with _errors_in(str(path)):
-            if not tables.get("streams"):
+            values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
+            if not values.get("streams"):
                 raise FleetError(
                     'it has no streams: add a table for each, for example [streams.cam-1] with source = "demo:1"'
                 )
-            values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
             if (store := values.get("store")) and "://" not in store:
                 values["store"] = str(folder / store)
             if keys := values.get("keys"):
@@ -225,7 +225,7 @@ class FleetSpec:
             return cls(**values | {"streams": streams})
 
     def changes(self, new: FleetSpec, *, are_running: bool) -> list[str]:
-        """Describe the change of each stream if another spec takes the place of this one, a line for each."""
+        """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
         same = "is unchanged" if are_running else "continues from its last state"
         lines = []
         for name in sorted(self.streams.keys() | new.streams.keys()):
@@ -236,7 +236,8 @@ class FleetSpec:
                 lines.append(f"{name}: starts again with its changes")
             else:
                 lines.append(f"{name}: {same if before == after else 'continues with its changes'}")
-        return lines
+        later = [key for key in _FLEET if key != "streams" and getattr(self, key) != getattr(new, key)]
+        return lines + [f"{key} changes at the next start, after catstream fleet down" for key in later if are_running]
 
 
 def to_json(stored: object) -> bytes:
@@ -303,7 +304,8 @@ def _toml_problem(error: str, text: str) -> str:
     number = int(place[1]) if place else len(lines)
     headers = [match[1] for line in lines[:number] if (match := _STREAM_HEADER.match(line))]
     stream = f"the stream {headers[-1]}: " if headers else ""
-    if "Cannot overwrite a value" in error:
-        key = lines[number - 1].partition("=")[0].strip()
+    inside = re.search(r"(?:immutable namespace \(|inline table key )'([^']*)'", error)
+    if inside or "Cannot overwrite a value" in error:
+        key = inside[1] if inside else lines[number - 1].partition("=")[0].strip()
         return f"{stream}{key} is given twice, in line {number}: remove one of them"
     return f"{stream}this is not TOML: {error}"

@@ -162,13 +162,11 @@ class Job:
                 f"the run in {str(folder)!r} has {self._frames()}, and this one has {other._frames()}: "
                 "continue with the same frames, or start a new run in another folder"
             )
-        ours, theirs = self.settings.values(), other.settings.values()
-        for name in sorted(ours.keys() - _FREE):
-            if ours[name] != theirs[name]:
-                raise SettingsError(
-                    f"the run in {str(folder)!r} was started with {name}={ours[name]}, not {theirs[name]}: "
-                    "continue without settings (they are stored too), or start a new run in another folder"
-                )
+        if changed := changed_setting(self.settings, other.settings):
+            raise SettingsError(
+                f"the run in {str(folder)!r} was started with {changed}: continue without settings (they are stored "
+                "too), or start a new run in another folder"
+            )
 
     def _frames(self) -> str:
         """The size and the numbers of the frames, for an error."""
@@ -176,6 +174,17 @@ class Job:
         first, stop, stride = self.part.start or 0, self.part.stop, self.part.step or 1
         numbers = f"frames {first} to {'the last' if stop is None else stop - 1}"
         return f"{size}{numbers}{f' in steps of {stride}' * (stride > 1)}"
+
+
+def changed_setting(before: Settings, after: Settings) -> str:
+    """The first setting that differs and may not while a run continues, with its values; empty if there is none.
+
+    >>> changed_setting(Settings(), Settings(coreset={"size": 32}, run={"lag_frames": 25}))
+    'coreset.size=64, not 32'
+    """
+    ours, theirs = before.values(), after.values()
+    changed = (name for name in sorted(ours.keys() - _FREE) if ours[name] != theirs[name])
+    return next((f"{name}={ours[name]}, not {theirs[name]}" for name in changed), "")
 
 
 def files_by_name(files: Models | None) -> dict[str, Path]:

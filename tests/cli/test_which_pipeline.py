@@ -88,12 +88,22 @@ def test_a_stream_of_a_fleet_can_be_selected_by_its_name(pipeline, managing):
         assert "no stream 'cam-8': its streams are cam-7" in str(said("stop", "--stream", "cam-8").exception)
 
 
+def test_the_status_of_a_stream_that_does_not_run_says_why(managing):
+    streams = {"a": StreamStatus("a", "failed", trouble="there is no video"), "b": StreamStatus("b", "ended")}
+    with managing(lambda: FleetStatus("site", 0.0, streams)):
+        for name, why in {
+            "a": "its state is failed: there is no video",
+            "b": "its state is ended",
+        }.items():
+            assert why in str(said("status", "--stream", name, "--wait", 0.1).exception)
+
+
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
         (["--fleet", "site"], "give the name of its stream, too (--stream NAME)"),
         (["--stream", "cam-7", "--endpoint", "run"], "give one"),
-        (["--stream", "cam-7", "--source", "walk.mp4"], "give one of them"),
+        (["--stream", "cam-7", "--source", "walk.mp4"], "as --endpoint and --stream do: give one of"),
     ],
 )
 def test_a_pipeline_is_selected_in_one_way(words, reason):

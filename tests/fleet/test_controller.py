@@ -256,6 +256,15 @@ def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_st
     assert states(site)["gate"] == "running", "it stays where it is"
 
 
+def test_a_node_that_was_drained_a_moment_ago_has_no_room(site, spec):
+    for node in ("n1", "n2"):
+        site.change("drained", node, undo=False, may_wait=True)
+    with pytest.raises(FleetError, match=r"roof needs a node that is not drained.* n2 \(drained\)"):
+        site.change("applied", spec, "", replace_other=False)
+    site.change("drained", "n1", undo=True)
+    site.change("applied", spec, "", replace_other=False)
+
+
 def test_a_stream_that_was_moved_to_a_node_that_died_is_placed_by_ray_and_stays_there(site, ray):
     site.change("moved", "gate", ray.nodes[1])
     for _ in range(3):
@@ -306,6 +315,18 @@ def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, sp
     site.change("added", GATE)
     site._turn()
     assert ray.actors["site/stream/gate"].options["scheduling_strategy"] == "SPREAD"
+
+
+def test_a_setting_with_which_a_stream_cannot_continue_is_not_changed(site, spec):
+    assert "gate: starts again" in site.change("added", replace(GATE, settings={"run.lag_frames": 26}))[0]
+    gate = replace(GATE, settings={"coreset.size": 32})
+    changed = replace(spec, streams={"gate": gate, "roof": ROOF})
+    for change in (("added", gate), ("applied", changed, "")):
+        more = {"replace_other": False} if change[0] == "applied" else {}
+        with pytest.raises(FleetError, match=r"gate was started with coreset.size=64, not 32: .*remove gate --forget"):
+            site.change(*change, **more)
+    site.change("removed", ["gate"])
+    site.change("applied", changed, "", replace_other=False)
 
 
 def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, ray, monkeypatch):

@@ -128,7 +128,7 @@ def test_processes_of_the_nodes_have_the_priority_of_the_process_that_starts_the
     assert theirs == os.getpriority(os.PRIO_PROCESS, 0)
 
 
-def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
+def test_what_cannot_be_done_is_refused_and_nothing_is_changed(site, until):
     fleet, spec = site
     with pytest.raises(FleetError, match="gate needs 4 cores, and the largest node"):
         fleet.add(replace(spec.streams["gate"], cores=4.0))
@@ -138,6 +138,9 @@ def test_what_fits_nowhere_is_refused_and_nothing_is_changed(site):
         fleet.move("cam-8", "node-1")
     with pytest.raises(FleetError, match="no node 'node-9'"):
         fleet.move("gate", "node-9")
+    until(lambda: fleet.status().streams["film"].state == "ended")
+    with pytest.raises(FleetError, match="film has ended"):
+        fleet.move("film", "node-1")
     assert set(fleet.status().streams) == {"film", "gate"}
 
 
@@ -158,12 +161,23 @@ def test_a_node_that_is_drained_gives_its_streams_away(site, until):
     node = fleet.status().streams["gate"].node
     assert fleet.drain(node).startswith(f"{node} is draining; ")
     until(lambda: (found := fleet.status().streams["gate"]).node not in ("", node) and found.state == "running")
+    other = fleet.status().streams["gate"].node
+    fleet.drain(other)
+    until(
+        lambda: (found := fleet.status().streams["gate"]).state == "unplaced" and f"{node} (drained)" in found.trouble
+    )
     assert fleet.drain(node, undo=True) == f"{node} takes streams again"
+    until(lambda: (found := fleet.status().streams["gate"]).node == node and found.state == "running")
+    fleet.drain(other, undo=True)
 
 
-def test_a_merge_runs_on_the_nodes(site):
+def test_a_merge_runs_on_nodes_whose_cores_are_all_reserved(site, until):
     fleet, spec = site
+    until(lambda: fleet.status().streams["film"].state == "ended")
+    fleet.add(StreamSpec("full", LIVE, cores=0.8))  # on the node without the gate: no core is free as a whole
+    until(lambda: fleet.status().streams["full"].state == "waiting")
     merged = fleet.merge("film")
+    fleet.remove("full", forget=True)
     assert merged.streams == ("film",)
     assert Store(spec.store).get_model("").files["model"] == merged.model
     with pytest.raises(FleetError, match="no stream has learned of 'nobody'"):
@@ -174,6 +188,13 @@ def test_a_merge_runs_on_the_nodes(site):
 def test_a_fleet_that_does_not_run_cannot_be_ended():
     with pytest.raises(FleetError, match="no fleet 'other' of yours runs"):
         Fleet(name="other").down()
+
+
+@pytest.mark.usefixtures("home")
+def test_a_fleet_whose_nodes_start_is_said_to_start(monkeypatch):
+    monkeypatch.setattr(LocalCluster, "running", True)
+    with pytest.raises(FleetError, match="the fleet early is starting"):
+        Fleet(name="early").down()
 
 
 def test_a_store_that_cannot_be_used_is_said_before_anything_starts(home, tmp_path):

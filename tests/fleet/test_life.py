@@ -145,7 +145,9 @@ def test_the_difference_is_that_of_each_stream_by_the_table(wanted, actors, node
 
 def test_why_streams_cannot_run_is_said():
     drained = Node("n2", "2", cores=8.0, draining=True)
-    assert objection(Wanted("a1"), [drained]) == ("needs a node that is not drained, and there is none: there are n2")
+    assert objection(Wanted("a1"), [drained]) == (
+        "needs a node that is not drained, and there is none: there are n2 (drained)"
+    )
     assert objection(Wanted("a1"), [Node("n1", "1"), drained]) == ""
     twenty = [Wanted(str(number)) for number in range(20)]
     assert (

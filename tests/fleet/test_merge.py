@@ -176,6 +176,11 @@ def test_the_part_of_a_stream_is_what_its_newest_state_has_learned(store):
             saved_part(store, stream_name, name, named=True)
 
 
+def test_objects_without_a_name_are_merged_only_of_streams_that_are_named():
+    with pytest.raises(FleetError, match=r"name the object \(--object NAME\), or the streams that show it"):
+        merge_streams("", ["door", "yard"], "", named=False)
+
+
 @pytest.mark.system
 def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(store, tmp_path, site):
     site[0].status()  # this process is connected to the nodes

@@ -116,8 +116,11 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
         ('[streams.cam-7]\nsource="0"\n[streams.cam-7]\nsource="1"', "two streams have the name cam-7: give each a"),
         ('[streams]\ncam-7={source="0"}\ncam-7={source="1"}', "cam-7 is given twice, in line 3: remove one of them"),
         ('[streams.cam-7]\nsource="0"\nsource="1"', "the stream cam-7: source is given twice, in line 3: remove one"),
+        ('[streams.cam-7]\nboxes={a=[1], a=[2]}', "the stream cam-7: a is given twice, in line 2: remove one of them"),
+        ('[streams.cam-7]\nlabels={a="1", a="2"}', "the stream cam-7: a is given twice, in line 2: remove one of them"),
         ('[streams.cam-7]\nsource=', "the stream cam-7: this is not TOML: Invalid value"),
         ("", "it has no streams: add a table for each, for example [streams.cam-1]"),
+        ("[stream.cam-1]\nsource='0'", "there is no key 'stream', did you mean 'streams'?"),
         ("streams = 3", "streams must be tables [streams.NAME], got 3"),
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
         ('[streams."cam 7"]\nsource="0"', "'cam 7' is not a valid name of a stream: expected 1 to 64 letters"),
@@ -175,6 +178,13 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(FleetError, match=r"a\.toml is not UTF-8 text"):
         FleetSpec.load(tmp_path / "a.toml")
+
+
+def test_a_key_that_changes_only_at_the_next_start_is_said():
+    old, new = FleetSpec("site"), FleetSpec("site", every=1.0, nodes=3)
+    later = "changes at the next start, after catstream fleet down"
+    assert old.changes(new, are_running=True) == [f"every {later}", f"nodes {later}"]
+    assert old.changes(new, are_running=False) == []
 
 
 def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
