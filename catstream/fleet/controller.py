@@ -164,12 +164,13 @@ class Controller:
             self.ready()
             desired: Desired = getattr(self._desired, how)(*arguments, **options)
             if not may_wait:
-                desired.check_fits(self._nodes)
+                desired.check_fits(self._nodes, self._ended)
             for (stream, name), data in (models or {}).items():
                 self._store.put_model(given_model(stream, name), data, {})
             self._store.put_fleet(to_json(desired))
             with self._lock:
-                lines: list[str] = self._desired.spec.changes(desired.spec, are_running=self._phase == "up")
+                running = self._phase == "up"
+                lines: list[str] = self._desired.spec.changes(desired.spec, self._ended, are_running=running)
                 self._desired, self._phase = desired, "up"
                 for name in self._streams.keys() - desired.spec.streams.keys():  # only the actor is left, until it ends
                     known = self._streams[name]
@@ -298,8 +299,13 @@ class Controller:
         """The streams that should run now."""
         if self._phase != "up":
             return {}
-        wanted = {name: self._desired.wanted(name) for name in self._desired.spec.streams if name in self._streams}
-        return {name: each for name, each in wanted.items() if self._streams[name].ended != each.digest}
+        return {name: each for name, each in self._desired.unended(self._ended).items() if name in self._streams}
+
+    @property
+    def _ended(self) -> dict[str, str]:
+        """The digests with which sources have ended, by stream."""
+        with self._lock:
+            return {name: known.ended for name, known in self._streams.items() if known.ended}
 
     def _ask(self, name: str, known: _Known, *, exists: bool) -> None:
         """Ask the actor of a stream for a report, unless it has still to answer."""
@@ -405,7 +411,9 @@ class Controller:
             quiet = time.monotonic() - known.seen.answered
             trouble = f"it has not answered for {quiet:.0f} s" if quiet > QUIET_SECONDS else last.trouble
             return replace(last, trouble=trouble)
-        last = replace(last, endpoint="", server="", rate=0.0, trouble="")
+        stored = last.stored_seconds
+        age = None if stored is None else stored + time.monotonic() - known.seen.answered
+        last = replace(last, endpoint="", server="", rate=0.0, cores=0.0, stored_seconds=age, trouble="")
         if known.ended == self._desired.spec.streams[name].digest:
             return replace(last, state="ended", node="")
         if known.seen.state == "stopping":

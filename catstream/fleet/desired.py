@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 from catstream.errors import FleetError
@@ -92,10 +92,14 @@ class Desired:
             known = ", ".join(self.spec.streams) or "none"
             raise FleetError(f"there is no stream {name!r} in the fleet {self.spec.name}: there are {known}")
 
-    def check_fits(self, nodes: Collection[Node]) -> None:
-        """Raise FleetError if the nodes cannot run all streams."""
-        nodes = self.with_draining(nodes)
+    def unended(self, ended: Mapping[str, str]) -> dict[str, Wanted]:
+        """The streams that should run: all but those that have ended with the digest that they have now."""
         wanted = {name: self.wanted(name) for name in self.spec.streams}
+        return {name: each for name, each in wanted.items() if ended.get(name) != each.digest}
+
+    def check_fits(self, nodes: Collection[Node], ended: Mapping[str, str]) -> None:
+        """Raise FleetError if the nodes cannot run all streams but those that have `ended`."""
+        nodes, wanted = self.with_draining(nodes), self.unended(ended)
         reasons = [f"{name} {reason}" for name, each in wanted.items() if (reason := objection(each, nodes))]
         if reasons := reasons or list(filter(None, [shortage(wanted.values(), nodes)])):
             raise FleetError(

@@ -26,7 +26,7 @@ import json
 import re
 import reprlib
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -224,7 +224,7 @@ class FleetSpec:
             streams = {name: StreamSpec.parse(name, table, folder) for name, table in values["streams"].items()}
             return cls(**values | {"streams": streams})
 
-    def changes(self, new: FleetSpec, *, are_running: bool) -> list[str]:
+    def changes(self, new: FleetSpec, ended: Collection[str], *, are_running: bool) -> list[str]:
         """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
         same = "is unchanged" if are_running else "continues from its last state"
         lines = []
@@ -234,6 +234,8 @@ class FleetSpec:
                 lines.append(f"{name}: is {'added' if before is None else 'removed'}")
             elif before.digest != after.digest:
                 lines.append(f"{name}: starts again with its changes")
+            elif name in ended:
+                lines.append(f"{name}: has ended")
             else:
                 lines.append(f"{name}: {same if before == after else 'continues with its changes'}")
         later = [key for key in _FLEET if key != "streams" and getattr(self, key) != getattr(new, key)]

@@ -257,10 +257,12 @@ class Stream:
         self._planned = facts["planned"] + bool(facts["end"]) if facts else claim.removed + 1
         with self._lock:
             self._status = replace(self._status, restarts=claim.token - self._planned)
-        if facts and facts["end"] == "ended":
+        if claim.state is not None and facts["end"] == "ended":
             if facts["digest"] == self._spec.digest:
+                restarts = claim.state.token - facts["planned"]  # this claim only finds that it has ended
                 with self._lock:
-                    self._status = replace(self._status, state="ended", frame=int(facts["frame"]))
+                    self._stored_at = float(facts["time"])
+                    self._status = replace(self._status, state="ended", frame=int(facts["frame"]), restarts=restarts)
                 return
             claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
@@ -385,6 +387,8 @@ class Stream:
         if pipeline.lost_seconds:
             troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
         self._rates.update(lambda: _processor_seconds([os.getpid(), *pipeline.pids.values()]), skipped)
+        if pipeline.holding:  # on purpose
+            self._rates.skipped, self._rates.skipping = skipped, 0.0
         with self._lock:
             status = self._status
             if tracks:

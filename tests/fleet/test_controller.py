@@ -286,6 +286,8 @@ def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed
     for _ in range(3):
         site._turn()
     assert (states(site)["gate"], ray.started.count("gate")) == ("ended", 1)
+    assert site.change("added", GATE) == ["gate: has ended", "roof: is unchanged"]
+    site.change("added", StreamSpec("lake", "demo:2", cores=2.0))  # in the place of the one that has ended
     site.change("added", replace(GATE, source="demo:3"))
     for _ in range(2):
         site._turn()

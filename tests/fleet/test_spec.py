@@ -183,8 +183,8 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 def test_a_key_that_changes_only_at_the_next_start_is_said():
     old, new = FleetSpec("site"), FleetSpec("site", every=1.0, nodes=3)
     later = "changes at the next start, after catstream fleet down"
-    assert old.changes(new, are_running=True) == [f"every {later}", f"nodes {later}"]
-    assert old.changes(new, are_running=False) == []
+    assert old.changes(new, (), are_running=True) == [f"every {later}", f"nodes {later}"]
+    assert old.changes(new, (), are_running=False) == []
 
 
 def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
@@ -194,7 +194,7 @@ def test_the_changes_of_a_new_spec_have_a_line_for_each_stream():
     old, box = spec(a=["0"], b=["0"], c=["0"], d=["0"]), {"": Box(1, 2, 30, 40)}
     new = spec(b=["1"], c=["0"], d=["0"], e=["0", box])
     new.streams["d"] = replace(new.streams["d"], cores=2.0)
-    assert old.changes(new, are_running=True) == [
+    assert old.changes(new, (), are_running=True) == [
         "a: is removed",
         "b: starts again with its changes",
         "c: is unchanged",

@@ -86,10 +86,12 @@ def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(s
 
 
 def test_a_stream_that_has_ended_is_not_run_again(spec, store, until):
-    for _ in range(2):
+    for _ in range(3):
         with started(spec, store) as stream:
             until(lambda: stream.report().status.state == "ended")
-    assert stream.report().status.endpoint == ""
+    status = stream.report().status
+    assert (status.endpoint, status.restarts) == ("", 0)
+    assert status.stored_seconds is not None
 
 
 def test_a_stream_that_has_ended_and_was_changed_begins_anew(spec, store, until):
@@ -149,6 +151,14 @@ def test_a_slow_stream_says_so():
     rates = module._Rates(since=0.0, frames=60)
     rates.update(lambda: 2.0, skipped=2)
     assert rates.trouble == ""
+
+
+def test_a_stream_that_waits_for_a_box_skips_frames_on_purpose(store, until, monkeypatch):
+    monkeypatch.setattr(module, "RATE_SECONDS", 0.1)
+    with started(StreamSpec("cam-7", LIVE), store) as stream:
+        until(lambda: stream.report().status.skipped > 2)
+        status = stream.report().status
+    assert (status.state, status.trouble) == ("waiting", "")
 
 
 def test_a_stream_goes_on_while_the_store_takes_nothing(long_spec, store, until, monkeypatch):
