@@ -130,7 +130,7 @@ class DetectorLoop:
         self._tracks = Tracks(0, 0, {})  # the last ones
         self._features = Features(0, 0, 0.0, {})
         self._positions: dict[str, Position] = {}  # the answers of the receivers, by channel
-        self._arrived: dict[str, Model] = {}  # before the positions agree
+        self._arrived: dict[str, Model] = {}  # of the objects that have no detector yet
         self._do: dict[type[Action], Callable[[Any], Event | None]] = {
             actions.Continue: self._continue,
             actions.Resume: self._resume,
@@ -276,6 +276,8 @@ class DetectorLoop:
                 self._detectors.adopt(model)
                 known = _known(self._detectors.detectors[model.object])
                 self.tell(core.ModelArrived(model.object, model.version, known))
+            else:  # the object may begin again: the compressor of a resumed run can be ahead of the tracks
+                self._arrived[model.object] = model
 
     def _progressed(self) -> Event | None:
         """The progress of the receivers, if the core waits for it and it is another one than before."""
@@ -305,7 +307,6 @@ class DetectorLoop:
         self._detectors.seq = order.seq
         for sender, position in zip(self._outputs.senders.values(), order.positions, strict=True):
             sender.window.resume(order.seq, position)
-        self._arrived.clear()
         return core.Resumed(self._known())
 
     def _set_box(self, order: actions.SetBox) -> Event:
@@ -343,6 +344,8 @@ class DetectorLoop:
 
     def _step(self, _: actions.Step) -> Event:
         tracks, features = self._detectors.step(self._pyramid, self._frame.time, self._given)
+        for name in self._arrived.keys() & tracks.tracks.keys():
+            self._detectors.adopt(self._arrived.pop(name))
         models = {
             name: replace(features.objects[name], model=learned.to_bytes()) for name, learned in self._begun.items()
         }

@@ -185,4 +185,14 @@ def test_a_complete_run_is_not_resumed_and_that_is_reported(video, succeed, fail
     error = fail("track", "--resume", kept, "--box", "1,2,30,40")
     assert "is complete" in error
     assert "no frame is left for a box" in error
+    (out / "demo.txt").unlink()
+    succeed("track", "--resume", kept, "--start", 0, "--end", 6)  # the same frames
     assert (out / "demo.csv").read_bytes() == before
+    assert len((out / "demo.txt").read_text().splitlines()) == 6
+
+
+@pytest.mark.timeout(60)
+def test_new_results_of_a_run_to_resume_have_all_frames_although_the_models_are_of_later_ones(killed, succeed):
+    succeed("track", "--resume", killed / "kept")
+    succeed("track", "--resume", killed / "kept", "--output", killed / "new")
+    assert frames(killed / "new") == [*range(32)]
