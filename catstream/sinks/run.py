@@ -96,6 +96,8 @@ class RunFiles:
     def complete(self) -> bool:
         """Whether all files exist and are complete."""
         files = [file for file in self.files if file != STDOUT]
+        if self.output is not None:
+            files += [self.output / file for file in results.result_files(self.name, self.names())]
         return all(file.exists() for file in [*files, *([self._video_file()] if self.video else [])])
 
     def position(self) -> Position | None:
