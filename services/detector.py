@@ -33,7 +33,7 @@ from catstream.services import actions, core
 from catstream.services.actions import Action
 from catstream.services.core import Event, History
 from catstream.services.core_state import Known, Phase, Progress, Request, Rules, State
-from catstream.services.desired import DesiredObject, DesiredState
+from catstream.services.desired import DESIRED, DesiredObject, DesiredState
 from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
@@ -48,7 +48,6 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["main", "opening_seconds", "prepare"]
 
-_FILE = "desired_state.json"  # in the folder of the state
 _EVENTS_FILE = "detector_events.ndjson"  # the same, after a crash
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
@@ -378,12 +377,12 @@ class DetectorLoop:
         if state is not None and desired != self._kept:
             try:
                 self._models_of_job.store()  # before the state that names them
-                desired.save(state / _FILE)
+                desired.save(state / DESIRED)
                 self._kept = desired
                 self._models_of_job.keep_only(set(order.models))
             except OSError as error:
-                _log.warning("the desired state cannot be written to %s (%s)", state / _FILE, error.strerror)
-                lost = f"; a resumed run will not know it, as {state / _FILE} cannot be written ({error.strerror})"
+                _log.warning("the desired state cannot be written to %s (%s)", state / DESIRED, error.strerror)
+                lost = f"; a resumed run will not know it, as {state / DESIRED} cannot be written ({error.strerror})"
         for answer in order.answers:
             self._control.answer(replace(answer, reason=answer.reason + lost) if answer.done else answer)
 
@@ -460,9 +459,9 @@ def opening_seconds(part: slice, first: int) -> tuple[float, float]:
 def _desired(process: Process, models: ModelFiles) -> DesiredState:
     """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
     job = process.job
-    if job.resume and job.state is not None and (job.state / _FILE).exists():
+    if job.resume and job.state is not None and (job.state / DESIRED).exists():
         try:
-            return DesiredState.load(job.state / _FILE)
+            return DesiredState.load(job.state / DESIRED)
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)

@@ -264,7 +264,7 @@ def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None
         known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
     )
     for file in request.saved.values():
-        check_file(file, overwrite=request.overwrite)
+        check_file(file, overwrite=request.overwrite, made=files.output)
         if [*request.saved.values()].count(file) > 1:
             raise ServiceError(f"{file} is named twice: give each object its own file")
 
@@ -324,10 +324,14 @@ class _Run:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
         try:
             with self._pipeline, ExitStack() as stack:
+                self._files.make_folder()
                 if self._request.view is not None:
                     self._serve(self._request.view, stack)
-                if self._pipeline.waits:
+                if self._pipeline.holding == "waiting":
                     self._console.print(f"waiting for a box: {self._ways_to_set_box()}")
+                elif self._pipeline.holding:
+                    place = f"--endpoint {self._pipeline.endpoint}"
+                    self._console.print(f"paused, as it was before: to continue, catstream resume {place}")
                 self._write_tracks()
         except KeyboardInterrupt:
             return True

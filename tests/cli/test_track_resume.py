@@ -160,10 +160,10 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
 ):
     (source, box), out = video, tmp_path / "out"
     objects = ["--box", f"flower={box}", "--box", "lake=10,20,60,40"]
-    files = ["--output", out, "--write", tmp_path / "t.txt", "--save-model", f"lake={tmp_path / 'lake'}"]
+    files = ["--output", out, "--write", out / "t.txt", "--save-model", f"lake={out / 'lake'}"]
     _, errors = succeed("track", source, *objects, *files, "--end", 16, "--state", tmp_path / "kept", *OFTEN)
     assert "1 flower: present in" in errors
-    assert Learned.load(tmp_path / "lake").object == "lake"
+    assert Learned.load(out / "lake").object == "lake"
     table = out / "demo.csv"
     table.write_bytes(table.read_bytes()[:-9])  # the last row, that of the lake, is torn
     succeed("track", "--resume", tmp_path / "kept")
@@ -171,7 +171,7 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
     assert rows == [(frame, name) for frame in range(16) for name in ("flower", "lake")]
     for name in ("flower", "lake"):
         assert len((out / f"demo-{name}.txt").read_text().splitlines()) == 16
-    ids = {tuple(line.split(",")[:2]) for line in (tmp_path / "t.txt").read_text().splitlines()}
+    ids = {tuple(line.split(",")[:2]) for line in (out / "t.txt").read_text().splitlines()}
     assert ids == {(str(frame + 1), number) for frame in range(16) for number in ("1", "2")}
 
 
