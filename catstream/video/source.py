@@ -442,6 +442,9 @@ def _good_frames(container: InputContainer, stream: VideoStream, rate: float, da
             damage.report(problem, count)
             since_damage = waits_for_key = True
             stream.codec_context.flush_buffers()
+    if since_damage and last is not None:  # the rest of the file, by its stated duration
+        rest = _stated_duration(container, stream) - float((last - (stream.start_time or 0)) * time_base(stream))
+        damage.frames += max(0, round(rest * rate) - 1)
 
 
 def _packets(

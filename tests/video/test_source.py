@@ -172,6 +172,10 @@ def test_a_truncated_video_returns_its_good_frames_and_then_an_error_with_the_fr
     assert good == list(range(len(good)))
     assert 2 < len(good) < 100
     assert f"frame {len(good)} " in message or f"after frame {len(good) - 1}:" in message
+    with open_source(path, skip_damaged=True) as source:
+        read = len(list(source)) + source.counters.get("damaged", 0)
+    if path.suffix in (".mp4", ".mkv"):  # which state how long they were
+        assert read == pytest.approx(100, abs=1)
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.mpg"])
