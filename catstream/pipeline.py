@@ -17,6 +17,7 @@ from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from types import TracebackType
 from typing import Self
 
 from catstream.errors import ProtocolError, RecordingError, ServiceError, SettingsError, require_extra
@@ -97,6 +98,8 @@ class Pipeline:
         Width and height of a frame.
     live : bool
         Whether the source is a camera or a stream.
+    saved_models : list of Path
+        At the end: the files of `save_model` that were written.
 
     Raises
     ------
@@ -165,6 +168,7 @@ class Pipeline:
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
         self._save_models = job.results.models if save_model is None else saved_models
+        self.saved_models: list[Path] = []
         self._after = after
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
@@ -214,7 +218,7 @@ class Pipeline:
                 stack.enter_context(begun(self._state, self._resumed_job, self._job))
             job = self._started(str(endpoint))
             reader = stack.enter_context(RunReader(job, endpoint, self._start, folder, live=self.live))
-            stack.enter_context(saved(self._save_models, self._state or folder, settings))
+            self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
             stack.callback(reader.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._reader, self._stack = str(endpoint), reader, stack.pop_all()
         return self
@@ -231,20 +235,24 @@ class Pipeline:
             since=time.monotonic() - max(0.0, time.time() - self._job.started),
         )
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        stack, self._stack = self._stack, _CLOSED
+        if stack is not None and stack is not _CLOSED:
+            stack.__exit__(kind, error, trace)
 
     async def __aenter__(self) -> Self:
         return self.__enter__()  # it does not block; the processes end with this thread
 
-    async def __aexit__(self, *_: object) -> None:
-        await asyncio.shield(asyncio.to_thread(self.close))
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await asyncio.shield(asyncio.to_thread(self.__exit__, kind, error, trace))
 
     def close(self) -> None:
         """Stop the processes in order, after they have stored everything. The pipeline cannot be started again."""
-        stack, self._stack = self._stack, _CLOSED
-        if stack is not None and stack is not _CLOSED:
-            stack.close()
+        self.__exit__(None, None, None)
 
     def __del__(self) -> None:
         if getattr(self, "_stack", None) not in (None, _CLOSED):

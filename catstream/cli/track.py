@@ -310,7 +310,7 @@ class _Run:
         request, folder = self._request, self._request.folder
         if request.resume is not None and not self._progress.frames and not interrupted:
             self._console.print(f"no frames were left to track: the run in {request.resume} is complete")
-        for file in self._pipeline.results.models.values():
+        for file in self._pipeline.saved_models:
             self._console.print(f"saved model: {file}")
         if interrupted:
             hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
