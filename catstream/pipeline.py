@@ -139,12 +139,17 @@ class Pipeline:
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("state starts a new run, and resume continues one: give one of them")
+        if resume is not None and not (box is None and model is None):
+            raise SettingsError(
+                "a resumed run continues with the objects that it had: give neither a box nor a model, and add others "
+                "with catstream set-box or catstream search once it runs"
+            )
         start_server()  # it imports while this process opens the source
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         job = self._resumed_job or Job(started=time.time())
         job = replace(
-            job if box is None and model is None else job.with_objects(box, model),
+            job if resume is not None else job.with_objects(box, model),
             source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),

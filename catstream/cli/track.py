@@ -173,8 +173,8 @@ def track(**options: Any) -> None:
     are kept.
 
     With --state, a checkpoint is written once a second. After a power failure,
-    a crash or Ctrl-C, --resume continues the run, with the same source, box,
-    settings and results unless they are given again.
+    a crash or Ctrl-C, --resume continues the run with the objects that it had,
+    and with the same source, settings and results unless they are given again.
 
     \b
     Writes
@@ -279,17 +279,14 @@ def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
 
 def _completed(request: _Request, pipeline: Pipeline, files: RunFiles) -> str:
     """Complete the files of a run to resume whose frames were all tracked; return the message about it."""
-    results = f", its results are in {files.output}" if files.output is not None else ""
-    message = (
-        f"the run in {request.resume} is complete, all {pipeline.frames} frames were tracked{results}; "
-        "to track the source again, start a new run in another folder (--state DIR)"
-    )
-    if request.boxes:
-        raise click.UsageError(f"{message}: no frame is left for a box")
     if not files.complete:
         with files.opened(resume=True):  # creates new files, and those that are made at the end
             pass
-    return message
+    results = f", its results are in {files.output}" if files.output is not None else ""
+    return (
+        f"the run in {request.resume} is complete, all {pipeline.frames} frames were tracked{results}; "
+        "to track the source again, start a new run in another folder (--state DIR)"
+    )
 
 
 class _Run:
