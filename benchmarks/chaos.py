@@ -287,7 +287,7 @@ def undisturbed(source: str, boxes: dict[str, Box], changes: list[Change] = []) 
                 tracker.forget(name)
             if tracks:
                 begun = {name: box for name, box in now.items() if box is not None}
-                tracker.update(frame.image, frame.time, begin=begun or None)
+                tracker.update(frame.image, time=frame.time, begin=begun or None)
             else:
                 tracker.init(frame.image, boxes, frame.time)
             tracks.append(tracker.tracks)

@@ -165,8 +165,8 @@ class MultiTracker:
     def update(
         self,
         frame: np.ndarray,
-        time: float = 0.0,
         *,
+        time: float = 0.0,
         begin: Boxes | None = None,
         search: Mapping[str, Learned] | None = None,
     ) -> dict[str, Track]:
@@ -174,6 +174,8 @@ class MultiTracker:
 
         Parameters
         ----------
+        time : float
+            Seconds since the start of the video.
         begin : mapping of str to boxes
             The boxes of objects that begin in this frame. An object of the same name is forgotten. If one box is
             refused, no object begins, and the frame counts as not seen.

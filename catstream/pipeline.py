@@ -12,19 +12,22 @@ import os
 import time
 import warnings
 from collections.abc import AsyncIterator, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from types import TracebackType
 from typing import Self
 
-from catstream.errors import RecordingError, ServiceError, SettingsError, require_extra
+from catstream.errors import ProtocolError, RecordingError, ServiceError, SettingsError, require_extra
 from catstream.messages.kinds import Health, Position, Track
 from catstream.messages.names import Boxes, check_boxes
+from catstream.messages.storage import why_not_writable
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
 from catstream.run.state import begun, position, saved
+from catstream.services.desired import DESIRED, DesiredState
 from catstream.services.run_reader import RunReader
 from catstream.services.start_server import start_server
 from catstream.settings import Settings
@@ -95,6 +98,8 @@ class Pipeline:
         Width and height of a frame.
     live : bool
         Whether the source is a camera or a stream.
+    saved_models : list of Path
+        At the end: the files of `save_model` that were written.
 
     Raises
     ------
@@ -108,7 +113,8 @@ class Pipeline:
     SettingsError
         From the constructor, if the settings do not suit the source: a live one in lockstep.
     ServiceError, ProtocolError
-        From the constructor, if the model cannot be read, or the folder to resume contains no run or a damaged one.
+        From the constructor, if the model cannot be read, a file of `save_model` cannot be written, or the folder to
+        resume contains no run or a damaged one.
     ServiceError
         At the start, if the endpoint or the state folder is in use, or if the pipeline has run already. While
         iterating, if a process fails repeatedly.
@@ -133,17 +139,26 @@ class Pipeline:
     ) -> None:
         if state is not None and resume is not None:
             raise SettingsError("state starts a new run, and resume continues one: give one of them")
+        if resume is not None and not (box is None and model is None):
+            raise SettingsError(
+                "a resumed run continues with the objects that it had: give neither a box nor a model, and add others "
+                "with catstream set-box or catstream search once it runs"
+            )
         start_server()  # it imports while this process opens the source
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
         job = self._resumed_job or Job(started=time.time())
         job = replace(
-            job if box is None and model is None else job.with_objects(box, model),
+            job if resume is not None else job.with_objects(box, model),
             source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
             results=job.results if results is None else results.after(job.results),
         )
+        saved_models = files_by_name(save_model)
+        for file in saved_models.values():
+            if reason := why_not_writable(file):
+                raise ServiceError(reason)
         self._record = Path(record) if record is not None else None
         _check(job, self._record, is_new=self._resumed_job is None)
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
@@ -157,7 +172,8 @@ class Pipeline:
         check_files(job.models, self._job.settings)
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
-        self._save_models = job.results.models if save_model is None else files_by_name(save_model)
+        self._save_models = job.results.models if save_model is None else saved_models
+        self.saved_models: list[Path] = []
         self._after = after
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
@@ -207,7 +223,7 @@ class Pipeline:
                 stack.enter_context(begun(self._state, self._resumed_job, self._job))
             job = self._started(str(endpoint))
             reader = stack.enter_context(RunReader(job, endpoint, self._start, folder, live=self.live))
-            stack.enter_context(saved(self._save_models, self._state or folder, settings))
+            self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
             stack.callback(reader.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._reader, self._stack = str(endpoint), reader, stack.pop_all()
         return self
@@ -224,20 +240,24 @@ class Pipeline:
             since=time.monotonic() - max(0.0, time.time() - self._job.started),
         )
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        stack, self._stack = self._stack, _CLOSED
+        if stack is not None and stack is not _CLOSED:
+            stack.__exit__(kind, error, trace)
 
     async def __aenter__(self) -> Self:
         return self.__enter__()  # it does not block; the processes end with this thread
 
-    async def __aexit__(self, *_: object) -> None:
-        await asyncio.shield(asyncio.to_thread(self.close))
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await asyncio.shield(asyncio.to_thread(self.__exit__, kind, error, trace))
 
     def close(self) -> None:
         """Stop the processes in order, after they have stored everything. The pipeline cannot be started again."""
-        stack, self._stack = self._stack, _CLOSED
-        if stack is not None and stack is not _CLOSED:
-            stack.close()
+        self.__exit__(None, None, None)
 
     def __del__(self) -> None:
         if getattr(self, "_stack", None) not in (None, _CLOSED):
@@ -355,11 +375,6 @@ class Pipeline:
         return self.health.get("detector", {}).get("lost_seconds", 0.0)
 
     @property
-    def waits(self) -> bool:
-        """Whether a new run waits for a box, because it has neither box nor model; false for a resumed run."""
-        return not self._job.boxes and not self._job.models and self._resumed_job is None
-
-    @property
     def complete(self) -> bool:
         """Whether the run to resume has already tracked all frames; valid before the start."""
         return self._resumed_job is not None and self.frames is not None and self._start.seq >= self.frames
@@ -367,8 +382,18 @@ class Pipeline:
     @property
     def holding(self) -> str:
         """Reason for which no frames are tracked: "paused", or "waiting" for a box; empty if they are tracked."""
-        counters = self.health.get("detector", {})
+        counters = self.health.get("detector") or self._held_at_start
         return next((name for name in ("waiting", "paused") if counters.get(name)), "")
+
+    @cached_property
+    def _held_at_start(self) -> dict[str, bool]:
+        """The reasons for which the run starts without tracking; those of a resumed run are in its folder."""
+        waiting, paused = not self._job.boxes and not self._job.models, False
+        if self._resumed_job is not None and self._state is not None:
+            with suppress(ProtocolError):  # the detector reports it, and starts with the objects of the job
+                desired = DesiredState.load(self._state / DESIRED)
+                waiting, paused = not desired.objects, desired.paused
+        return {"waiting": waiting, "paused": paused}
 
     @property
     def _reports(self) -> dict[str, Health]:

@@ -104,7 +104,7 @@ class Tracker:
         FrameError
             For an array that is not a frame, or is of another size than those before.
         """
-        track = self._objects.update(frame, time)[UNNAMED]
+        track = self._objects.update(frame, time=time)[UNNAMED]
         return track.box is not None, track.box
 
     def learned(self) -> Learned:

@@ -12,7 +12,10 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import storage
 
-__all__ = ["DesiredObject", "DesiredState", "PastObject"]
+__all__ = ["DESIRED", "DesiredObject", "DesiredState", "PastObject"]
+
+#: Name of the file, in the folder of the state.
+DESIRED = "desired_state.json"
 
 _PAST = 256  # far more than there are in the frames that a restarted detector repeats
 

@@ -33,7 +33,7 @@ from catstream.services import actions, core
 from catstream.services.actions import Action
 from catstream.services.core import Event, History
 from catstream.services.core_state import Known, Phase, Progress, Request, Rules, State
-from catstream.services.desired import DesiredObject, DesiredState
+from catstream.services.desired import DESIRED, DesiredObject, DesiredState
 from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
@@ -48,7 +48,6 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["main", "opening_seconds", "prepare"]
 
-_FILE = "desired_state.json"  # in the folder of the state
 _EVENTS_FILE = "detector_events.ndjson"  # the same, after a crash
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
@@ -130,7 +129,7 @@ class DetectorLoop:
         self._tracks = Tracks(0, 0, {})  # the last ones
         self._features = Features(0, 0, 0.0, {})
         self._positions: dict[str, Position] = {}  # the answers of the receivers, by channel
-        self._arrived: dict[str, Model] = {}  # before the positions agree
+        self._arrived: dict[str, Model] = {}  # of the objects that have no detector yet
         self._do: dict[type[Action], Callable[[Any], Event | None]] = {
             actions.Continue: self._continue,
             actions.Resume: self._resume,
@@ -276,6 +275,8 @@ class DetectorLoop:
                 self._detectors.adopt(model)
                 known = _known(self._detectors.detectors[model.object])
                 self.tell(core.ModelArrived(model.object, model.version, known))
+            else:  # the object may begin again: the compressor of a resumed run can be ahead of the tracks
+                self._arrived[model.object] = model
 
     def _progressed(self) -> Event | None:
         """The progress of the receivers, if the core waits for it and it is another one than before."""
@@ -305,7 +306,6 @@ class DetectorLoop:
         self._detectors.seq = order.seq
         for sender, position in zip(self._outputs.senders.values(), order.positions, strict=True):
             sender.window.resume(order.seq, position)
-        self._arrived.clear()
         return core.Resumed(self._known())
 
     def _set_box(self, order: actions.SetBox) -> Event:
@@ -343,6 +343,8 @@ class DetectorLoop:
 
     def _step(self, _: actions.Step) -> Event:
         tracks, features = self._detectors.step(self._pyramid, self._frame.time, self._given)
+        for name in self._arrived.keys() & tracks.tracks.keys():
+            self._detectors.adopt(self._arrived.pop(name))
         models = {
             name: replace(features.objects[name], model=learned.to_bytes()) for name, learned in self._begun.items()
         }
@@ -375,12 +377,12 @@ class DetectorLoop:
         if state is not None and desired != self._kept:
             try:
                 self._models_of_job.store()  # before the state that names them
-                desired.save(state / _FILE)
+                desired.save(state / DESIRED)
                 self._kept = desired
                 self._models_of_job.keep_only(set(order.models))
             except OSError as error:
-                _log.warning("the desired state cannot be written to %s (%s)", state / _FILE, error.strerror)
-                lost = f"; a resumed run will not know it, as {state / _FILE} cannot be written ({error.strerror})"
+                _log.warning("the desired state cannot be written to %s (%s)", state / DESIRED, error.strerror)
+                lost = f"; a resumed run will not know it, as {state / DESIRED} cannot be written ({error.strerror})"
         for answer in order.answers:
             self._control.answer(replace(answer, reason=answer.reason + lost) if answer.done else answer)
 
@@ -457,9 +459,9 @@ def opening_seconds(part: slice, first: int) -> tuple[float, float]:
 def _desired(process: Process, models: ModelFiles) -> DesiredState:
     """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
     job = process.job
-    if job.resume and job.state is not None and (job.state / _FILE).exists():
+    if job.resume and job.state is not None and (job.state / DESIRED).exists():
         try:
-            return DesiredState.load(job.state / _FILE)
+            return DesiredState.load(job.state / DESIRED)
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)

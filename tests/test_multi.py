@@ -143,6 +143,8 @@ def test_if_one_box_of_several_is_refused_nothing_changes(frames, begin, error):
     tracker, other = started(frames, settings={"run.objects_most": 4}), started(frames)
     with pytest.raises(error):
         tracker.update(frames[1], begin=begin)
+    with pytest.raises(TypeError):
+        tracker.update(frames[1], begin)  # it would be taken for the time
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 

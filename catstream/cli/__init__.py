@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 from importlib import import_module
 
@@ -86,4 +88,11 @@ def main() -> None:
         group(prog_name="catstream")
     except CatstreamError as error:
         complain(error)
+        sys.exit(1)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        # The interpreter flushes standard output again when it exits: that must not fail a second time.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        complain(f"cannot write any more: {error.strerror}")
         sys.exit(1)

@@ -14,8 +14,13 @@ from catstream.services.options import PATH
 __all__ = ["check_file", "with_json_file", "write_json"]
 
 
-def check_file(file: Path, *, overwrite: bool) -> None:
+def check_file(file: Path, *, overwrite: bool, made: Path | None = None) -> None:
     """Check before the work that a file can be written.
+
+    Parameters
+    ----------
+    overwrite : whether it may exist
+    made : a folder that is made before the file, if it does not exist
 
     Raises
     ------
@@ -24,7 +29,7 @@ def check_file(file: Path, *, overwrite: bool) -> None:
     """
     if file.exists() and not overwrite:
         raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
-    if reason := why_not_writable(file):
+    if reason := why_not_writable(file, made):
         raise ServiceError(reason)
 
 

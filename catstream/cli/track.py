@@ -173,8 +173,8 @@ def track(**options: Any) -> None:
     are kept.
 
     With --state, a checkpoint is written once a second. After a power failure,
-    a crash or Ctrl-C, --resume continues the run, with the same source, box,
-    settings and results unless they are given again.
+    a crash or Ctrl-C, --resume continues the run with the objects that it had,
+    and with the same source, settings and results unless they are given again.
 
     \b
     Writes
@@ -264,7 +264,7 @@ def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None
         known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
     )
     for file in request.saved.values():
-        check_file(file, overwrite=request.overwrite)
+        check_file(file, overwrite=request.overwrite, made=files.output)
         if [*request.saved.values()].count(file) > 1:
             raise ServiceError(f"{file} is named twice: give each object its own file")
 
@@ -279,17 +279,14 @@ def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
 
 def _completed(request: _Request, pipeline: Pipeline, files: RunFiles) -> str:
     """Complete the files of a run to resume whose frames were all tracked; return the message about it."""
-    results = f", its results are in {files.output}" if files.output is not None else ""
-    message = (
-        f"the run in {request.resume} is complete, all {pipeline.frames} frames were tracked{results}; "
-        "to track the source again, start a new run in another folder (--state DIR)"
-    )
-    if request.boxes:
-        raise click.UsageError(f"{message}: no frame is left for a box")
     if not files.complete:
         with files.opened(resume=True):  # creates new files, and those that are made at the end
             pass
-    return message
+    results = f", its results are in {files.output}" if files.output is not None else ""
+    return (
+        f"the run in {request.resume} is complete, all {pipeline.frames} frames were tracked{results}; "
+        "to track the source again, start a new run in another folder (--state DIR)"
+    )
 
 
 class _Run:
@@ -310,7 +307,7 @@ class _Run:
         request, folder = self._request, self._request.folder
         if request.resume is not None and not self._progress.frames and not interrupted:
             self._console.print(f"no frames were left to track: the run in {request.resume} is complete")
-        for file in self._pipeline.results.models.values():
+        for file in self._pipeline.saved_models:
             self._console.print(f"saved model: {file}")
         if interrupted:
             hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
@@ -324,10 +321,14 @@ class _Run:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
         try:
             with self._pipeline, ExitStack() as stack:
+                self._files.make_folder()
                 if self._request.view is not None:
                     self._serve(self._request.view, stack)
-                if self._pipeline.waits:
+                if self._pipeline.holding == "waiting":
                     self._console.print(f"waiting for a box: {self._ways_to_set_box()}")
+                elif self._pipeline.holding:
+                    place = f"--endpoint {self._pipeline.endpoint}"
+                    self._console.print(f"paused, as it was before: to continue, catstream resume {place}")
                 self._write_tracks()
         except KeyboardInterrupt:
             return True

@@ -30,6 +30,7 @@ __all__ = [
     "is_writable",
     "lock",
     "name_fits",
+    "nearest",
     "read",
     "read_metadata",
     "remove_parts",
@@ -148,13 +149,27 @@ def is_writable(folder: Path) -> bool:
 
 
 def name_fits(path: Path) -> bool:
-    """Return whether the file system takes a name of this length in the folder of a file, which has to exist."""
-    return len(os.fsencode(path.name)) + _MOST_BYTES_BESIDE <= os.pathconf(path.parent, "PC_NAME_MAX")
+    """Return whether the file system takes a name of this length in the folder of a file, which need not exist yet."""
+    return len(os.fsencode(path.name)) + _MOST_BYTES_BESIDE <= os.pathconf(nearest(path.parent), "PC_NAME_MAX")
 
 
-def why_not_writable(path: Path) -> str:
-    """Return why a file cannot be made or replaced, and what to do; empty if it can."""
-    if path.is_dir() or not is_writable(path.parent):
+def nearest(folder: Path) -> Path:
+    """Return a folder, or if it does not exist the nearest one above it that does."""
+    folder = folder.absolute()
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+def why_not_writable(path: Path, made: Path | None = None) -> str:
+    """Return why a file cannot be made or replaced, and what to do; empty if it can.
+
+    Parameters
+    ----------
+    made : a folder that is made before the file, if it does not exist
+    """
+    folder = path.parent.absolute()
+    if made is not None and folder == made.absolute():
+        folder = nearest(folder)
+    if path.is_dir() or not is_writable(folder):
         return f"cannot write {path}: give a file in a folder that exists and that you may write to"
     if not name_fits(path):
         return f"cannot write {path}: its name is too long for the folder, give a shorter one"

@@ -157,7 +157,7 @@ class Job:
 
     def check_fits(self, other: Job, folder: Path) -> None:
         """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
-        if other.size != self.size or other.part != self.part:
+        if other._frames() != self._frames():
             raise SettingsError(
                 f"the run in {str(folder)!r} has {self._frames()}, and this one has {other._frames()}: "
                 "continue with the same frames, or start a new run in another folder"

@@ -168,27 +168,34 @@ def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[None]:
-    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving."""
+def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[list[Path]]:
+    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving.
+
+    Yields
+    ------
+    the list of the files that were saved, filled afterwards
+    """
+    done: list[Path] = []
     try:
-        yield
+        yield done
     except BaseException:
-        for error in _save(files, state, settings):
+        for error in _save(files, state, settings, done):
             _log.warning("%s", error)
         raise
-    errors = _save(files, state, settings)
+    errors = _save(files, state, settings, done)
     for error in errors[1:]:
         _log.warning("%s", error)
     if errors:
         raise errors[0]
 
 
-def _save(files: Mapping[str, Path], state: Path, settings: Settings) -> list[CatstreamError]:
-    """Save what was learned of each object to its file; returns the errors of those that could not be saved."""
+def _save(files: Mapping[str, Path], state: Path, settings: Settings, done: list[Path]) -> list[CatstreamError]:
+    """Save what was learned of each object to its file, and add it to `done`; returns the errors of the others."""
     errors: list[CatstreamError] = []
     for name, file in files.items():
         try:
             learned(state, settings, name).save(file)
+            done.append(file)
         except CatstreamError as error:
             errors.append(error)
     return errors

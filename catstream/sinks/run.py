@@ -12,7 +12,7 @@ from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import ObjectPosition, Position, Track
 from catstream.messages.names import UNNAMED
-from catstream.messages.storage import is_writable, name_fits
+from catstream.messages.storage import is_writable, name_fits, nearest, writing
 from catstream.sinks import results
 from catstream.sinks.formats import CsvSink, StdoutSink
 from catstream.sinks.frames import FIRST, in_order, objects_of, whole_frames
@@ -61,14 +61,12 @@ class RunFiles:
         known : files, and a folder of results, that an earlier part of this run has written
         """
         if self.output is not None:
-            folder = self.output.absolute()
-            nearest = next(path for path in (folder, *folder.parents) if path.exists())
-            if not is_writable(nearest):
+            if not is_writable(nearest(self.output)):
                 raise VideoError(
                     f"cannot write results to {str(self.output)!r}: give a folder that exists or can be made, "
                     "and that you may write to"
                 )
-            if long := [file.name for file in self._results() if not name_fits(nearest / file.name)]:
+            if long := [file.name for file in self._results() if not name_fits(file)]:
                 raise VideoError(
                     f"the names of results of {self.name!r} would be too long for a file ({long[0]!r}): "
                     "give the source or the object a shorter name, or write to one file (--write FILE)"
@@ -82,7 +80,7 @@ class RunFiles:
         if twice := [file for count, file in enumerate(self.files) if file in self.files[:count]]:
             raise VideoError(f"{twice[0]} is named twice: give each file once")
         for file in with_logs(self.files):
-            check_writable(file, may_exist=True)
+            check_writable(file, may_exist=True, made=self.output)
             if exists(file) and not overwrite and file not in with_logs(known):
                 raise VideoError(f"{file} exists already: replace it with --overwrite, or give another name")
         files = [file for file in self.files if file != STDOUT]
@@ -92,10 +90,18 @@ class RunFiles:
                 "--write tracks.ndjson or --output FOLDER"
             )
 
+    def make_folder(self) -> None:
+        """Make the folder of the results, in which other files of the run may be, too."""
+        if self.output is not None:
+            with writing(self.output, VideoError):
+                self.output.mkdir(parents=True, exist_ok=True)
+
     @property
     def complete(self) -> bool:
         """Whether all files exist and are complete."""
         files = [file for file in self.files if file != STDOUT]
+        if self.output is not None:
+            files += [self.output / file for file in results.result_files(self.name, self.names())]
         return all(file.exists() for file in [*files, *([self._video_file()] if self.video else [])])
 
     def position(self) -> Position | None:

@@ -48,12 +48,13 @@ class Sink(Protocol):
         """Complete the file; raise VideoError if it cannot be written. The tracks written before remain."""
 
 
-def check_writable(path: Path, *, may_exist: bool = False) -> None:
+def check_writable(path: Path, *, may_exist: bool = False, made: Path | None = None) -> None:
     """Raise VideoError if a file cannot be written, or if it exists and may not.
 
     Parameters
     ----------
     may_exist : whether the file may exist already
+    made : a folder that is made before the file, if it does not exist
     """
     if path == STDOUT:
         return
@@ -63,7 +64,7 @@ def check_writable(path: Path, *, may_exist: bool = False) -> None:
         raise VideoError(f"{path} exists already: give another name, or remove it")
     if path.suffix == ".parquet":
         require_extra("parquet")
-    if reason := why_not_writable(path):
+    if reason := why_not_writable(path, made):
         raise VideoError(reason)
 
 

@@ -110,11 +110,10 @@ class _FileSource(Source):
         self._stream, self._total, self._part, self._damage = stream, total, part, damage
         self._first: Frame | None = next(stream, None)
         if self._first is None:
-            numbers = range(sys.maxsize)[part][start:]
-            end = "" if part.stop is None else f" and before frame {numbers.stop}"
+            number = range(sys.maxsize)[part][start:].start
             raise VideoError(
-                f"{name} has {total() or 'no'} frames, numbered from 0, and none from frame {numbers.start} on"
-                f"{end}: give an earlier first frame, or another source"
+                f"{name} has {total() or 'no'} frames, numbered from 0, and none from frame {number} on: "
+                "give an earlier first frame, or another source"
             )
         height, width = self._first.image.shape[:2]
         super().__init__(name, rate / (part.step or 1), (width, height))
@@ -184,6 +183,8 @@ def open_source(
     """
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
+    if part.stop is not None and part.stop <= (part.start or 0):
+        raise VideoError(f"no frame is from {part.start or 0} on and before {part.stop}: give an end after the start")
     if is_live(text):
         if part != ALL_FRAMES:
             raise VideoError("a live source gives only its newest frame: leave out start, end and stride")
@@ -441,6 +442,9 @@ def _good_frames(container: InputContainer, stream: VideoStream, rate: float, da
             damage.report(problem, count)
             since_damage = waits_for_key = True
             stream.codec_context.flush_buffers()
+    if since_damage and last is not None:  # the rest of the file, by its stated duration
+        rest = _stated_duration(container, stream) - float((last - (stream.start_time or 0)) * time_base(stream))
+        damage.frames += max(0, round(rest * rate) - 1)
 
 
 def _packets(

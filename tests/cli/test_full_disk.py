@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 #: Bytes of a disk for some of the messages of a short video, and of one for its rows but not for all.
@@ -57,3 +59,11 @@ def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on
     assert "No space left on device" in errors
     assert len((tmp_path / "demo.txt").read_text().splitlines()) == 32
     assert code == 0
+
+
+@pytest.mark.parametrize("words", [["settings"], ["settings", "--json"], ["track", "--help"]], ids=" ".join)
+def test_output_for_which_the_disk_has_no_room_is_one_line_of_error(catstream, words):
+    with Path("/dev/full").open("w") as full:
+        process = catstream(*words, stdout=full)
+        assert process.communicate(timeout=60)[1] == "catstream: cannot write any more: No space left on device\n"
+    assert process.returncode == 1

@@ -16,6 +16,7 @@ import pytest
 from pyarrow import parquet
 
 from catstream.errors import VideoError
+from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
 from catstream.video.source import open_source
 
@@ -255,6 +256,15 @@ def readable(path):
     with open_source(path) as source, pytest.raises(VideoError, match="is damaged at frame"):
         frames.extend(frame.number for frame in source)
     return len(frames)
+
+
+def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video, said, monkeypatch, tmp_path):
+    monkeypatch.setattr(Pipeline, "by_frame", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--save-model", tmp_path / "model")
+    assert (code, list(tmp_path.iterdir())) == (130, [])
+    assert "saved model:" not in errors
+    assert "nothing was learned" in errors
 
 
 def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_after_it(

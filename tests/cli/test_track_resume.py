@@ -117,6 +117,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "frames 3 to the last": ["track", "--resume", kept, "--start", "3"],
         "contains no run": ["track", "--resume", tmp_path / "none"],
         "give one of them": ["track", "--resume", kept, "--state", kept],
+        "with the objects that it had": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
         "needs SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
     }
     for word, command in refusals.items():
@@ -160,10 +161,10 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
 ):
     (source, box), out = video, tmp_path / "out"
     objects = ["--box", f"flower={box}", "--box", "lake=10,20,60,40"]
-    files = ["--output", out, "--write", tmp_path / "t.txt", "--save-model", f"lake={tmp_path / 'lake'}"]
+    files = ["--output", out, "--write", out / "t.txt", "--save-model", f"lake={out / 'lake'}"]
     _, errors = succeed("track", source, *objects, *files, "--end", 16, "--state", tmp_path / "kept", *OFTEN)
     assert "1 flower: present in" in errors
-    assert Learned.load(tmp_path / "lake").object == "lake"
+    assert Learned.load(out / "lake").object == "lake"
     table = out / "demo.csv"
     table.write_bytes(table.read_bytes()[:-9])  # the last row, that of the lake, is torn
     succeed("track", "--resume", tmp_path / "kept")
@@ -171,18 +172,25 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
     assert rows == [(frame, name) for frame in range(16) for name in ("flower", "lake")]
     for name in ("flower", "lake"):
         assert len((out / f"demo-{name}.txt").read_text().splitlines()) == 16
-    ids = {tuple(line.split(",")[:2]) for line in (tmp_path / "t.txt").read_text().splitlines()}
+    ids = {tuple(line.split(",")[:2]) for line in (out / "t.txt").read_text().splitlines()}
     assert ids == {(str(frame + 1), number) for frame in range(16) for number in ("1", "2")}
 
 
-def test_a_complete_run_is_not_resumed_and_that_is_reported(video, succeed, fail, tmp_path):
+def test_a_complete_run_is_not_resumed_and_that_is_reported(video, succeed, tmp_path):
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
     succeed("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
     before = (out / "demo.csv").read_bytes()
     output, errors = succeed("track", "--resume", kept)
     assert not output
     assert f"the run in {kept} is complete, all 6 frames were tracked, its results are in {out}" in errors
-    error = fail("track", "--resume", kept, "--box", "1,2,30,40")
-    assert "is complete" in error
-    assert "no frame is left for a box" in error
+    (out / "demo.txt").unlink()
+    succeed("track", "--resume", kept, "--start", 0, "--end", 6)  # the same frames
     assert (out / "demo.csv").read_bytes() == before
+    assert len((out / "demo.txt").read_text().splitlines()) == 6
+
+
+@pytest.mark.timeout(60)
+def test_new_results_of_a_run_to_resume_have_all_frames_although_the_models_are_of_later_ones(killed, succeed):
+    succeed("track", "--resume", killed / "kept")
+    succeed("track", "--resume", killed / "kept", "--output", killed / "new")
+    assert frames(killed / "new") == [*range(32)]

@@ -35,7 +35,7 @@ def expected(video, objects):
     with open_source(video[0]) as source:
         for frame, _ in zip(source, range(FRAMES), strict=False):
             if tracks:
-                tracker.update(frame.image, frame.time)
+                tracker.update(frame.image, time=frame.time)
             else:
                 tracker.init(frame.image, objects, frame.time)
             tracks.append(tracker.tracks)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
 from catstream.run.state import files, position, restore, skip
+from catstream.services.desired import DESIRED, DesiredState
 from catstream.settings import Settings
 
 
@@ -48,3 +51,17 @@ def test_a_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
     with pytest.raises(ServiceError, match="not a file of the state"):
         restore(tmp_path, {name: b""})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_was_paused_or_has_no_object_left_says_so_when_it_is_resumed(state):
+    assert Pipeline(resume=state).holding == ""
+    desired = DesiredState.load(state / DESIRED)
+    replace(desired, paused=True).save(state / DESIRED)
+    assert Pipeline(resume=state).holding == "paused"
+    replace(desired, objects={}).save(state / DESIRED)
+    assert Pipeline(resume=state).holding == "waiting"
+
+
+def test_a_model_that_could_not_be_saved_is_an_error_before_the_run(video, tmp_path):
+    with pytest.raises(ServiceError, match="none/anna: give a file in a folder that exists"):
+        Pipeline(video[0], video[1][0], save_model=tmp_path / "none" / "anna")

@@ -311,7 +311,9 @@ def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoev
     with open_source(path) as source:
         for frame in source:
             if expected:
-                tracker.update(frame.image, frame.time, search={"anna": learned} if frame.number in began else None)
+                tracker.update(
+                    frame.image, time=frame.time, search={"anna": learned} if frame.number in began else None
+                )
             else:
                 tracker.init(frame.image, {"ben": PATCH}, frame.time)
             expected += tracker.tracks.values()
