@@ -275,7 +275,7 @@ class DetectorLoop:
                 self._detectors.adopt(model)
                 known = _known(self._detectors.detectors[model.object])
                 self.tell(core.ModelArrived(model.object, model.version, known))
-            else:  # the object may begin again: the compressor of a resumed run can be ahead of the tracks
+            elif self.state.seq < self.state.repeats:  # the object may begin again: its trees are ahead of the tracks
                 self._arrived[model.object] = model
 
     def _progressed(self) -> Event | None:

@@ -29,7 +29,6 @@ LEVELS = [
     {"pipeline"},
     {"applications", "fleet"},
     {"cli"},
-    {"__main__"},
 ]
 
 #: The files or folders that may import a foreign library.

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import builtins
 import signal
 
 import pytest
 
-from catstream.__main__ import main
 from catstream.cli.interrupts import Interrupts
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -53,14 +51,3 @@ def test_ignored_signals_stay_ignored(interrupts):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     interrupts.install()
     signal.raise_signal(signal.SIGHUP)
-
-
-def test_ctrl_c_during_the_imports_of_the_command_line_is_no_traceback(monkeypatch, capfd):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(builtins, "__import__", interrupted)
-        with pytest.raises(SystemExit) as end:
-            main()
-    assert (end.value.code, capfd.readouterr().err) == (130, "stopped\n")
