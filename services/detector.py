@@ -41,7 +41,7 @@ from catstream.services.timing import MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS,
 from catstream.video import source
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
-from catstream.video.source import open_source
+from catstream.video.source import is_live, open_source
 from catstream.wire.channels import CONTROL, MODELS
 from catstream.wire.commands import Responder
 from catstream.wire.newest import Subscriber
@@ -192,9 +192,9 @@ class DetectorLoop:
         self._process.beat(self._counters, self._object_counters, now=bool(commands))
 
     def open(self, stack: ExitStack) -> Iterator[Frame]:
-        """Open the source at the frame before the next one, which always exists."""
+        """Open the source at the next frame; a file at the one before, which always exists."""
         job, settings = self._process.job, self._process.settings
-        first = max(self.state.seq - 1, 0)
+        first = self.state.seq if is_live(job.source) else max(self.state.seq - 1, 0)
         once, each = opening_seconds(job.part, first)
         self._process.watchdog.allow(once)
         self._process.watchdog.allow_each(each)

@@ -14,6 +14,7 @@ from catstream.pipeline import Pipeline
 from catstream.services import run_reader
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
+from catstream.video.live_demo import first_box
 
 SETTINGS = Settings(run={"unstored_frames": 4})
 PART = slice(0, 20)
@@ -83,6 +84,16 @@ def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
 def test_the_first_frame_is_set_before_the_start(pipeline):
     with pipeline, pytest.raises(ServiceError, match="before that"):
         pipeline.starting_after(None)
+
+
+@pytest.mark.timeout(60)
+def test_a_run_of_a_live_source_is_resumed_with_its_first_frame(tmp_path):
+    """The second frame would come after 100 s."""
+    source = "demo:1?rate=0.01"
+    with Pipeline(source, first_box(source), state=tmp_path / "kept") as pipeline:
+        before = next(iter(pipeline))
+    with Pipeline(resume=tmp_path / "kept") as pipeline:
+        assert next(iter(pipeline)).frame == before.frame + 1
 
 
 def test_a_pipeline_that_is_never_closed_causes_a_warning_and_ends(video, alive):
