@@ -24,7 +24,7 @@ from catstream.errors import CatstreamError, FleetError
 from catstream.fleet import life
 from catstream.fleet.cluster import NAMESPACE, actor_name, actors, is_local, nodes
 from catstream.fleet.desired import Desired, objection
-from catstream.fleet.life import NODE_ID, Node, Order, Seen, Step, Wanted
+from catstream.fleet.life import Node, Order, Seen, Step, Wanted
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.fleet.stream import Place, Report, Stream, given_model
@@ -41,7 +41,7 @@ from catstream.services.start_server import share_start_server, start_server
 from catstream.video.frames import without_password
 from catstream.wire.keys import Client, allowed, ensure
 
-__all__ = ["Controller"]
+__all__ = ["Controller", "warm"]
 
 #: Contents of saved models, by stream and object.
 Models = dict[tuple[str, str], bytes]
@@ -114,7 +114,6 @@ class Controller:
         self._changing = threading.Lock()  # held by a change while it is stored
         self._lock = threading.RLock()  # of what follows, held for moments only
         self._nodes: list[Node] = []
-        self._warmed: set[str] = set()  # ids of the nodes that have a start server
         self._streams: dict[str, _Known] = {}
         self._clients: dict[str, Client] | None = None if self._keys is None else {}
         self._clients_due = 0.0
@@ -263,7 +262,6 @@ class Controller:
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
-            self._warm_nodes()
             for name in existing | self._desired.spec.streams.keys():
                 self._streams.setdefault(name, _Known(Seen("absent")))
             for name, known in self._streams.items():
@@ -282,18 +280,6 @@ class Controller:
             for name in set(gone) - self._desired.spec.streams.keys():
                 del self._streams[name]
             self._recent = self.status()
-
-    def _warm_nodes(self) -> None:
-        """Start the start server of each new node, before there is a stream for it.
-
-        Its variables give the task a worker of its own, so that it leaves to the streams those that are idle.
-        """
-        import ray
-
-        for new in {node.id for node in self._nodes if node.alive} - self._warmed:
-            self._warmed.add(new)
-            own = ray.remote(num_cpus=0, max_calls=1, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})
-            own(warm).options(label_selector={NODE_ID: new}).remote()
 
     def _wanted(self) -> dict[str, Wanted]:
         """The streams that should run now."""

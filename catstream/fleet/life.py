@@ -14,7 +14,6 @@ from catstream.fleet.timing import ADOPTED_SECONDS, PAUSE_SECONDS, SILENT_SECOND
 
 __all__ = [
     "EVENTS",
-    "NODE_ID",
     "STATES",
     "TABLE",
     "Action",
@@ -75,7 +74,7 @@ TABLE: dict[tuple[State, Event], tuple[State, Action]] = {
 _SILENT: dict[State, float] = {"working": SILENT_SECONDS, "stopping": STOPPING_SECONDS}
 
 #: Label that Ray gives to each node: its id.
-NODE_ID = "ray.io/node-id"
+_NODE_ID = "ray.io/node-id"
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +122,7 @@ class Wanted:
         """What Ray is asked for."""
         target = self.target(nodes)
         leaving = ",".join(sorted(node.id for node in nodes if node.draining))
-        selector = dict(self.labels) | ({NODE_ID: f"!in({leaving})"} if leaving else {})
+        selector = dict(self.labels) | ({_NODE_ID: f"!in({leaving})"} if leaving else {})
         return Order(self.digest, self.cores, selector, target.id if target is not None else "")
 
     def fits(self, node: Node) -> bool:

@@ -93,9 +93,9 @@ class LocalCluster:
         health["RAY_health_check_failure_threshold"] = str(HEALTH_FAILURES)
         # A worker of Ray has a lower priority by default: other programs would starve the streams.
         workers = {"RAY_worker_niceness": "0", "RAY_OBJECT_STORE_ALLOW_SLOW_STORAGE": "1"}
-        # A node starts idle workers that have imported what a stream needs; Ray would start them for one program only.
+        # Each node has idle workers, which any stream can have: by default Ray starts them for the first program only.
         prestart = {"RAY_enable_worker_prestart": "1", "RAY_prestart_worker_first_driver": "0"}
-        prestart["RAY_preload_python_modules"] = "catstream.fleet.controller"
+        prestart["RAY_preload_python_modules"] = "catstream.fleet.prestarted"
         return token | loopback | quiet | health | workers | prestart
 
     def start(self, nodes: int, cores: int | None = None, *, detach: bool = True) -> None:

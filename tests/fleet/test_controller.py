@@ -70,7 +70,7 @@ class Ray(types.ModuleType):
     def __init__(self):
         super().__init__("ray")
         self.__spec__ = ModuleSpec("ray", None)
-        self.actors, self.started, self.warmed = {}, [], []
+        self.actors, self.started = {}, []
         self.has_restarted = False  # whether it has started the controller again
         self.util = types.ModuleType("ray.util")
         self.util.list_named_actors = lambda **_: [{"name": name, "namespace": "catstream"} for name in self.actors]
@@ -82,17 +82,10 @@ class Ray(types.ModuleType):
     def get_runtime_context(self):
         return types.SimpleNamespace(was_current_actor_reconstructed=self.has_restarted)
 
-    def remote(self, what=None, **own):
-        if what is None:  # a task with options of its own
-            assert own["max_calls"] == 1, "the worker of a task would stay, and no stream can have it"
-            return self.remote
-        start = self._warm if what is module.warm else self._start
+    def remote(self, _):
         return types.SimpleNamespace(
-            options=lambda **options: types.SimpleNamespace(remote=lambda *given: start(options, *given))
+            options=lambda **options: types.SimpleNamespace(remote=lambda *given: self._start(options, *given))
         )
-
-    def _warm(self, options):
-        self.warmed.append(options["label_selector"]["ray.io/node-id"])
 
     def _start(self, options, spec, order, *_):
         if options["name"] in self.actors:
@@ -208,13 +201,6 @@ def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec,
                 assert sorted(registry.streams().streams) == ["gate", "roof"]
         finally:
             site.end()
-
-
-def test_each_node_gets_its_start_server_once_before_there_is_a_stream_for_it(site, ray):
-    ray.nodes[1:] = [replace(ray.nodes[1], alive=False), Node("n3", "3")]
-    for _ in range(2):
-        site._turn()
-    assert sorted(ray.warmed) == ["1", "2", "3"]
 
 
 @pytest.mark.parametrize(("parent", "shared"), [(4711, [4711]), (1, [])], ids=["alive", "dead"])

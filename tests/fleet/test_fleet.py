@@ -98,7 +98,7 @@ def test_a_stream_of_a_dead_node_continues_and_the_node_comes_back(home, site, u
     fleet, spec = site
     fleet.move("gate", "node-2")
     until(lambda: (found := fleet.status().streams["gate"]).node == "node-2" and found.state == "running")
-    until(lambda: Store(spec.store).newest("gate").facts["seq"] > 5)
+    until(lambda: (state := Store(spec.store).newest("gate")) is not None and state.facts["seq"] > 5)
     before = fleet.status().streams["gate"]
     raylets(home / "site")["node-2"].kill()
     until(lambda: (found := fleet.status().streams["gate"]).token > before.token and found.state == "running")
@@ -126,6 +126,15 @@ def test_processes_of_the_nodes_have_the_priority_of_the_process_that_starts_the
     ray = import_module("ray")
     theirs = ray.get(ray.remote(num_cpus=0)(lambda: os.getpriority(os.PRIO_PROCESS, 0)).remote())
     assert theirs == os.getpriority(os.PRIO_PROCESS, 0)
+
+
+@pytest.mark.usefixtures("site")
+def test_each_node_has_a_start_server_before_there_is_a_stream_for_it(home, until):
+    def nodes_of_servers():
+        servers = [process for process in psutil.process_iter() if process.name() == "start server"]
+        return {int(process.environ().get("RAY_RAYLET_PID", 0)) for process in servers}
+
+    until(lambda: {process.pid for process in raylets(home / "site").values()} <= nodes_of_servers())
 
 
 def test_what_cannot_be_done_is_refused_and_nothing_is_changed(site, until):
