@@ -280,7 +280,7 @@ def move(running: Fleet, name: str, node: str) -> None:
 def drain(running: Fleet, node: str, undo: bool) -> None:
     """Move all streams from a NODE and place none there, before it is switched off.
 
-    Streams for which the other nodes have no room wait.
+    Streams wait if the other nodes have no room for them.
 
     \b
     EXAMPLE

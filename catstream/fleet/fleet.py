@@ -169,7 +169,7 @@ class Fleet:
     def drain(self, node: str, *, undo: bool = False) -> str:
         """Move all streams from a node and place none there, for example before it is switched off.
 
-        Streams for which the other nodes have no room wait.
+        Streams wait if the other nodes have no room for them.
         """
         self._node(node)
         count = sum(each.node == node for each in self.status().streams.values())
