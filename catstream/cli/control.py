@@ -35,6 +35,10 @@ class _Target:
     timeout: float
     yes: bool
 
+    def __post_init__(self) -> None:
+        if self.endpoint and self.source:
+            raise click.UsageError("--source selects the pipeline, as --endpoint and --stream do: give one of them")
+
     @property
     def is_named(self) -> bool:
         return bool(self.endpoint or self.source)
@@ -53,16 +57,10 @@ class _Target:
         return pipeline
 
 
-def _target(endpoint: str, source: str, keys: str, timeout: float, yes: bool) -> _Target:
-    if endpoint and source:
-        raise click.UsageError("--source selects the pipeline, as --endpoint and --stream do: give one of them")
-    return _Target(endpoint, source, keys, timeout, yes)
-
-
 #: Adds the options that select a pipeline, as one argument `target`.
 _with_pipeline = combined(
     "target",
-    _target,
+    _Target,
     with_endpoint,
     click.option(
         "--source", default="", metavar="SOURCE", help="The source that the pipeline tracks, instead of --endpoint."

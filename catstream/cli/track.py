@@ -75,22 +75,16 @@ class _Request:
 
     def check(self) -> None:
         """Raise UsageError if the options contradict each other."""
-        several = len(self.boxes) + len(self.models) > 1
-        _reject_if(
-            (self.state and self.resume, "--state starts a new run, and --resume continues one: give one of them"),
-            (
-                not self.resume and not self.source,
-                "a run needs SOURCE: a video, a folder of images, a camera or a stream",
-            ),
-            (
-                self.resume and self.overwrite,
-                "--resume continues the existing results, and --overwrite replaces them: give one of them",
-            ),
-            (
-                several and UNNAMED in self.saved,
-                "--save-model FILE is for a single object: for each of several, give NAME=FILE",
-            ),
-        )
+        if self.state and self.resume:
+            raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
+        if not self.resume and not self.source:
+            raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
+        if self.resume and self.overwrite:
+            raise click.UsageError(
+                "--resume continues the existing results, and --overwrite replaces them: give one of them"
+            )
+        if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
+            raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
 
     def pipeline(self) -> Pipeline:
         """The pipeline of the run, not started; a resumed run continues the results of its earlier part."""
@@ -241,22 +235,14 @@ def track(**options: Any) -> None:
     _Run(request, pipeline, files, console).execute()
 
 
-def _reject_if(*cases: tuple[object, str]) -> None:
-    """Raise UsageError with the message of the first case that holds."""
-    for holds, message in cases:
-        if holds:
-            raise click.UsageError(message)
-
-
 def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None:
     """Raise an error before the run if one of its files could not be written."""
-    _reject_if(
-        (files.video and files.output is None, "--video requires --output, the folder for the video"),
-        (
-            pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)),
-            "a video needs the frames once more, and a live source cannot repeat them: omit the video",
-        ),
-    )
+    if files.video and files.output is None:
+        raise click.UsageError("--video requires --output, the folder for the video")
+    if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
+        raise click.UsageError(
+            "a video needs the frames once more, and a live source cannot repeat them: omit the video"
+        )
     earlier = pipeline.earlier_results
     files.check_writable(
         overwrite=request.overwrite,
