@@ -27,21 +27,14 @@ __all__ = ["find"]
 _SHOWN = 12  # intervals that are printed
 
 
-class _Sizes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
-    name = "LOW,HIGH"
-
-    def convert(self, value: object, param: click.Parameter | None, context: click.Context | None) -> object:
-        if isinstance(value, tuple):
-            return value
-        try:
-            low, high = map(float, str(value).split(","))
-        except ValueError:
-            low, high = 0.0, 0.0
-        if not 0 < low <= high < 100:
-            self.fail(
-                f"{value!r} is not two positive numbers, the smaller one first: for example 0.5,2", param, context
-            )
-        return low, high
+def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, float]:
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not 0 < low <= high < 100:
+        raise click.BadParameter(f"{text!r} is not two positive numbers, the smaller one first: for example 0.5,2")
+    return low, high
 
 
 @click.command()
@@ -75,10 +68,11 @@ class _Sizes(click.ParamType):  # type: ignore[type-arg]  # generic since click 
 )
 @click.option(
     "--sizes",
-    type=_Sizes(),
-    default=(0.4, 2.5),
+    default="0.4,2.5",
+    show_default=True,
+    callback=_sizes,
     metavar="LOW,HIGH",
-    help="Smallest and largest size, as multiples of the learned size.  [default: 0.4,2.5]",
+    help="Smallest and largest size, as multiples of the learned size.",
 )
 @click.option("--fps", type=float, default=25.0, show_default=True, metavar="N", help="Images of a folder per second.")
 @with_skip_damaged
