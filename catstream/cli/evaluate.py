@@ -13,7 +13,7 @@ from rich.progress import Task
 from rich.table import Table
 
 from catstream.cli.files import with_json_file, write_json
-from catstream.cli.interrupts import interruptible, stopped
+from catstream.cli.interrupts import INTERRUPTS, stopped
 from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.errors import CatstreamError
 from catstream.services.options import PATH, with_settings
@@ -101,7 +101,7 @@ def evaluate(
       catstream evaluate sequences/walk --jitter 7 --set coreset.size=128
     """
     # Imported here so that --help and the other commands start faster.
-    with interruptible():
+    with INTERRUPTS.leaving():
         from catstream.applications.evaluation.attributes import attributes_of, read_attributes
         from catstream.applications.evaluation.datasets import find_sequences
         from catstream.applications.evaluation.onepass import evaluate as run_all

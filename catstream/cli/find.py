@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import Task
 
-from catstream.cli.interrupts import INTERRUPTS, interruptible, stopped
+from catstream.cli.interrupts import INTERRUPTS, stopped
 from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.errors import CatstreamError, VideoError
 from catstream.messages.names import counted
@@ -122,7 +122,7 @@ def find(
       catstream find --model anna.safetensors --threshold 0.7 --output sure videos/
     """
     # Imported here so that --help and the other commands start faster.
-    with interruptible():
+    with INTERRUPTS.leaving():
         from catstream.applications.finding.files import find_files
         from catstream.applications.finding.log import SearchLog
         from catstream.applications.finding.report import write_report

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import click
 
-__all__ = ["INTERRUPTED", "INTERRUPTS", "Interrupts", "interruptible", "stopped"]
+__all__ = ["INTERRUPTED", "INTERRUPTS", "Interrupts", "stopped"]
 
 #: Exit code of a command that was interrupted.
 INTERRUPTED = 130
@@ -19,10 +19,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupts:
-    """Raises KeyboardInterrupt for each of these signals; inside a `deferred` block, at the end of the block."""
+    """Raises KeyboardInterrupt for each of these signals, except in the blocks below."""
 
     def __init__(self) -> None:
-        self._deferring = self._pending = False
+        self._leaving = self._deferring = self._pending = False
 
     def install(self) -> None:
         """Install the handlers. A signal that is ignored, as under nohup, stays ignored, except SIGTERM."""
@@ -31,8 +31,21 @@ class Interrupts:
                 signal.signal(number, self._handle)
 
     @contextmanager
+    def leaving(self) -> Iterator[None]:
+        """A block in which these signals end this process at once. It is for imports before any work.
+
+        Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of
+        it.
+        """
+        self._leaving = True
+        try:
+            yield
+        finally:
+            self._leaving = False
+
+    @contextmanager
     def deferred(self) -> Iterator[None]:
-        """A block that these signals do not interrupt."""
+        """A block that these signals interrupt at its end only."""
         self._deferring = True
         try:
             yield
@@ -43,6 +56,9 @@ class Interrupts:
             raise KeyboardInterrupt
 
     def _handle(self, *_: object) -> None:
+        if self._leaving:
+            os.write(2, b"stopped\n")
+            os._exit(INTERRUPTED)
         if not self._deferring:
             raise KeyboardInterrupt
         self._pending = True
@@ -50,29 +66,6 @@ class Interrupts:
 
 #: The handlers of this process; the command line installs them.
 INTERRUPTS = Interrupts()
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """End this process at once on Ctrl-C inside a `with`. It is for imports before any work.
-
-    Kernels are compiled during these imports, and the compiler hides a KeyboardInterrupt or makes another error of it.
-    If SIGINT is ignored, as in the background job of a script, it stays ignored.
-    """
-
-    def leave(*_: object) -> None:
-        os.write(2, b"stopped\n")
-        os._exit(INTERRUPTED)
-
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, leave)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def stopped(result: str = "") -> NoReturn:

@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 
 from catstream.cli.files import check_file
-from catstream.cli.interrupts import INTERRUPTS, interruptible
+from catstream.cli.interrupts import INTERRUPTS
 from catstream.cli.output import line_of, messages
 from catstream.errors import ObjectError, SettingsError, VideoError
 from catstream.messages.names import boxes_by_name, listed, split_name
@@ -83,7 +83,7 @@ def summary(
       catstream summary walk.mcap -k 8
     """
     # Imported here so that --help and the other commands start faster.
-    with interruptible():
+    with INTERRUPTS.leaving():
         from catstream.applications.summaries.images import describe  # noqa: F401  this import compiles the kernels
         from catstream.applications.summaries.sheet import json_beside
         from catstream.run.job import Job

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 
 import pytest
 
-from catstream.cli.interrupts import Interrupts
+from catstream.cli.interrupts import INTERRUPTED, Interrupts
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -47,7 +49,17 @@ def test_between_frames_a_signal_takes_effect_at_once(interrupts):
         signal.raise_signal(signal.SIGINT)
 
 
+def test_during_imports_a_signal_ends_the_process_at_once(interrupts, monkeypatch, capfd):
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit, match=str(INTERRUPTED)), interrupts.leaving():
+        signal.raise_signal(signal.SIGINT)
+    assert capfd.readouterr().err == "stopped\n"
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
 def test_ignored_signals_stay_ignored(interrupts):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     interrupts.install()
-    signal.raise_signal(signal.SIGHUP)
+    with interrupts.leaving():
+        signal.raise_signal(signal.SIGHUP)

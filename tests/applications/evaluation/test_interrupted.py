@@ -5,14 +5,13 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import psutil
 import pytest
 
 from catstream.applications.evaluation.workers import run_tasks
-from catstream.cli.interrupts import INTERRUPTED, interruptible
+from catstream.cli.interrupts import INTERRUPTED
 from catstream.services.start import sigint_blocked
 
 
@@ -60,21 +59,3 @@ def test_a_caller_that_stops_early_leaves_no_worker():
     given.close()
     assert len(running) == 2
     assert not multiprocessing.active_children()
-
-
-def test_ctrl_c_during_imports_ends_at_once(monkeypatch, capfd):
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(os, "_exit", sys.exit)
-    with pytest.raises(SystemExit, match=str(INTERRUPTED)), interruptible():
-        signal.raise_signal(signal.SIGINT)
-    assert capfd.readouterr().err == "stopped\n"
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_during_imports_an_ignored_ctrl_c_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with interruptible():
-            signal.raise_signal(signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGINT, before)
