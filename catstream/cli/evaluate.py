@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +18,6 @@ from catstream.services.options import PATH, with_settings
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
-    from catstream.applications.evaluation.runs import EvaluationRun
     from catstream.applications.evaluation.summary import Row
 
 __all__ = ["evaluate"]
@@ -119,7 +116,8 @@ def evaluate(
 
     errors: list[CatstreamError] = []
     try:
-        with _progress() as (begin, done):
+        with line_of(messages(), _line) as progress:
+            task = progress.add_task("starting", total=None)
             runs = run_all(
                 sequences,
                 names,
@@ -128,8 +126,8 @@ def evaluate(
                 peer_models=peer_models,
                 jobs=jobs,
                 output=output,
-                begin=begin,
-                done=done,
+                begin=lambda frames: progress.update(task, total=frames),
+                done=lambda run: progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}"),
                 failed=errors.append,
             )
     except KeyboardInterrupt:
@@ -154,24 +152,10 @@ def evaluate(
         )
 
 
-@contextmanager
-def _progress() -> Iterator[tuple[Callable[[int], None], Callable[[EvaluationRun], None]]]:
-    """Show a bar; yield the functions that take the number of frames, and each finished run."""
-
-    def parts(task: Task) -> list[str]:
-        left = [] if task.time_remaining is None else [f"{timedelta(seconds=round(task.time_remaining))} left"]
-        return [task.description, f"{task.completed:.0f}/{task.total or 0:.0f} frames", *left]
-
-    with line_of(messages(), parts) as progress:
-        task = progress.add_task("starting", total=None)
-
-        def begin(frames: int) -> None:
-            progress.update(task, total=frames)
-
-        def done(run: EvaluationRun) -> None:
-            progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}")
-
-        yield begin, done
+def _line(task: Task) -> list[str]:
+    """Tracker and run, frames, and the time that is left."""
+    left = [] if task.time_remaining is None else [f"{timedelta(seconds=round(task.time_remaining))} left"]
+    return [task.description, f"{task.completed:.0f}/{task.total or 0:.0f} frames", *left]
 
 
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:

@@ -13,14 +13,18 @@ from catstream.cli.files import check_file
 from catstream.cli.interrupts import INTERRUPTS
 from catstream.cli.output import line_of, messages
 from catstream.errors import ObjectError, SettingsError, VideoError
+from catstream.messages.kinds import Features, Health
 from catstream.messages.names import boxes_by_name, listed, split_name
+from catstream.numerics.threads import one_thread
+from catstream.run.job import Job
 from catstream.services.options import PATH, with_overwrite, with_settings
 from catstream.settings import Settings
+from catstream.sinks.recording.container import MAGIC
+from catstream.sinks.recording.file import Recording
+from catstream.sinks.recording.learning import require_features
 
 if TYPE_CHECKING:
     from catstream.applications.summaries.sheet import Sheet
-    from catstream.run.job import Job
-    from catstream.sinks.recording.file import Recording
 
 __all__ = ["summary"]
 
@@ -86,15 +90,16 @@ def summary(
     with INTERRUPTS.leaving():
         from catstream.applications.summaries.images import describe  # noqa: F401  this import compiles the kernels
         from catstream.applications.summaries.sheet import json_beside
-        from catstream.run.job import Job
-        from catstream.sinks.recording.file import Recording
 
     _check_output(output, json_beside(output), overwrite)
     console = messages()
     if _is_recording(path):
         sheet = _of_recording(Recording(path), count, name, source, console)
     elif box is not None or (path.is_dir() and Job.is_in(path)):
-        job = Job.load(path) if box is None else _job(path, box, settings)
+        if box is None:
+            job = Job.load(path)
+        else:
+            job = Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
         with tempfile.TemporaryDirectory(prefix="catstream-summary-") as folder:
             sheet = _of_recording(_tracked(job, Path(folder), console), count, name, source or job.source, console)
     else:
@@ -105,18 +110,10 @@ def summary(
 
 
 def _is_recording(path: Path) -> bool:
-    from catstream.sinks.recording.container import MAGIC
-
     if not path.is_file():
         return False
     with path.open("rb") as file:
         return path.suffix == _RECORDING or file.read(len(MAGIC)) == MAGIC
-
-
-def _job(path: Path, box: str, settings: Settings) -> Job:
-    from catstream.run.job import Job
-
-    return Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
 
 
 def _check_output(output: Path, json: Path, overwrite: bool) -> None:
@@ -131,7 +128,6 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
     from catstream.applications.summaries.images import describe
     from catstream.applications.summaries.selection import RowSelection
     from catstream.applications.summaries.sheet import WIDTH, sheet_of_images
-    from catstream.numerics.threads import one_thread
     from catstream.video.image import jpeg
 
     collection, selection = Collection(path), RowSelection[tuple[Origin, bytes]](count)
@@ -153,7 +149,6 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
 def _tracked(job: Job, folder: Path, console: Console) -> Recording:
     """Track the source of a job, and record it."""
     from catstream.pipeline import Pipeline
-    from catstream.sinks.recording.file import Recording
     from catstream.video.source import is_live
 
     if is_live(job.source):
@@ -174,9 +169,6 @@ def _tracked(job: Job, folder: Path, console: Console) -> Recording:
 def _of_recording(recording: Recording, count: int, name: str | None, source: str | None, console: Console) -> Sheet:
     from catstream.applications.summaries.sheet import pictures_of, sheet_of_frames
     from catstream.applications.summaries.taught import most_taught, taught_frames
-    from catstream.messages.kinds import Features
-    from catstream.numerics.threads import one_thread
-    from catstream.sinks.recording.learning import require_features
 
     require_features(recording, incomplete=True)
     settings, source = recording.settings, source or _source_of(recording)
@@ -197,8 +189,6 @@ def _of_recording(recording: Recording, count: int, name: str | None, source: st
 
 def _source_of(recording: Recording) -> str:
     """Return the source that the detector reported; empty if the recording does not name it."""
-    from catstream.messages.kinds import Health
-
     reports = (message for _, message in recording.messages() if isinstance(message, Health))
     return next((report.source for report in reports if report.source), "")
 
