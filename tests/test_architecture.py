@@ -78,7 +78,7 @@ IMPORTERS = {
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
         *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
-        *("services/desired.py", "catstream/run/job.py"),
+        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
     ],
     "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
     "psutil": ["catstream/applications/loadtest/usage.py"],

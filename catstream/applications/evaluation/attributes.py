@@ -14,10 +14,10 @@ read from a JSON file: {"sequence": ["occlusion", "blur"]}.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from catstream.applications.evaluation.datasets import Sequence
@@ -89,14 +89,8 @@ def read_attributes(file: Path) -> dict[str, list[str]]:
         If it cannot be read, or has another form.
     """
     try:
-        read = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
+    except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
         raise SettingsError(
             f'cannot read the attributes in {str(file)!r} ({error}): give a JSON file {{"sequence": ["occlusion"]}}'
         ) from None
-    lists = list(read.values()) if isinstance(read, dict) else [None]
-    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
-        raise SettingsError(
-            f'{str(file)!r} has no list of attributes for each sequence: expected {{"sequence": ["occlusion"]}}'
-        )
-    return {name: list(attributes) for name, attributes in read.items()}
