@@ -31,7 +31,7 @@ from catstream.cli import main
 from catstream.client.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
 from catstream.numerics.threads import one_thread
-from catstream.video.demo import write
+from catstream.video.demo import render, write
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -96,6 +96,20 @@ def demo_video(once):
         return folder / "demo.mp4", [Box(*box) for box in boxes.tolist()]
 
     return rendered
+
+
+@pytest.fixture(scope="session")
+def walk(tmp_path_factory):
+    """A sequence folder in the layout of OTB: 12 frames, the object absent in frames 5 to 7."""
+    folder = tmp_path_factory.mktemp("sets") / "walk"
+    (folder / "img").mkdir(parents=True)
+    lines = []
+    for number, (image, box) in enumerate(render(12, (160, 120))):
+        assert box is not None
+        cv2.imwrite(str(folder / "img" / f"{number + 1:04d}.png"), image)
+        lines.append("nan,nan,nan,nan" if 5 <= number < 8 else str(box))
+    (folder / "groundtruth_rect.txt").write_text("\n".join(lines) + "\n")
+    return folder
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,12 +9,8 @@ from pathlib import Path
 import pytest
 
 from catstream.cli import COMMANDS
-from catstream.video.demo import render
-
-cv2 = pytest.importorskip("cv2")
 
 CATSTREAM = Path(sys.executable).with_name("catstream")
-FRAMES = 12
 
 #: Modules that the processes import: of libraries, of the standard library, of catstream, and of the start of Python.
 TRAPS = [
@@ -40,18 +36,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory):
-    """A short sequence with truth, and the box in its first frame."""
-    folder, boxes = tmp_path_factory.mktemp("set") / "walk", []
-    (folder / "img").mkdir(parents=True)
-    for number, (image, box) in enumerate(render(FRAMES, (160, 120))):
-        cv2.imwrite(str(folder / "img" / f"{number + 1:04d}.png"), image)
-        boxes.append(str(box))
-    (folder / "groundtruth_rect.txt").write_text("\n".join(boxes) + "\n")
-    return folder, boxes[0]
-
-
 @pytest.fixture
 def traps(tmp_path):
     """A folder with a trap for each module; each writes a file if it is imported."""
@@ -64,16 +48,17 @@ def traps(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["track", "demo", "evaluate", "loadtest", "program", "all others"])
-def test_no_file_in_the_current_folder_is_imported(name, sequence, traps, tmp_path):
+def test_no_file_in_the_current_folder_is_imported(name, walk, traps, tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
-    (folder, box), out = sequence, tmp_path / "out"
+    images, out = walk / "img", tmp_path / "out"
+    box = (walk / "groundtruth_rect.txt").read_text().splitlines()[0]
     load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1"]
     command = {
-        "track": [CATSTREAM, "track", folder / "img", "--box", box, "--output", out],
+        "track": [CATSTREAM, "track", images, "--box", box, "--output", out],
         "demo": [CATSTREAM, "demo", "--frames", "4", "--output", out],
-        "evaluate": [CATSTREAM, "evaluate", folder, "--starts", "2", "--jobs", "2", "--output", out],
+        "evaluate": [CATSTREAM, "evaluate", walk, "--starts", "2", "--jobs", "2", "--output", out],
         "loadtest": [CATSTREAM, "loadtest", *load],
-        "program": [sys.executable, tmp_path / "program.py", folder / "img", box, str(FRAMES)],
+        "program": [sys.executable, tmp_path / "program.py", images, box, "12"],
         "all others": [sys.executable, "-P", "-c", EVERY_COMMAND, *COMMANDS],
     }[name]
     done = subprocess.run(command, cwd=traps, capture_output=True, text=True, timeout=240, check=False)

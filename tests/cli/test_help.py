@@ -37,23 +37,6 @@ def test_every_command_has_a_help_text(help_of, command):
     assert help_of(command).startswith(f"Usage: catstream {command}")
 
 
-def test_the_help_of_track_lists_its_files_and_how_to_stop_it(help_of):
-    text = help_of("track")
-    for word in (
-        "NAME=X,Y,W,H",
-        "NAME-anna.txt",
-        "forget",
-        "NAME.txt",
-        "NAME_confidence.value",
-        "NAME_time.txt",
-        "NAME.csv",
-        "NAME.mp4",
-        "Ctrl-C",
-        "EXAMPLES",
-    ):
-        assert word in text
-
-
 def test_an_unknown_command_is_an_error(fail):
     assert "No such command 'trakc'" in fail("trakc")
 

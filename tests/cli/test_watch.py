@@ -93,11 +93,6 @@ def test_the_name_of_an_object_is_shown_if_it_has_one(two_objects, said):
     assert [line.startswith("object anna  frame ") for line in output.splitlines()] == [True, False] * 4
 
 
-def test_an_object_of_a_channel_without_objects_and_a_name_that_is_none_are_errors_of_one_line(fail):
-    assert "a message of health is about all objects: subscribe to " in fail("watch", "health", "--object", "anna")
-    assert "'an na' is not a name: expected " in fail("watch", "tracks", "--object", "an na")
-
-
 def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
     code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
     model = json.loads(output)

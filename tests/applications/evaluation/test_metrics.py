@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from catstream.applications.evaluation.metrics import (
-    PIXELS,
     distances,
     is_lost,
     long_term,
@@ -155,13 +154,6 @@ def test_frames_without_the_object_count_for_no_loss():
     assert is_lost(boxes, truth)
     truth[12] = np.nan
     assert not is_lost(boxes, truth)
-
-
-def test_plots_are_monotonic():
-    found, truth = boxes()
-    assert (np.diff(success_plot(found, truth)) <= 0).all()
-    assert (np.diff(precision_plot(found, truth)) >= 0).all()
-    assert len(precision_plot(found, truth)) == len(PIXELS)
 
 
 SIDES = st.tuples(*[st.floats(-50, 50)] * 2, *[st.floats(0.1, 50)] * 2)

@@ -98,12 +98,7 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
     assert (out / "catstream" / "walk.txt").exists()
 
 
-def test_the_command_shows_the_spread_over_several_starts(walk, succeed):
-    output, _ = succeed("evaluate", walk, "--starts", 2, "--tracker", "mil")
-    assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", output)
-
-
-def test_the_command_counts_the_sequences_that_flip(tmp_path, walk, succeed):
+def test_the_command_shows_the_spread_over_several_runs_and_counts_the_sequences_that_flip(tmp_path, walk, succeed):
     output, errors = succeed("evaluate", walk, "--jitter", 2, "--tracker", "mil", "--output", tmp_path)
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", output)
     (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the first box", output + errors)  # MIL is random
@@ -138,9 +133,3 @@ def test_an_unwritable_json_path_is_an_error_before_the_work(tmp_path, walk, fai
     for place in (tmp_path, tmp_path / "a" / "b"):
         error = fail("evaluate", walk, "--tracker", "mil", "--json", place)
         assert "give a file in a folder that exists" in error
-
-
-def test_the_help_names_every_tracker_and_measure(succeed):
-    text, _ = succeed("evaluate", "--help")
-    for word in ("csrt", "kcf", "mil", "tld", "AUC", "success", "precision", "norm.", "F-score", "--starts 5"):
-        assert word in text

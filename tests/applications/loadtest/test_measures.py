@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from catstream.applications.loadtest.measures import (
     PERCENTILES,
-    carried_forward,
     latencies_to_answer,
     measure,
     percentiles,
@@ -76,10 +75,6 @@ def test_latencies_equal_those_of_brute_force(answers, frames):
     expected = [min([at for at, number in answers if number >= frame], default=60.0) for frame in range(frames)]
     np.testing.assert_allclose(found, np.array(expected) - due)
     assert without_track == sum(wait == 60.0 for wait in expected)
-
-
-def test_before_the_first_box_there_is_no_known_box():
-    assert np.isnan(carried_forward(np.ones((3, 4)), np.zeros(3, bool))).all()
 
 
 def test_percentiles_are_latencies_of_frames_and_the_last_is_the_longest(rng):
