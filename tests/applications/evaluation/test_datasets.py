@@ -95,18 +95,10 @@ def test_princeton_with_colour_images_and_a_column_for_occlusion(tmp_path):
     check(place)
 
 
-def test_a_video_in_the_folder_is_read(tmp_path, walk):
-    av = pytest.importorskip("av")
-    (sequence,) = find_sequences(walk)
-    with av.open(str(tmp_path / "film.avi"), "w") as container:
-        stream = container.add_stream("mjpeg", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuvj420p"
-        for image in sequence.frames():
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-        container.mux(stream.encode(None))
-    (tmp_path / "groundtruth_rect.txt").write_text((walk / "groundtruth_rect.txt").read_text())
-    (other,) = find_sequences(tmp_path)
-    assert len(list(other.frames())) == len(other) == 12
+def test_a_video_in_the_folder_is_read(demo_video):
+    path, boxes = demo_video(32)
+    (sequence,) = find_sequences(path.parent)
+    assert len(list(sequence.frames())) == len(sequence) == len(boxes)
 
 
 @pytest.mark.parametrize("row", ["0,0,0,0", "10,10,0,5", "NaN,NaN,NaN,NaN", "10,10,nan,5", "10,10,-3,5"])
