@@ -55,7 +55,7 @@ def plot(title: str, x: Axis, y: Axis, curves: Mapping[str, tuple[np.ndarray, np
     ----------
     title : title above the plot
     x, y : axes; values outside their range are clipped
-    curves : label -> x and y values, float64 (k,) both; NaN makes a gap
+    curves : label -> x and y values, float64 (k,) both; NaN makes a gap, and a curve may be empty
 
     Returns
     -------
@@ -88,7 +88,7 @@ def plot(title: str, x: Axis, y: Axis, curves: Mapping[str, tuple[np.ndarray, np
         parts.append(f'<text x="{across(value):.1f}" y="{bottom + 18}" text-anchor="middle">{text}</text>')
     for number, (xs, ys) in enumerate(curves.values()):
         style = f'fill="none" {_stroke(number)} stroke-width="2.2" stroke-linejoin="round"'
-        for piece in np.ma.clump_unmasked(np.ma.masked_invalid(ys)):
+        for piece in np.ma.clump_unmasked(np.ma.masked_invalid(ys)) if len(ys) else ():
             points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across(xs[piece]), down(ys[piece]), strict=True))
             parts.append(f'<polyline points="{points}" {style}/>')
     return "\n".join([*parts, "</svg>"])

@@ -34,6 +34,11 @@ def test_nan_leaves_a_gap():
     assert [len(line) for line in lines] == [2, 2]
 
 
+def test_a_curve_without_points_is_only_named():
+    lines, texts = parsed(plot("Lag", Axis.upto(5), Axis.upto(4), {"stream 0": (np.empty(0), np.empty(0))}))
+    assert (lines, "stream 0" in texts) == ([], True)
+
+
 @pytest.mark.parametrize("value", [0.0, 1e-4, 0.031, 0.7, 1.0, 4.9, 10.0, 12.0, 99.0, 5e6])
 def test_an_axis_includes_its_value_and_has_two_to_six_ticks_up_to_its_end(value):
     axis = Axis.upto(value)
