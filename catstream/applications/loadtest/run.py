@@ -25,7 +25,7 @@ from catstream.video.broadcast import Schedule
 __all__ = ["Report", "Result", "run"]
 
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
-_LEAD_SECONDS = 0.5  # from the end of the start to the first frame
+_LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
 _READING_SECONDS = 0.5  # between two readings of processor and memory use
 _LOOP_SECONDS = 0.05
@@ -107,7 +107,7 @@ def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
     usage, interrupted, next_reading = Usage(), False, 0.0
     with ExitStack() as stack:
         seen, groups = _started(plan, streams, next(iter(camera.video.boxes)), stack, report)
-        schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS, plan.rate, plan.frames))
+        schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate, plan.frames))
         try:
             for now in _until_the_last_track(plan, streams, seen, schedules):
                 if now >= next_reading:

@@ -67,6 +67,12 @@ def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
     assert children() == []
 
 
+def test_a_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
+    load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64)), [], find=False)
+    (stream,) = load_test.result.streams
+    assert stream.track[0] > 0
+
+
 @pytest.mark.slow
 def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not():
     plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
