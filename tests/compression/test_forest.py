@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
@@ -130,15 +129,6 @@ def test_an_object_that_begins_again_has_new_trees(settings, messages):
     forest.take(changed(next(messages), begins=True))
     assert forest.counters()["rows"] == 2 + 3 + 6 + 3, "those of one frame"
     assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
-
-
-def test_trees_may_be_of_another_class(settings, messages):
-    class Other(CoresetTree):
-        pass
-
-    compressor = Compressor(settings, tree=Other)
-    compressor.take(0, next(messages).objects[""], 1)
-    assert {type(tree) for tree in compressor.trees.values()} == {Other}
 
 
 def test_a_message_stored_already_is_ignored(settings, messages):
