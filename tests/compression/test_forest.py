@@ -219,14 +219,6 @@ def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, 
     assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(detector))
 
 
-def test_memory_is_flat_between_doublings(settings, messages):
-    forest = Forest(settings)
-    take(forest, messages, 64)
-    small = forest.counters()["bytes"]
-    take(forest, messages, 64 * 15)
-    assert forest.counters()["bytes"] < 2.5 * small
-
-
 @pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
 def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path):
     """Its checksum fits: whoever writes one on purpose sees to that."""

@@ -188,15 +188,6 @@ def test_a_detector_that_is_resumed_adopts_no_model_of_the_object_before_either(
     assert other.model.version == 2
 
 
-def test_the_training_rows_of_a_frame_do_not_depend_on_earlier_frames(scene):
-    detector, other = started(scene), Follower()
-    model = dataclasses.replace(detector.model, version=1)
-    detector.adopt(model)
-    other.go_on(1, other.state_at(START, START, 0), model)
-    one, two = (stage.step(scene((60, 50)))[1] for stage in (detector, other))
-    np.testing.assert_allclose(one.training[APPEARANCE].rows, two.training[APPEARANCE].rows, atol=1e-5)
-
-
 @pytest.mark.parametrize("place", ["start", "move"])
 @pytest.mark.parametrize(
     "box", [(-1e300, -1e300, 2e300, 2e300), (0, 0, 641, 20), (0, 0, 20, 481)], ids=["huge", "wide", "high"]

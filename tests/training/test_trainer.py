@@ -43,12 +43,6 @@ def test_the_score_is_0_at_the_backgrounds_mean_and_1_at_the_objects(sample, cla
     assert (model.version, model.frame, model.weights.dtype) == (sample.version, sample.frame, np.float32)
 
 
-def test_the_same_sample_gives_the_same_bits(sample):
-    one, two = (Trainer(Settings()).train(sample) for _ in range(2))
-    assert one.weights.tobytes() == two.weights.tobytes()
-    assert one.bias == two.bias
-
-
 def test_a_model_does_not_depend_on_the_samples_before_it(sample, rng):
     rows = rng.normal(size=sample.trees["extent"].rows.shape).astype(np.float32)
     other = with_tree(sample, "extent", dataclasses.replace(sample.trees["extent"], rows=rows))
