@@ -100,7 +100,7 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> Evalu
     boxes, scores, moments = [], [], [perf_counter()]
     with one_thread(opencv=True):
         for row, image in enumerate(sequence.frames(start.frame)):
-            frame = Pyramid.of(image)
+            frame = Pyramid(image)
             given = {}
             if row == 0:
                 given[UNNAMED] = detectors.begin(UNNAMED, frame, start.box(sequence, image.shape[1::-1]))

@@ -258,7 +258,7 @@ def _patch(
 
     Returns
     -------
-    uint8 (3, 96, 96), or (1, 96, 96) of a grey frame
+    uint8 (3, 96, 96)
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
     x, y = window.centre

@@ -29,17 +29,17 @@ class Follower(Detector):
         self.seq = 0
 
     def start(self, image, box, time=0.0):
-        result = self.init(Pyramid.of(image), self.seq + 1, time, box)
+        result = self.init(Pyramid(image), self.seq + 1, time, box)
         self.seq += 1
         return result
 
     def move(self, image, box):
-        result = self.correct(Pyramid.of(image), self.seq + 1, 0.0, box)
+        result = self.correct(Pyramid(image), self.seq + 1, 0.0, box)
         self.seq += 1
         return result
 
     def step(self, image):
-        frame = Pyramid.of(image)
+        frame = Pyramid(image)
         found = self.look(frame, self.seq + 1)
         self.seq += 1
         return self.settle(found, frame, self.seq, 0.0)
@@ -78,14 +78,13 @@ def test_half_of_the_first_copies_are_put_on_another_background(scene):
     assert not differ[0]
 
 
-@pytest.mark.parametrize("channels", [..., (..., 1)], ids=["colour", "grey"])
 @pytest.mark.parametrize("detection", ["local", "full"])
-def test_a_moving_object_is_followed(scene, detection, channels):
+def test_a_moving_object_is_followed(scene, detection):
     detector = Follower({"search.mode": detection})
-    detector.start(scene((60, 50))[channels], START)
+    detector.start(scene((60, 50)), START)
     for i in range(1, 15):
         at = (60 + 6 * i, 50 + 4 * i)
-        track, _ = detector.step(scene(at)[channels])
+        track, _ = detector.step(scene(at))
         assert track.box.overlap(Box(*at, 48, 40)) > 0.8
 
 

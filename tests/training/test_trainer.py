@@ -19,7 +19,7 @@ from catstream.training.trainer import Trainer
 def sample():
     image = np.random.default_rng(3).integers(0, 256, (160, 200, 3), np.uint8)
     settings = Settings()
-    _, features = Detector(settings).init(Pyramid.of(image), 1, 0.0, Box(60, 40, 50, 60))
+    _, features = Detector(settings).init(Pyramid(image), 1, 0.0, Box(60, 40, 50, 60))
     return Compressor(settings).take(0, features, 1)
 
 
