@@ -169,7 +169,7 @@ def seen(run: EvaluationRun, last: int) -> Iterator[Seen]:
     settings = Settings().for_length(len(run.boxes))
     detector, forest, trainer = Detector(settings), Forest(settings), Trainer(settings)
     for row, image in zip(range(last + 1), run.sequence.frames(run.start.frame), strict=False):
-        frame, lead = Pyramid.of(as_bgr(image)), None
+        frame, lead = Pyramid(as_bgr(image)), None
         if row:
             found = detector.look(frame, row + 1)
             lead = lead_of(found)

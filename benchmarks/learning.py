@@ -66,7 +66,7 @@ def features(sequence: Sequence, start: int, count: int, settings: Settings) -> 
     found = []
     with one_thread(opencv=True):
         for seq, image in enumerate(islice(sequence.frames(start), count), start=1):
-            frame = Pyramid.of(image)
+            frame = Pyramid(image)
             if seq == 1:
                 _, part = detector.init(frame, seq, 0.0, Box(*map(float, sequence.boxes[start])))
             else:
@@ -99,7 +99,7 @@ def tracked(learned: Learned, sequence: Sequence, start: int, count: int) -> lis
     tracks = []
     with one_thread(opencv=True):
         for seq, image in enumerate(islice(sequence.frames(start), count), start=1):
-            frame = Pyramid.of(image)
+            frame = Pyramid(image)
             track, part = detector.settle(detector.look(frame, seq), frame, seq, 0.0)
             learn(detector, compressor, trainer, seq, part)
             tracks.append(track)

@@ -53,7 +53,7 @@ def best(learned: Learned, sequence: Sequence, start: int, count: int) -> float:
     for image, truth in islice(zip(sequence.frames(start), sequence.boxes[start:], strict=True), 0, count, _EVERY):
         if np.isfinite(truth).all():
             box, context = Box(*map(float, truth)), learned.settings.search.context
-            window = ScoreMap.whole(Pyramid.of(image), Window.around(box, context), learned.model).best()[1]
+            window = ScoreMap.whole(Pyramid(image), Window.around(box, context), learned.model).best()[1]
             found.append(window.box(context).overlap(box) > 0.5)
     return fmean(found) if found else 0.0
 

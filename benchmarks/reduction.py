@@ -77,7 +77,7 @@ def costs(sequence: Sequence, variants: dict[str, Settings]) -> Table:
     detectors = Detectors(variants["svd"])
     stages = {name: Stages(settings) for name, settings in variants.items()}
     for number, image in enumerate(sequence.frames()):
-        pyramid = Pyramid.of(image)
+        pyramid = Pyramid(image)
         given = {} if number else {"": detectors.begin("", pyramid, Box(*sequence.boxes[0]))}
         _, features = detectors.step(pyramid, 0.0, given)
         models = {name: each.take(features) for name, each in stages.items()}

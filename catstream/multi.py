@@ -155,7 +155,7 @@ class MultiTracker:
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
         prepare(self.settings)  # a library is held to one thread if it is there when a call begins
         with one_thread():
-            pyramid = Pyramid.of(image)
+            pyramid = Pyramid(image)
             given = detectors.begin_all(boxes, pyramid, time)
             # If a box was refused, nothing has changed.
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
@@ -208,7 +208,7 @@ class MultiTracker:
                 "resize it, or call init to start again"
             )
         with one_thread():
-            pyramid = Pyramid.of(image)
+            pyramid = Pyramid(image)
             given = self.detectors.begin_all(boxes, pyramid, time)
             for name, learned in models.items():
                 self.detectors.seek(name, learned.model, learned.box, learned.likeness())

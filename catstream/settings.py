@@ -475,7 +475,7 @@ class Settings:
         return [f"{name}={texts[name]}" for name, value in self.values().items() if value != default[name]]
 
     def texts(self) -> dict[str, str]:
-        """All values as texts, by full name; `of` reads them."""
+        """All values as texts, by full name; `from_values` reads them."""
         values = self.values().items()
         return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values}
 

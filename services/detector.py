@@ -222,7 +222,7 @@ class DetectorLoop:
     def take(self, frame: Frame) -> None:
         """Track the objects in a frame, and wait until the next one can be taken."""
         self.turn()
-        self._frame, self._pyramid = frame, Pyramid.of(frame.image)
+        self._frame, self._pyramid = frame, Pyramid(frame.image)
         self.tell(core.Frame(frame.number, self._source is not None and self._source.live))
         self.wait()
 

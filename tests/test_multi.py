@@ -87,15 +87,6 @@ def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, together, monke
     parallel._pool.cache_clear()
 
 
-def test_one_unnamed_object_is_that_of_a_tracker(frames):
-    tracker, several = Tracker(), MultiTracker()
-    tracker.init(frames[0], box_of("anna", 0))
-    several.init(frames[0], {"": box_of("anna", 0)})
-    for frame in frames[1:]:
-        tracker.update(frame)
-        assert several.update(frame) == {"": tracker.track}
-
-
 #: In which frame an object begins, and in which it is forgotten, if it is.
 _LIFE = st.tuples(st.integers(1, 7), st.none() | st.integers(1, 7)).map(
     lambda life: (life[0], life[1] if life[1] is None else min(life[0] + life[1], 8))

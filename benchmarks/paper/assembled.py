@@ -95,11 +95,12 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> Evalu
     """Run the loop of `catstream.tracker.Tracker` with other trees, and stop learning after a share of the frames."""
     frames = len(sequence) - start.frame
     settings = recipe.settings.for_length(frames)
-    detectors, compressor, trainer = Detectors(settings), Compressor(settings, tree=recipe.tree), Trainer(settings)
+    detectors, compressor, trainer = Detectors(settings), Compressor(settings), Trainer(settings)
+    compressor.trees = {name: recipe.tree(settings.coreset.size) for name in compressor.trees}
     boxes, scores, moments = [], [], [perf_counter()]
     with one_thread(opencv=True):
         for row, image in enumerate(sequence.frames(start.frame)):
-            frame = Pyramid.of(image)
+            frame = Pyramid(image)
             given = {}
             if row == 0:
                 given[UNNAMED] = detectors.begin(UNNAMED, frame, start.box(sequence, image.shape[1::-1]))

@@ -36,7 +36,6 @@ class Compressor:
     Parameters
     ----------
     name : name of the object
-    tree : class of its trees; None for that of the setting `coreset.reduction`
 
     Attributes
     ----------
@@ -47,15 +46,14 @@ class Compressor:
     last_sample : the newest sample, None before the first
     """
 
-    def __init__(self, settings: Settings, name: str = "", tree: type[CoresetTree] | None = None) -> None:
+    def __init__(self, settings: Settings, name: str = "") -> None:
         if settings.coreset.share:
             raise SettingsError(
                 f"coreset.share={settings.coreset.share:g} is a share of a video's length: "
                 "call Settings.for_length first, or set coreset.size"
             )
         self.settings, self.name = settings, name
-        self._tree = tree or REDUCTIONS[settings.coreset.reduction]
-        self.trees = {name: self._tree(settings.coreset.size) for name in TREES}
+        self.trees = {name: REDUCTIONS[settings.coreset.reduction](settings.coreset.size) for name in TREES}
         self.began, self.frame = 0, -1
         self.box: Box | None = None
         self.detector: DetectorState | None = None

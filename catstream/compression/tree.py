@@ -7,7 +7,7 @@ become a node one level up (paper, "Coreset Tree Implementation"). `FrequentDire
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from catstream.messages import storage
 from catstream.messages.kinds import Summary
 from catstream.messages.storage import Arrays, Metadata
 from catstream.numerics.arrays import Float64, is_finite
-
-if TYPE_CHECKING:
-    import os
 
 __all__ = ["REDUCTIONS", "CoresetTree", "FrequentDirections", "pack_trees", "unpack_trees"]
 
@@ -131,15 +128,9 @@ class CoresetTree:
         return tree
 
     def merged(self, other: CoresetTree) -> Self:
-        """A tree of the rows of both: see `merge`."""
-        tree = self.copy()
-        tree.merge(other)
-        return tree
+        """A tree of both streams, as if their rows had been inserted into one; the two trees are not changed.
 
-    def merge(self, other: CoresetTree) -> None:
-        """Add the summary of another stream, as if its rows had been inserted here.
-
-        The bound holds for both streams together. The other tree is not changed.
+        The bound holds for both streams together.
         """
         if other.reduction != self.reduction:
             raise ProtocolError(
@@ -155,20 +146,15 @@ class CoresetTree:
                 f"a tree of rows of length {self.width} cannot merge rows of length {other.width}: "
                 "build both from the same features"
             )
-        if not self.width:
-            self._leaf = np.empty((0, other.width), np.float32)
-        # As in the addition of two binary numbers, equal levels are merged from the lowest level up.
-        carried = sorted([*self.nodes, *other.nodes], key=lambda node: -node.level)
-        self.nodes = []
-        while carried:
-            node = carried.pop()
-            if carried and self._to_merge(carried[-1], node):
-                carried.append(self._merged(carried.pop(), node))
-                carried.sort(key=lambda node: -node.level)
-            else:
-                self.nodes.insert(0, node)
+        tree = self.copy()
+        if not tree.width:
+            tree._leaf = np.empty((0, other.width), np.float32)
+        tree.nodes = []
+        for node in sorted([*self.nodes, *other.nodes], key=lambda node: -node.level):
+            tree._push(node)
         if len(other.pending):
-            self.insert(other.pending)
+            tree.insert(other.pending)
+        return tree
 
     def sample(self) -> Summary:
         """A hierarchical sample of at most 2n rows (paper, "Coreset Appearance Model").
@@ -183,21 +169,6 @@ class CoresetTree:
             count=self.rows_seen,
             levels=tuple(node.level for node in self.nodes),
         )
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the tree to a safetensors file, atomically."""
-        storage.write(path, *self.state())
-
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> CoresetTree:
-        """Read a tree back, bit for bit.
-
-        Raises
-        ------
-        ProtocolError
-            If the file is damaged, or not a consistent tree.
-        """
-        return CoresetTree.from_state(*storage.read(path))
 
     def state(self) -> tuple[Arrays, Metadata]:
         """Arrays and metadata that `from_state` restores."""

@@ -11,7 +11,7 @@ from catstream.box import Box, Window
 from catstream.detection import motion, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
-from catstream.detection.step import looked, replaced, settled, taught, track_of
+from catstream.detection.step import looked, settled, taught, track_of
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import WINDOW, row_length
@@ -128,8 +128,10 @@ class Detector:
     def settle(self, found: Detection, frame: Pyramid, seq: int, time: float) -> Result:
         """Take the detection of `look`, or another one of the same frame, and cut the training rows."""
         state, model, settings = self._known(), self.model, self.settings
-        followed = self._scm is not None  # by the paper's first tracker
-        state = replaced(state, found) if followed else settled(state, found, frame.size, settings)
+        if self._scm is None:
+            state = settled(state, found, frame.size, settings)
+        else:  # never absent: the first leaf is of the first n frames, whatever the score of this tracker is
+            state = replace(state, level="confident", window=found.window)
         self.state = state
         return self._result(seq, time, found.score, taught(state, found, frame, seq, model, self.likeness, settings))
 

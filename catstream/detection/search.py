@@ -6,7 +6,7 @@ A window is 8 x 8 cells. A search at another size resizes the frame, not the mod
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -29,7 +29,6 @@ __all__ = [
     "find",
     "fitted",
     "local",
-    "searched",
     "seek",
     "whole",
 ]
@@ -63,20 +62,6 @@ class Detection:
     window: Window
     around: ScoreMap | None = None
     redetected: bool = False
-
-
-def searched(
-    frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness | None, settings: Settings
-) -> tuple[DetectorState, Detection]:
-    """The best window of a frame, and the state that it was searched with: `seek` changes it, `find` does not.
-
-    Parameters
-    ----------
-    likeness : to the object of a saved model, as long as that has not been found
-    """
-    if state.first_window is None and likeness is not None:
-        return seek(frame, state, seq, model, likeness, settings)
-    return state, find(frame, state, seq, model, settings)
 
 
 def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings) -> Detection:
@@ -113,11 +98,10 @@ def seek(
     searched at a third of the sizes.
     """
     limits = settings.belief
-    sighting = _sighting(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model)
-    if state.sightings or sighting.found.score >= limits.confident_score:
-        sighting = _sighting(frame, state.window, _SOUGHT_FACTORS, model)
-    best = sighting.found
-    seen = best.score >= limits.confident_score and _stands_out(sighting, likeness, limits)
+    best, stands_out = _sighting(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model, likeness, limits)
+    if state.sightings or best.score >= limits.confident_score:
+        best, stands_out = _sighting(frame, state.window, _SOUGHT_FACTORS, model, likeness, limits)
+    seen = best.score >= limits.confident_score and stands_out
     again = state.sightings > 0 and best.window.overlap(state.confident_window) > SAME_OVERLAP
     state = replace(
         state,
@@ -224,49 +208,39 @@ def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[lis
 def _best_of(frame: Pyramid, parts: list[_Part], window: Window, model: Model) -> Detection:
     """The best window of several parts of a frame, each searched at the size of a window times a factor."""
     maps = [ScoreMap.within(frame, region, window.scaled(factor), model) for factor, region in parts]
-    found = [Detection(*each.best()) for each in maps]
-    costs = [extent.cost(math.log(factor)) for factor, _ in parts]
-    return found[int(np.argmax([each.score - cost for each, cost in zip(found, costs, strict=True)]))]
+    return Detection(*_best_map(maps, [factor for factor, _ in parts]).best())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sighting:
-    """The best window of a whole frame at several sizes, and its rival: the best one that does not touch it.
-
-    rival      score of the rival; 0, the mean of the background that was learned, if none is higher
-    row        feature row of the best window
-    rival_row  feature row of the rival, None if there is none
-    """
-
-    found: Detection
-    rival: float
-    row: np.ndarray
-    rival_row: np.ndarray | None
+def _best_map(maps: Sequence[ScoreMap], factors: Sequence[float]) -> ScoreMap:
+    """The map with the highest score less the cost of its factor of size."""
+    costs = [extent.cost(math.log(factor)) for factor in factors]
+    return maps[int(np.argmax([float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]))]
 
 
-def _sighting(frame: Pyramid, window: Window, factors: tuple[float, ...], model: Model) -> _Sighting:
-    """The best window of a whole frame, at the size of a window times each of several factors.
+def _sighting(
+    frame: Pyramid,
+    window: Window,
+    factors: tuple[float, ...],
+    model: Model,
+    likeness: Likeness,
+    limits: BeliefSettings,
+) -> tuple[Detection, bool]:
+    """The best window of a whole frame, at the size of a window times each of several factors; and whether it looks
+    like the object, and leads the rest of the frame.
 
-    In a scene that the model never saw, anything may score high: the rival shows how high.
+    In a scene that the model never saw, anything may score high: the rival, the best window that does not touch this
+    one, shows how high. The mean of the background that was learned scores 0.
     """
     maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
-    costs = [extent.cost(math.log(factor)) for factor in factors]
-    worths = [float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]
-    scores = maps[int(np.argmax(worths))]
-    best = Detection(*scores.best())
+    scores = _best_map(maps, factors)
+    best, alike = Detection(*scores.best()), likeness(scores.row(*scores.highest()))
     apart = max((each.apart(best.window) for each in maps), key=lambda each: float(each.scores.max()))
-    rival = float(apart.scores.max())
-    rival_row = apart.row(*apart.highest()) if rival > 0 else None
-    return _Sighting(best, max(rival, 0.0), scores.row(*scores.highest()), rival_row)
-
-
-def _stands_out(sighting: _Sighting, likeness: Likeness, limits: BeliefSettings) -> bool:
-    """Whether the best window looks like the object, and leads the rest of the frame."""
-    lead, alike = sighting.found.score - sighting.rival, likeness(sighting.row)
+    rival = max(float(apart.scores.max()), 0.0)
+    lead = best.score - rival
     if alike < limits.sighting_likeness or lead < _SIGHTING_LEAD:
-        return False
-    rival = 0.0 if sighting.rival_row is None else likeness(sighting.rival_row)
-    return lead >= _LEAD_OVER_ALIKE or rival < alike / 2
+        return best, False
+    alike_rival = likeness(apart.row(*apart.highest())) if rival else 0.0
+    return best, lead >= _LEAD_OVER_ALIKE or alike_rival < alike / 2
 
 
 def _near(frame: Pyramid, window: Window, state: DetectorState, model: Model, settings: Settings) -> Detection:

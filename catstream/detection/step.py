@@ -15,7 +15,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Model, State, Track
 from catstream.settings import Settings
 
-__all__ = ["looked", "replaced", "settled", "taught", "track_of"]
+__all__ = ["looked", "settled", "taught", "track_of"]
 
 
 def looked(
@@ -28,13 +28,16 @@ def looked(
 
     Parameters
     ----------
-    likeness : to the object of a saved model that has not been found yet
+    likeness : to the object of a saved model, which is sought in the whole frame as long as it has not been found
 
     Returns
     -------
     the state with the place that was expected, and the detection
     """
-    return search.searched(frame, motion.expected(state), seq, model, likeness, settings)
+    state = motion.expected(state)
+    if state.first_window is None and likeness is not None:
+        return search.seek(frame, state, seq, model, likeness, settings)
+    return state, search.find(frame, state, seq, model, settings)
 
 
 def settled(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
@@ -48,14 +51,6 @@ def settled(state: DetectorState, found: Detection, size: tuple[int, int], setti
     if _policy(state, settings).report:
         state = motion.observed(_followed(state, found, size, settings))
     return state
-
-
-def replaced(state: DetectorState, found: Detection) -> DetectorState:
-    """The state after a detection by the paper's first tracker: never absent, and each frame gives training rows.
-
-    The paper's first leaf is made of the first n frames, whatever that tracker's score is.
-    """
-    return replace(state, level="confident", window=found.window)
 
 
 def taught(

@@ -258,7 +258,7 @@ def _patch(
 
     Returns
     -------
-    uint8 (3, 96, 96), or (1, 96, 96) of a grey frame
+    uint8 (3, 96, 96)
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
     x, y = window.centre
@@ -377,8 +377,8 @@ def _rows(
     rows: Sequence[np.ndarray] | np.ndarray, labels: float | list[float], weight: float, teaching: TeachingSettings
 ) -> TrainingRows:
     """Training rows of one weight; the histogram of colours is 0 unless it is used: then no model weighs it."""
-    k, table = len(rows), np.asarray(rows, np.float32).reshape(len(rows), row_length())
+    table = np.asarray(rows, np.float32).reshape(len(rows), row_length())
     if not teaching.colours:
         table = table.copy()
         table[:, COLOURS] = 0
-    return TrainingRows(table, np.full(k, labels, np.float32), np.full(k, weight, np.float32))
+    return TrainingRows.labelled(table, labels, weight)

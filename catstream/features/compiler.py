@@ -7,7 +7,7 @@ arrays by the C structure that NumPy's C-API makes public, and releases the inte
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FunctionType
 
@@ -15,8 +15,11 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 from llvmlite import ir
+from numba.core.sigutils import normalize_signature
+from numba.core.types.abstract import Type
+from numba.core.types.npytypes import Array
 
-from catstream.features.machine import ENTRY, FUNCTIONS, Parameter, globals_of, parameters, target_machine
+from catstream.features.machine import ENTRY, FUNCTIONS, globals_of, target_machine
 
 __all__ = ["machine_code"]
 
@@ -44,7 +47,8 @@ def machine_code(name: str, function: FunctionType, signature: str) -> bytes:
     compiled = _export(signature)(_translated(function))
     module = llvm.parse_assembly(compiled.inspect_llvm())
     error = f"{name} takes writable arrays of these types: {signature}"
-    entry = llvm.parse_assembly(str(_entry(compiled.native_name, parameters(signature), error)))
+    types, _ = normalize_signature(signature)  # type: ignore[no-untyped-call]
+    entry = llvm.parse_assembly(str(_entry(compiled.native_name, types, error)))
     taken, given = (str(each.get_function(compiled.native_name).global_value_type) for each in (module, entry))
     if taken != given:
         raise TypeError(f"this version of numba has another structure of arrays: {taken} in place of {given}")
@@ -80,10 +84,10 @@ def _remove_unused(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> None:
     passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
 
 
-def _entry(callee: str, types: list[Parameter], error: str) -> ir.Module:
+def _entry(callee: str, types: Sequence[Type], error: str) -> ir.Module:
     """A module with the entry, which calls the function `callee` with numba's structures in place of the arrays."""
     module = ir.Module()
-    taken = [_structure_type(each.dimensions) if each.dimensions else _NUMBERS[each.dtype] for each in types]
+    taken = [_structure_type(each.ndim) if isinstance(each, Array) else _NUMBERS[each.name] for each in types]
     kernel = ir.Function(module, ir.FunctionType(_POINTER, taken), callee)
     entry = ir.Function(module, ir.FunctionType(_POINTER, [_POINTER, _POINTER, _WORD]), ENTRY)
     builder = _Builder(entry.append_basic_block())
@@ -93,7 +97,7 @@ def _entry(callee: str, types: list[Parameter], error: str) -> ir.Module:
     values = []
     for place, each in enumerate(types):
         value = builder.word(arguments, place, _POINTER)
-        if each.dimensions:
+        if isinstance(each, Array):
             builder.check(value, each, error)
             values.append(builder.structure(value, each))
         else:
@@ -136,24 +140,24 @@ class _Builder(ir.IRBuilder):  # type: ignore[misc]  # llvmlite has no types
         self.foreign("PyErr_SetString", ir.VoidType(), self.object("TypeError"), variable)
         self.ret(_POINTER(None))
 
-    def number(self, value: ir.Value, parameter: Parameter) -> ir.Value:
+    def number(self, value: ir.Value, kind: Type) -> ir.Value:
         """A Python number as one of C."""
-        if parameter.dtype == "int64":
+        if kind.name == "int64":
             number = self.foreign("PyLong_AsLongLong", _WORD, value)
         else:
             number = self.foreign("PyFloat_AsDouble", ir.DoubleType(), value)
         with self.unless(self.foreign("PyErr_Occurred", _POINTER), _POINTER(None)):
             self.ret(_POINTER(None))
-        return self.fptrunc(number, ir.FloatType()) if parameter.dtype == "float32" else number
+        return self.fptrunc(number, ir.FloatType()) if kind.name == "float32" else number
 
-    def check(self, array: ir.Value, parameter: Parameter, error: str) -> None:
+    def check(self, array: ir.Value, kind: Array, error: str) -> None:
         """Refuse an object that is no array, or one of another type."""
-        dtype = np.dtype(parameter.dtype)
+        dtype = np.dtype(kind.dtype.name)
         characters = int.from_bytes(f"{dtype.kind}{dtype.char}{dtype.byteorder}".encode(), "little")
-        flags = _ALIGNED | _WRITABLE | _CONTIGUOUS * parameter.contiguous
+        flags = _ALIGNED | _WRITABLE | _CONTIGUOUS * kind.is_c_contig
         with self.unless(self.word(array, _TYPE, _POINTER), self.object("ndarray")):
             self.refuse(error)
-        with self.unless(self.word(array, _DIMENSIONS, _INT), _INT(parameter.dimensions)):
+        with self.unless(self.word(array, _DIMENSIONS, _INT), _INT(kind.ndim)):
             self.refuse(error)
         with self.unless(self.and_(self.word(array, _FLAGS, _INT), _INT(flags)), _INT(flags)):
             self.refuse(error)
@@ -161,17 +165,17 @@ class _Builder(ir.IRBuilder):  # type: ignore[misc]  # llvmlite has no types
         with self.unless(self.and_(found, _INT(0xFFFFFF)), _INT(characters)):
             self.refuse(error)
 
-    def structure(self, array: ir.Value, parameter: Parameter) -> ir.Value:
+    def structure(self, array: ir.Value, kind: Array) -> ir.Value:
         """An array as numba's structure, which owns nothing."""
         size = _WORD(1)
-        shape = strides = ir.Constant(ir.ArrayType(_WORD, parameter.dimensions), None)
-        for axis in range(parameter.dimensions):
+        shape = strides = ir.Constant(ir.ArrayType(_WORD, kind.ndim), None)
+        for axis in range(kind.ndim):
             length = self.word(self.word(array, _SHAPE, _POINTER), axis)
             stride = self.word(self.word(array, _STRIDES, _POINTER), axis)
             size = self.mul(size, length)
             shape, strides = self.insert_value(shape, length, axis), self.insert_value(strides, stride, axis)
-        item = _WORD(np.dtype(parameter.dtype).itemsize)
-        structure = ir.Constant(_structure_type(parameter.dimensions), None)
+        item = _WORD(np.dtype(kind.dtype.name).itemsize)
+        structure = ir.Constant(_structure_type(kind.ndim), None)
         for place, value in enumerate((size, item, self.word(array, _DATA, _POINTER), shape, strides), start=2):
             structure = self.insert_value(structure, value, place)
         return structure

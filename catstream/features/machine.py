@@ -1,16 +1,15 @@
-"""Parameters, names and the processor of kernels, shared by their compiler and their calls."""
+"""Names and the processor of kernels, shared by their compiler and their calls."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-import re
 from types import FunctionType
-from typing import Any, NamedTuple
+from typing import Any
 
 import llvmlite.binding as llvm
 
-__all__ = ["ENTRY", "FUNCTIONS", "Parameter", "globals_of", "parameters", "processor", "target_machine"]
+__all__ = ["ENTRY", "FUNCTIONS", "globals_of", "processor", "target_machine"]
 
 ENTRY = "kernel"  #: name of the function in the machine code
 #: Functions of Python's C-API that the machine code may call.
@@ -23,29 +22,6 @@ FUNCTIONS = (
     "PyLong_AsLongLong",
     "Py_NewRef",
 )
-
-
-class Parameter(NamedTuple):
-    """The type of a kernel's parameter.
-
-    dtype       name of the dtype of the number or array
-    dimensions  of the array; 0 for a number
-    contiguous  if the array has to be C-contiguous
-    """
-
-    dtype: str
-    dimensions: int
-    contiguous: bool
-
-
-def parameters(signature: str) -> list[Parameter]:
-    """Parameters of a kernel.
-
-    >>> parameters("void(uint8[:,::1])")
-    [Parameter(dtype='uint8', dimensions=2, contiguous=True)]
-    """
-    found = re.findall(r"(\w+)(?:\[([:,1]+)\])?", signature.removeprefix("void"))
-    return [Parameter(dtype, axes.count(",") + 1 if axes else 0, axes.endswith("::1")) for dtype, axes in found]
 
 
 def globals_of(function: FunctionType) -> dict[str, Any]:

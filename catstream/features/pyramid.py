@@ -70,11 +70,6 @@ class Pyramid:
         self.image = np.ascontiguousarray(image)
         self._halves = {0: self.image}
 
-    @classmethod
-    def of(cls, image: np.ndarray) -> Pyramid:
-        """In colour, of a frame that may be grey."""
-        return cls(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the frame in pixels."""

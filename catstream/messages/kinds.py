@@ -147,10 +147,10 @@ class TrainingRows:
     offsets: Annotated[np.ndarray, Array("float32", ("k", 2), low=0, high=1)] | None = None
 
     @classmethod
-    def labelled(cls, rows: Sequence[np.ndarray], label: float | Sequence[float], weight: float = 1.0) -> Self:
+    def labelled(cls, rows: np.ndarray, label: float | Sequence[float], weight: float = 1.0) -> Self:
         """Rows of one weight, with one label or each its own."""
         k = len(rows)
-        return cls(np.array(rows, np.float32), np.full(k, label, np.float32), np.full(k, weight, np.float32))
+        return cls(np.asarray(rows, np.float32), np.full(k, label, np.float32), np.full(k, weight, np.float32))
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -7,10 +7,9 @@ trainer smooths with it.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.machinery import SourceFileLoader
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -71,39 +70,25 @@ def _imported() -> ModuleType:
     The packages of filterpy import scipy.stats for their other filters, which costs a second of processor time. If the
     program has imported filterpy, the module is that of the program.
     """
-    if "filterpy.kalman" not in sys.modules and (package := find_spec("filterpy")) is not None and package.origin:
-        folder = Path(package.origin).parent
-        common = _loaded("filterpy.common.helpers", folder / "common" / "helpers.py")
-        stats = ModuleType("filterpy.stats")
-        stats.logpdf = _logpdf  # type: ignore[attr-defined]
-        with _modules({"filterpy.common": common, "filterpy.stats": stats}):
-            return _loaded("filterpy.kalman.kalman_filter", folder / "kalman" / "kalman_filter.py")
-    return import_module("filterpy.kalman")
+    package = find_spec("filterpy")
+    if "filterpy.kalman" in sys.modules or package is None or package.origin is None:
+        return import_module("filterpy.kalman")
+    folder, stats = Path(package.origin).parent, ModuleType("filterpy.stats")
+    stats.logpdf = _logpdf  # type: ignore[attr-defined]
+    common = _loaded("filterpy.common.helpers", folder / "common" / "helpers.py")
+    # A program that has imported any module of filterpy has imported all of them, so neither of the two is there.
+    sys.modules.update({"filterpy.common": common, "filterpy.stats": stats})
+    try:
+        return _loaded("filterpy.kalman.kalman_filter", folder / "kalman" / "kalman_filter.py")
+    finally:
+        del sys.modules["filterpy.common"], sys.modules["filterpy.stats"]
 
 
 def _loaded(name: str, file: Path) -> ModuleType:
     """A module from its file; the packages that contain it are not imported."""
-    spec = spec_from_file_location(name, file)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{file} is not a module: install filterpy again")
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = ModuleType(name)
+    SourceFileLoader(name, str(file)).exec_module(module)
     return module
-
-
-@contextmanager
-def _modules(modules: dict[str, ModuleType]) -> Iterator[None]:
-    """Let these modules be found by an import inside the `with`."""
-    before = {name: sys.modules.get(name) for name in modules}
-    sys.modules.update(modules)
-    try:
-        yield
-    finally:
-        for name, module in before.items():
-            if module is None:
-                del sys.modules[name]
-            else:
-                sys.modules[name] = module
 
 
 def _logpdf(*values: Any, **options: Any) -> float:

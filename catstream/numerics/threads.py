@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from contextlib import ContextDecorator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 __all__ = ["limit_process", "one_thread"]
@@ -108,7 +109,8 @@ def _set(library: _Library, threads: int) -> None:
 _libraries = _Libraries()
 
 
-class one_thread(ContextDecorator):
+@contextmanager
+def one_thread(*, opencv: bool = False) -> Iterator[None]:
     """Run linear algebra on one thread inside a `with`, or inside the function that it decorates.
 
     It may be nested and used by several threads at once: the last one to leave restores the number of threads, also
@@ -125,27 +127,15 @@ class one_thread(ContextDecorator):
     ...     {library["num_threads"] for library in threadpool_info()}
     {1}
     """
+    if opencv:
+        import cv2
 
-    def __init__(self, *, opencv: bool = False) -> None:
-        self._opencv = opencv
-        self._entered: list[tuple[list[tuple[_Library, int]], int | None]] = []
-
-    def _recreate_cm(self) -> one_thread:
-        return one_thread(opencv=self._opencv)  # a decorated function may run in several threads at once
-
-    def __enter__(self) -> None:
-        threads = None
-        if self._opencv:
-            import cv2
-
-            threads = cv2.getNumThreads()
-            cv2.setNumThreads(1)
-        self._entered.append((_libraries.limit(), threads))
-
-    def __exit__(self, *_: object) -> None:
-        own, threads = self._entered.pop()
+        threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+    own = _libraries.limit()
+    try:
+        yield
+    finally:
         _libraries.restore(own)
-        if threads is not None:
-            import cv2
-
+        if opencv:
             cv2.setNumThreads(threads)

@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 
 from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
@@ -132,15 +131,6 @@ def test_an_object_that_begins_again_has_new_trees(settings, messages):
     assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
 
 
-def test_trees_may_be_of_another_class(settings, messages):
-    class Other(CoresetTree):
-        pass
-
-    compressor = Compressor(settings, tree=Other)
-    compressor.take(0, next(messages).objects[""], 1)
-    assert {type(tree) for tree in compressor.trees.values()} == {Other}
-
-
 def test_a_message_stored_already_is_ignored(settings, messages):
     forest, message = Forest(settings), next(messages)
     forest.take(message)
@@ -227,14 +217,6 @@ def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, 
     forest.save(tmp_path / "state")
     loaded = Forest.load(tmp_path / "state", settings).compressors[""].detector
     assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(detector))
-
-
-def test_memory_is_flat_between_doublings(settings, messages):
-    forest = Forest(settings)
-    take(forest, messages, 64)
-    small = forest.counters()["bytes"]
-    take(forest, messages, 64 * 15)
-    assert forest.counters()["bytes"] < 2.5 * small
 
 
 @pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])

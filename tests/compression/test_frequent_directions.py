@@ -47,8 +47,7 @@ def test_the_error_of_each_direction_stays_within_the_bound(stream):
 
 
 def test_two_sketches_merged_are_one_sketch_within_the_bound(stream):
-    sketch, other = sketched(stream[:75]), sketched(stream[75:])
-    sketch.merge(other)
+    sketch = sketched(stream[:75]).merged(sketched(stream[75:]))
     assert (sketch.rows_seen, len(sketch.nodes)) == (len(stream), 1)
     assert_allclose(sketch.sum, stream.sum(axis=0, dtype=np.float64), atol=ROUNDING * len(stream))
     assert_within_the_bound(sketch, stream)
@@ -78,7 +77,7 @@ def test_a_sketch_and_a_tree_are_not_merged(stream):
     tree = CoresetTree(SIZE)
     tree.insert(stream)
     with pytest.raises(ProtocolError, match=r"coreset.reduction=svd cannot merge one of frequent-directions"):
-        tree.merge(sketched(stream))
+        tree.merged(sketched(stream))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7))

@@ -91,14 +91,6 @@ def test_a_sample_after_many_others_is_that_of_a_tree_that_made_none(cuts, seed)
         assert_array_equal(tree.sample().rows, grown(rows[:start], size=4).sample().rows)
 
 
-def test_two_trees_merged_are_sampled_as_a_tree_that_was_not_sampled_before(stream):
-    tree, other = grown(stream[:75]), grown(stream[75:])
-    fresh = tree.merged(other).sample()
-    tree.sample()
-    tree.merge(other)
-    assert_array_equal(tree.sample().rows, fresh.rows)
-
-
 @pytest.mark.parametrize("count", [0, SIZE - 1])
 def test_before_the_first_leaf_there_is_nothing_to_sample(count):
     summary = grown(np.ones((count, 3))).sample()

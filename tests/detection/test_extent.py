@@ -53,7 +53,7 @@ def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
 @pytest.mark.parametrize("steps", [-2, -1, 1, 2])
 def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(draw, steps):
     image, box = draw(60, 60)
-    frame, window = Pyramid.of(image), Window.around(box, Settings().search.context)
+    frame, window = Pyramid(image), Window.around(box, Settings().search.context)
     _, training = teacher.first_training(frame, window, np.random.default_rng(0), Settings())
     rows = training[EXTENT]
     regression = ridge.Regression(np.column_stack([rows.rows, np.ones(len(rows), np.float32)]))

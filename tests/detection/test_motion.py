@@ -35,12 +35,6 @@ def distance(a: np.ndarray | tuple[float, float], b: np.ndarray | tuple[float, f
     return float(np.hypot(a[0] - b[0], a[1] - b[1]))
 
 
-def test_predicts_the_next_centre_of_steady_motion(motion):
-    estimate = moving(motion)
-    assert velocity(estimate) == pytest.approx((3, -1), abs=1e-3)
-    assert centre(predicted(estimate, motion)) == pytest.approx((283, 139), abs=0.01)
-
-
 def test_a_lost_object_coasts_to_a_stop(motion):
     estimate = moving(motion)
     start, speed = centre(estimate), np.hypot(*velocity(estimate))

@@ -38,12 +38,6 @@ def test_a_tiny_frame_is_never_halved_away(rng, shape):
     assert wide <= max(shape)
 
 
-def test_a_grey_frame_in_colour_has_three_equal_channels(image):
-    grey = image[:, :, 0]
-    np.testing.assert_array_equal(Pyramid.of(grey).image, np.repeat(grey[:, :, None], 3, axis=2))
-    assert Pyramid.of(image).image is image
-
-
 def test_a_cut_at_its_own_scale_is_a_slice(image):
     np.testing.assert_array_equal(Pyramid(image).cut(100, 80, 1, 1, 64), planes_of(image[48:112, 68:132]))
 

@@ -88,15 +88,13 @@ def test_the_last_of_two_threads_restores_the_number():
 
 @pytest.mark.usefixtures("libraries")
 def test_a_number_of_threads_set_by_the_user_meanwhile_is_kept():
-    holder = one_thread()
-    holder.__enter__()
-    with threadpool_limits(1):
-        pass
-    libraries = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
-    for library in libraries:
-        library._real_set_num_threads(3) if hasattr(library, "_real_set_num_threads") else library.set_num_threads(3)
-    meant = [library.get_num_threads() for library in libraries]
-    holder.__exit__()
+    with one_thread():
+        with threadpool_limits(1):
+            pass
+        libraries = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
+        for each in libraries:
+            each._real_set_num_threads(3) if hasattr(each, "_real_set_num_threads") else each.set_num_threads(3)
+        meant = [library.get_num_threads() for library in libraries]
     assert [library.get_num_threads() for library in libraries] == meant
 
 

@@ -126,7 +126,7 @@ def test_before_the_first_sample_there_is_nothing_to_save():
 
 
 def test_a_file_of_another_kind_is_an_error(messages, tmp_path):
-    compressed(messages).trees["object"].save(tmp_path / "one")
+    storage.write(tmp_path / "one", *compressed(messages).trees["object"].state())
     with pytest.raises(ProtocolError, match="not a saved model"):
         Learned.load(tmp_path / "one")
 

@@ -137,18 +137,6 @@ def test_a_crash_while_the_files_of_a_resumed_run_are_written_again_loses_nothin
     assert rows_of(run) == rows_of(whole)
 
 
-def test_rows_that_a_power_cut_took_from_the_results_are_written_again_from_the_ndjson_file(files):
-    run = files("run", ["t.ndjson"])
-    fill(run, 0, 7)
-    for path in run.output.iterdir():
-        os.truncate(path, 20)
-    assert run.position().seq == 7
-    fill(run, 7, 7, resume=True)
-    whole = files("whole", ["t.ndjson"])
-    fill(whole, 0, 7)
-    assert rows_of(run) == rows_of(whole)
-
-
 def test_a_file_that_is_new_when_a_run_is_resumed_gets_all_tracks(files):
     fill(files("run", ["t.csv"]), 0, 7)
     more = files("run", ["t.csv", "t.json", "t.txt"])

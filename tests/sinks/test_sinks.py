@@ -183,20 +183,6 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
         assert sum(1 for _ in frames) == len(TRACKS)
 
 
-@pytest.mark.parametrize("suffix", [".ndjson", ".csv", ".txt"])
-def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, suffix):
-    path, told = tmp_path / f"tracks{suffix}", r"cannot write to .* any more: No space left on device$"
-    stack = ExitStack()
-    (sink,) = stack.enter_context(open_files([path]))
-    sink.write([TRACKS[0]])
-    before = path.read_text()
-    full(path)
-    for last in (lambda: sink.write([TRACKS[2]]), stack.close):  # which tries it once more
-        with pytest.raises(VideoError, match=told):
-            last()
-    assert path.read_text() == before
-
-
 @pytest.mark.parametrize("disk", [4096], indirect=True)
 def test_a_new_file_whose_first_line_the_disk_does_not_take_is_not_left(disk):
     (disk / "ballast").write_bytes(bytes(4096))

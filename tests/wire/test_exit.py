@@ -18,7 +18,7 @@ from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
 from catstream.wire.endpoint import Endpoint
 
-rows = TrainingRows.labelled([np.ones(100_000, np.float32)] * 10, 1)
+rows = TrainingRows.labelled(np.ones((10, 100_000), np.float32), 1)
 with Sender(FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
     features.ask_position()
     features.window.resume(0, Position())

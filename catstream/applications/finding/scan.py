@@ -105,7 +105,7 @@ class Scan:
         -------
         for each model, windows of the fitted size and aspect ratio that do not overlap, highest score first
         """
-        frame = Pyramid.of(image)
+        frame = Pyramid(image)
         found = []
         for searched, windows in zip(self._models, self.windows(frame), strict=True):
             seen = [_fitted(frame, each.window, searched) for each in windows]

@@ -19,7 +19,7 @@ def every_window(cells, weights, bias, least):
 @pytest.mark.parametrize("number", [0, 20, 40, 59])
 @pytest.mark.parametrize("threshold", [0.2, 0.5])
 def test_models_together_find_the_windows_of_each_models_plain_scan(learned, images, number, threshold, monkeypatch):
-    frame = Pyramid.of(images[number])
+    frame = Pyramid(images[number])
     together = Scan(learned, threshold).windows(frame)
     monkeypatch.setattr(Cells, "respond_above", every_window)
     plain = [Scan([each], threshold).windows(frame)[0] for each in learned]

@@ -36,7 +36,7 @@ def lockstep(demo_video, begins):
     messages = []
     with open_source(str(path)) as frames:
         for frame in frames:
-            pyramid = Pyramid.of(frame.image)
+            pyramid = Pyramid(frame.image)
             given = {}
             for number, (name, first) in enumerate(begins.items()):
                 if frame.number == first:
