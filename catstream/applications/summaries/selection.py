@@ -85,9 +85,8 @@ class RowSelection(Generic[_Key]):
             raise SettingsError(f"k images are selected with k from 1 to {self._size}, got {k}: give another k")
         self._k = k
         self._sketch = FrequentDirections(self._size)
-        self._new: list[Float32] = []  # candidates that are not in the sketch yet
-        self._keys: list[_Key] = []  # of the old candidates, then of the new ones
-        self._old = np.empty((0, 0), np.float32)
+        self._candidates: list[Float32] = []
+        self._keys: list[_Key] = []  # of the candidates
         self.count = 0
 
     def add(self, row: np.ndarray, key: _Key) -> None:
@@ -98,14 +97,16 @@ class RowSelection(Generic[_Key]):
         row : (d,), finite numbers
         key : returned if the row is selected
         """
-        self._new.append(np.array(row, np.float32))
+        candidate = np.array(row, np.float32)
+        self._sketch.insert(candidate[None])
+        self._candidates.append(candidate)
         self._keys.append(key)
         self.count += 1
-        if len(self._new) == self._size:
-            self._insert()
-            if len(self._old) > self._size:
-                chosen, _ = choose(*self._products(), self._size)
-                self._keep(sorted(self._completed(chosen, self._size)))
+        if len(self._candidates) == 2 * self._size:
+            chosen, _ = choose(*self._products(), self._size)
+            remaining = sorted(self._completed(chosen, self._size))
+            self._candidates = [self._candidates[number] for number in remaining]
+            self._keys = [self._keys[number] for number in remaining]
 
     def result(self) -> Selection[_Key]:
         """The selection among all rows so far; the stream may continue.
@@ -117,7 +118,6 @@ class RowSelection(Generic[_Key]):
         """
         if self.count < self._k:
             raise SettingsError(f"k = {self._k} images cannot be selected from {self.count}: give a smaller k")
-        self._insert()
         gram, products = self._products()
         chosen = exchange(gram, products, choose(gram, products, self._k)[0])
         order, energies = choose(gram[np.ix_(chosen, chosen)], products[:, chosen], len(chosen))
@@ -128,17 +128,9 @@ class RowSelection(Generic[_Key]):
         error = min(1.0, self._k / (self._size + 1)) * max(self._sketch.dropped_energy, 0.0) / whole
         return Selection(keys, shares, self.count, kept, min(kept + error, 1.0))
 
-    def _insert(self) -> None:
-        """Insert the new candidates into the sketch."""
-        if self._new:
-            rows = np.array(self._new)
-            self._sketch.insert(rows)
-            self._old = np.vstack([self._old, rows]) if len(self._old) else rows
-            self._new = []
-
     def _products(self) -> tuple[Float64, Float64]:
         """Products of the candidates with one another, and of the sketch with them."""
-        candidates = self._old.astype(np.float64)
+        candidates = np.array(self._candidates, np.float64)
         sketch = np.vstack([*(node.rows for node in self._sketch.nodes), self._sketch.pending])
         return candidates @ candidates.T, sketch @ candidates.T
 
@@ -147,9 +139,6 @@ class RowSelection(Generic[_Key]):
         taken = set(chosen)
         others = (number for number in range(len(self._keys)) if number not in taken)
         return [*chosen, *islice(others, count - len(chosen))]
-
-    def _keep(self, numbers: list[int]) -> None:
-        self._old, self._keys = self._old[numbers], [self._keys[number] for number in numbers]
 
 
 def choose(gram: Float64, products: Float64, k: int) -> tuple[list[int], list[float]]:
