@@ -1,4 +1,4 @@
-"""Real images for the tests of summaries: parts of two photographs, and frames of the demo video."""
+"""Real images for the tests of summaries: parts of two photographs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from catstream.applications.summaries.images import describe
-from catstream.video.source import open_source
 
 
 @pytest.fixture(scope="session")
@@ -29,14 +28,6 @@ def photographs() -> list[np.ndarray]:
 def rows(photographs: list[np.ndarray]) -> np.ndarray:
     """Their feature rows, float32 (120, d)."""
     return np.array([describe(image) for image in photographs])
-
-
-@pytest.fixture(scope="session")
-def frames(demo_video) -> list[np.ndarray]:
-    """The first frames of the demo video."""
-    path, _ = demo_video(60)
-    with open_source(path) as source:
-        return [frame.image for frame in source][:20]
 
 
 @pytest.fixture

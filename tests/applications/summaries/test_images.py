@@ -20,11 +20,6 @@ def test_images_of_different_sizes_are_summarised(photographs):
     assert found.kept == pytest.approx(sum(found.energies))
 
 
-def test_a_summary_of_copies_of_two_photographs_has_both(photographs):
-    copies = [cv2.resize(photographs[number % 2], (60 + number, 90 - number)) for number in range(30)]
-    assert {index % 2 for index in summarize(copies, k=2).selected} == {0, 1}
-
-
 def test_the_same_images_give_the_same_summary_as_arrays_and_as_files(photographs, tmp_path):
     files = [tmp_path / f"{number}.png" for number in range(10)]
     for file, image in zip(files, photographs, strict=False):
@@ -32,11 +27,10 @@ def test_the_same_images_give_the_same_summary_as_arrays_and_as_files(photograph
     assert summarize(files, 3) == summarize(map(str, files), 3) == summarize(photographs[:10], 3)
 
 
-def test_a_row_changes_little_with_the_size_of_the_image(frames):
-    for image in frames[:3]:
+def test_a_row_changes_little_with_the_size_of_the_image(photographs):
+    for image, other in zip(photographs[:10:2], photographs[1:10:2], strict=True):
         row, smaller = describe(image), describe(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        other = describe(np.ascontiguousarray(frames[-1][::-1]))
-        assert np.linalg.norm(row - smaller) < 0.3 * np.linalg.norm(row - other)
+        assert np.linalg.norm(row - smaller) < 0.3 * np.linalg.norm(row - describe(other))
 
 
 def test_invalid_input_is_an_error_of_one_line(photographs, tmp_path):
