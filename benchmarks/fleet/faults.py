@@ -172,7 +172,7 @@ class Trial:
                 self.fleet.add(next(each for each in self._streams() if each.name == name))
 
     def _check_film(self, name: str) -> None:
-        state = self.store.newest(name)
+        state = self.store.stream(name).newest()
         if state is None:
             self.wrong.append(f"{name} has ended without a state")
             return

@@ -98,7 +98,7 @@ def answered(status: FleetStatus) -> float:
 def store() -> Iterator[tuple]:
     """A state that is written to a folder, and its bytes."""
     with tempfile.TemporaryDirectory() as folder:
-        claim = Store(folder).claim("camera", "node")
+        claim = Store(folder).stream("camera").claim("node")
         files = {"trees/1.safetensors": secrets.token_bytes(_STATE_BYTES)}
         write = least(lambda: [claim.write(files, {}) for _ in range(_WRITES)]) / _WRITES
         yield "a state is written", write, _STATE_BYTES / 2**20

@@ -165,8 +165,8 @@ class Controller:
             if not may_wait:
                 desired.check_fits(self._nodes, self._ended)
             for (stream, name), data in (models or {}).items():
-                self._store.put_model(given_model(stream, name), data, {})
-            self._store.put_fleet(to_json(desired))
+                self._store.model(given_model(stream, name)).put({"model": data}, {})
+            self._store.fleet.put({"fleet": to_json(desired)}, {})
             with self._lock:
                 running = self._phase == "up"
                 lines: list[str] = self._desired.spec.changes(desired.spec, self._ended, are_running=running)
@@ -222,8 +222,8 @@ class Controller:
             if self._keys is not None:
                 ensure(self._keys)
             self._registry = RegistryServer(self._listen, str(self._keys or ""), lambda: self._recent)
-        if (stored := self._store.get_fleet()) is not None:
-            self._desired = from_json(stored, Desired)
+        if (stored := self._store.fleet.newest()) is not None:
+            self._desired = from_json(stored.files["fleet"], Desired)
         if ray.get_runtime_context().was_current_actor_reconstructed:  # by Ray, while the fleet ran
             self._phase = "up"
         self._turn()

@@ -154,7 +154,7 @@ class Fleet:
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
-                store.remove(name)  # its actor is superseded, if it still runs
+                store.stream(name).clear()  # its actor is superseded, if it still runs
         return _about(lines, names)
 
     def move(self, name: str, node: str) -> str:

@@ -133,8 +133,8 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
     # Ray reserves a core of one node for a task by default, and waits for it without end if the streams have them all.
     load, join = remote(num_returns=2, num_cpus=0)(saved_part), remote(num_cpus=0)(joined)
     refs: dict[str, Any] = {stream: load.remote(url, stream, name, named=named) for stream in streams}
-    store = Store(url)
-    earlier = before.files["model"] if (before := store.get_model(name)) is not None else None
+    models = Store(url).model(name)
+    earlier = before.files["model"] if (before := models.newest()) is not None else None
     if earlier is not None and not named:
         refs[_EARLIER] = ray.put(Part.of(Learned.from_bytes(earlier, _EARLIER))), ray.put(earlier)
     try:
@@ -147,7 +147,7 @@ def merge_streams(url: str, streams: Iterable[str], name: str, *, named: bool) -
     except RayTaskError as error:
         raise (error.cause if isinstance(error.cause, CatstreamError) else error) from None
     if merged != earlier:  # the streams that follow the object get each new model
-        store.put_model(name, merged, {"streams": chosen})
+        models.put({"model": merged}, {"streams": chosen})
     return Merged(merged, tuple(chosen), tuple(stream for stream in parts if stream not in chosen))
 
 
@@ -160,7 +160,7 @@ def saved_part(url: str, stream: str, name: str, *, named: bool) -> tuple[Part, 
         If it has nothing, although the stream was `named`.
     """
     try:
-        if (newest := Store(url).newest(stream)) is None:
+        if (newest := Store(url).stream(stream).newest()) is None:
             raise FleetError("there is no state of it in the store yet")
         with tempfile.TemporaryDirectory(prefix="catstream-merge-") as folder:
             state.restore(Path(folder), newest.files)

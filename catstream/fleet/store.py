@@ -116,14 +116,17 @@ class Generation:
 
 
 class States:
-    """The states below a folder of the store."""
+    """The states below a folder of the store.
+
+    Every method raises StoreError if the store cannot be reached or is full; the call may be repeated.
+    """
 
     def __init__(self, objects: Objects, folder: str) -> None:
         self._objects = objects
         self.folder = folder
 
     def newest(self, after: int = 0) -> Generation | None:
-        """Return the newest state; None if there is none of a holder with a token above `after`."""
+        """Return the newest state; None if there is none of a holder with a token above `after`, which is quick."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
                 states = (self._read(place) for place in self.listed().newest(after))
@@ -131,7 +134,7 @@ class States:
         raise self._busy("read")
 
     def claim(self, holder: str) -> Claim:
-        """Become the holder, whose name is for messages."""
+        """Become the only process that may write states; the name of the holder, such as its node, is for messages."""
         for _ in range(_ATTEMPTS):
             found = self.listed()
             token = max([0, *found.claims, *(place.token for place in found.states)]) + 1
@@ -142,10 +145,17 @@ class States:
                 return Claim(self, token, holder, self.newest(), found.removed)
         raise self._busy("claimed")
 
-    def clear(self, holder: str) -> None:
-        """Remove all states. Their holder, if there is one, is superseded."""
+    def put(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
+        """Write a state where there is no lasting holder. Of two processes at once, both write, one after the other."""
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(FencedError):
+                return self.claim(_this_process()).write(files, facts)
+        raise self._busy("written")
+
+    def clear(self) -> None:
+        """Remove all states. A process that still holds them is superseded: it can no longer write."""
         if self.listed().newest():
-            token = self.claim(holder).token
+            token = self.claim(_this_process()).token
             with contextlib.suppress(FileExistsError):
                 self._objects.create(self._name(token, _REMOVED), b"")
             self.remove_up_to(token, kept=0)
@@ -248,7 +258,7 @@ class Claim:
 
 
 class Store:
-    """The store of a fleet.
+    """The store of a fleet: the states of its streams, its desired state, and its merged models.
 
     Parameters
     ----------
@@ -278,74 +288,19 @@ class Store:
         """
         self._objects.make()
 
-    def claim(self, stream: str, holder: str) -> Claim:
-        """Become the only process that may write the states of a stream.
+    @property
+    def fleet(self) -> States:
+        """The desired states of the fleet, each as the file `fleet`."""
+        return States(self._objects, "fleet")
 
-        Parameters
-        ----------
-        holder : name of the process for messages, such as its node
+    def stream(self, name: str) -> States:
+        """The states of a stream."""
+        check_fleet_name(name, "stream")
+        return States(self._objects, f"streams/{name}")
 
-        Raises
-        ------
-        StoreError
-            If the store cannot be reached or is full. The call may be repeated.
-        """
-        return self._states(_streams(stream)).claim(holder)
-
-    def newest(self, stream: str) -> Generation | None:
-        """Return the newest state of a stream; None if there is none."""
-        return self._states(_streams(stream)).newest()
-
-    def remove(self, stream: str) -> None:
-        """Remove the states of a stream. A process that still holds it can no longer write."""
-        self._states(_streams(stream)).clear(_this_process())
-
-    def put_fleet(self, data: bytes) -> None:
-        """Store the desired streams of the fleet."""
-        self._put("fleet", {"fleet": data}, {})
-
-    def get_fleet(self) -> bytes | None:
-        """Return the newest desired streams of the fleet; None if there are none."""
-        found = self._states("fleet").newest()
-        return found.files["fleet"] if found else None
-
-    def put_model(self, name: str, data: bytes, facts: Mapping[str, Any]) -> None:
-        """Store the merged model of an object.
-
-        Parameters
-        ----------
-        name : the name of the object
-        """
-        self._put(_models(name), {"model": data}, facts)
-
-    def get_model(self, name: str, after: int = 0) -> Generation | None:
-        """Return the newest merged model of an object, as the file `model`.
-
-        Parameters
-        ----------
-        name : the name of the object
-        after : token of the model that the caller has; None is returned if there is no newer one, which is quick
-        """
-        return self._states(_models(name)).newest(after)
-
-    def _put(self, folder: str, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Write where there is no lasting holder. Of two processes at once, both write, one after the other."""
-        for _ in range(_ATTEMPTS):
-            with contextlib.suppress(FencedError):
-                return self._states(folder).claim(_this_process()).write(files, facts)
-        raise StoreError(f"{folder} could not be written: other processes change it all the time; try again later")
-
-    def _states(self, folder: str) -> States:
-        return States(self._objects, folder)
-
-
-def _streams(name: str) -> str:
-    check_fleet_name(name, "stream")
-    return f"streams/{name}"
-
-
-def _models(name: str) -> str:
-    return f"models/{_NO_NAME if name == UNNAMED else check_name(name)}"
+    def model(self, name: str) -> States:
+        """The merged models of an object, each as the file `model`."""
+        return States(self._objects, f"models/{_NO_NAME if name == UNNAMED else check_name(name)}")
 
 
 def _this_process() -> str:

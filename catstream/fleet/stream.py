@@ -247,7 +247,7 @@ class Stream:
     def _run_once(self) -> None:
         """Claim the stream, and run the pipeline from the state in the store, or from the start."""
         self._store = Store(self._url)
-        claim = self._store.claim(self._spec.name, f"{self._place.node} process {os.getpid()}")
+        claim = self._store.stream(self._spec.name).claim(f"{self._place.node} process {os.getpid()}")
         self._store_trouble = ""
         where = f"after frame {claim.state.facts['frame']}" if claim.state is not None else "from the start"
         _log.info("%s: claimed with token %d, %s", self._spec.name, claim.token, where)
@@ -363,7 +363,7 @@ class Stream:
                     with suppress(CommandRejectedError):  # it was forgotten already
                         controlled.forget(name)
         for name in sorted(self._spec.models.keys() - before):
-            if (model := self._store.get_model(given_model(self._spec.name, name))) is None:
+            if (model := self._store.model(given_model(self._spec.name, name)).newest()) is None:
                 raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
             self._search(pipeline, model, name)
 
@@ -376,7 +376,9 @@ class Stream:
     def _search_merged(self, pipeline: Pipeline, known: dict[str, int]) -> None:
         """Search for each followed object that is not present by a merged model that is newer than the known one."""
         for name in self._follow:
-            if name not in self._present and (model := self._store.get_model(name, known.get(name, 0))) is not None:
+            if name in self._present:
+                continue
+            if (model := self._store.model(name).newest(known.get(name, 0))) is not None:
                 known[name] = model.token
                 self._search(pipeline, model, name)
 

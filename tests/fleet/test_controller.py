@@ -19,7 +19,7 @@ from catstream.fleet.controller import Controller
 from catstream.fleet.desired import Desired
 from catstream.fleet.life import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
-from catstream.fleet.store import Store
+from catstream.fleet.store import States, Store
 from catstream.fleet.stream import Report, _free_port
 from catstream.messages.kinds import StreamStatus
 from catstream.wire.keys import allow
@@ -291,14 +291,14 @@ def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, r
 
 def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, spec):
     store = Store(spec.store)
-    store.claim("gate", "n1").write({"a": b""}, {"ended": False})
+    store.stream("gate").claim("n1").write({"a": b""}, {"ended": False})
     site.change("moved", "gate", ray.nodes[1])
     assert site.change("removed", ["gate"]) == ["gate: is removed", "roof: is unchanged"]
-    store.remove("gate")
+    store.stream("gate").clear()
     for _ in range(4):
         site._turn()
-    assert store.newest("gate") is None
-    assert from_json(store.get_fleet(), Desired).pins == {}
+    assert store.stream("gate").newest() is None
+    assert from_json(store.fleet.newest().files["fleet"], Desired).pins == {}
     assert "gate" not in site._streams
     site.change("added", GATE)
     site._turn()
@@ -322,7 +322,7 @@ def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, ray, monke
         raise StoreError("the store cannot be reached")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "put_fleet", fails)
+        patch.setattr(States, "put", fails)
         for change in (
             lambda: site.change("added", replace(GATE, name="new")),
             lambda: site.change("moved", "gate", ray.nodes[1]),
@@ -342,7 +342,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
         hangs.set()
         goes_on.wait(60)
 
-    monkeypatch.setattr(Store, "put_fleet", put)
+    monkeypatch.setattr(States, "put", put)
     change = threading.Thread(target=site.change, args=("drained", "n1"), kwargs={"undo": False})
     change.start()
     try:
@@ -364,7 +364,7 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
     before.end()
     ray.has_restarted = True
     with monkeypatch.context() as patch:
-        patch.setattr(Store, "get_fleet", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
+        patch.setattr(States, "newest", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
         again = made()
         with pytest.raises(StoreError, match="cannot be reached"):
             again.ready()

@@ -98,7 +98,7 @@ def test_a_stream_of_a_dead_node_continues_and_the_node_comes_back(home, site, u
     fleet, spec = site
     fleet.move("gate", "node-2")
     until(lambda: (found := fleet.status().streams["gate"]).node == "node-2" and found.state == "running")
-    until(lambda: (state := Store(spec.store).newest("gate")) is not None and state.facts["seq"] > 5)
+    until(lambda: (state := Store(spec.store).stream("gate").newest()) is not None and state.facts["seq"] > 5)
     before = fleet.status().streams["gate"]
     raylets(home / "site")["node-2"].kill()
     until(lambda: (found := fleet.status().streams["gate"]).token > before.token and found.state == "running")
@@ -168,7 +168,7 @@ def test_a_stream_whose_source_cannot_be_opened_has_failed_until_it_is_changed_a
     fleet.add(StreamSpec("cam-8", LIVE, cores=0.1))
     until(lambda: fleet.status().streams["cam-8"].state in ("waiting", "running"))
     assert fleet.remove("cam-8", forget=True) == ["cam-8: is removed"]
-    until(lambda: Store(site[1].store).newest("cam-8") is None)
+    until(lambda: Store(site[1].store).stream("cam-8").newest() is None)
 
 
 def test_a_node_that_is_drained_gives_its_streams_away(site, until):
@@ -195,7 +195,7 @@ def test_a_merge_runs_on_nodes_whose_cores_are_all_reserved(site, until):
     merged = fleet.merge("film")
     fleet.remove("full", forget=True)
     assert merged.streams == ("film",)
-    assert Store(spec.store).get_model("").files["model"] == merged.model
+    assert Store(spec.store).model("").newest().files["model"] == merged.model
     with pytest.raises(FleetError, match="no stream has learned of 'nobody'"):
         merge_streams(spec.store, ["film"], "nobody", named=False)
 

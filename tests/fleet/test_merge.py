@@ -160,7 +160,7 @@ def put_state(tmp_path, name, seed, frames=12):
     for frame, features in enumerate(stream(seed, frames)):
         forest.take(Features(frame + 1, frame, 0.0, {"anna": features}))
     CheckpointStore(folder / "trees").save(forest)
-    Store(store_of(tmp_path)).claim(name, "here").write(files(folder), {})
+    Store(store_of(tmp_path)).stream(name).claim("here").write(files(folder), {})
 
 
 def test_the_part_of_a_stream_is_what_its_newest_state_has_learned(store):
@@ -188,16 +188,16 @@ def test_the_nodes_merge_the_states_in_the_store_and_only_a_new_model_is_stored(
     merged = merge_streams(store, streams, "anna", named=False)
     assert set(merged.streams) == {"door", "yard", "hall"}
     assert merged.model == merge_models([learned(seed).to_bytes() for seed in range(3)])
-    first = Store(store).get_model("anna")
+    first = Store(store).model("anna").newest()
     assert first.files["model"] == merged.model
     again = merge_streams(store, streams, "anna", named=False)
     assert again.model == merged.model
     assert set(again.skipped) == {"door", "yard", "hall"}
-    assert Store(store).get_model("anna", first.token) is None
+    assert Store(store).model("anna").newest(first.token) is None
     for seed, name in enumerate(merged.streams):
         put_state(tmp_path, name, streams.index(name), 14 + seed)
     assert set(merge_streams(store, streams, "anna", named=False).streams) == set(merged.streams)
-    assert Store(store).get_model("anna").token > first.token
+    assert Store(store).model("anna").newest().token > first.token
     with pytest.raises(FleetError, match="stream gate: there is no state of it in the store yet"):
         merge_streams(store, ["door", "gate"], "anna", named=True)
     with pytest.raises(FleetError, match="no stream has learned of 'ben' yet"):

@@ -314,7 +314,7 @@ def test_a_late_write_does_not_bring_a_removed_stream_back():
     claim = states.claim("old")
     claim.write({}, {})
     memory.late.append((f"{FOLDER}/00000001/00000002", memory.read(f"{FOLDER}/00000001/00000001")))
-    states.clear("remover")
+    states.clear()
     memory.land(0)
     assert states.newest() is None
     new = states.claim("new")

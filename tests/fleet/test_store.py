@@ -70,31 +70,31 @@ def listed(store, stream="cam-7"):
 
 
 def test_a_state_is_read_as_it_was_written(store):
-    store.claim("cam-7", "node-1").write(STATE, {"frame": 12})
-    found = store.newest("cam-7")
+    store.stream("cam-7").claim("node-1").write(STATE, {"frame": 12})
+    found = store.stream("cam-7").newest()
     assert (found.files, found.facts) == (STATE, {"frame": 12})
 
 
 def test_a_fenced_holder_writes_no_more_and_is_told_by_whom(store):
-    paused = store.claim("cam-7", "node-1")
+    paused = store.stream("cam-7").claim("node-1")
     paused.write(STATE, {"frame": 1})
-    store.claim("cam-7", "node-2").write(STATE, {"frame": 2})
+    store.stream("cam-7").claim("node-2").write(STATE, {"frame": 2})
     for _ in range(2):
         with pytest.raises(FencedError, match=r"streams/cam-7 was claimed by node-2 after node-1"):
             paused.write(STATE, {"frame": 3})
-    assert store.newest("cam-7").facts == {"frame": 2}
+    assert store.stream("cam-7").newest().facts == {"frame": 2}
 
 
 def test_two_states_stay_however_many_are_written(store):
-    claim = store.claim("cam-7", "node-1")
+    claim = store.stream("cam-7").claim("node-1")
     for frame in range(9):
         claim.write(STATE, {"frame": frame})
     assert listed(store) == ([claim.token], [(claim.token, 8), (claim.token, 9)])
 
 
 def test_a_later_holder_removes_the_states_and_the_claim_of_an_earlier_one(store):
-    store.claim("cam-7", "node-1").write(STATE, {"frame": 1})
-    claim = store.claim("cam-7", "node-2")
+    store.stream("cam-7").claim("node-1").write(STATE, {"frame": 1})
+    claim = store.stream("cam-7").claim("node-2")
     claim.write(STATE, {"frame": 2})
     assert listed(store) == ([1, 2], [(1, 1), (2, 1)])
     claim.write(STATE, {"frame": 3})
@@ -102,26 +102,26 @@ def test_a_later_holder_removes_the_states_and_the_claim_of_an_earlier_one(store
 
 
 def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
-    old = store.claim("cam-7", "node-1")
+    old = store.stream("cam-7").claim("node-1")
     old.write(STATE, {"frame": 1})
-    store.remove("cam-7")
-    store.remove("never-seen")
-    assert store.newest("cam-7") is None
+    store.stream("cam-7").clear()
+    store.stream("never-seen").clear()
+    assert store.stream("cam-7").newest() is None
     with pytest.raises(FencedError):
         old.write(STATE, {"frame": 2})
-    new = store.claim("cam-7", "node-2")
+    new = store.stream("cam-7").claim("node-2")
     assert (new.state, new.token > old.token) == (None, True)
 
 
 def test_the_newest_spec_and_model_are_returned(store):
-    assert (store.get_fleet(), store.get_model("anna")) == (None, None)
+    assert (store.fleet.newest(), store.model("anna").newest()) == (None, None)
     for version in (1, 2):
-        store.put_fleet(b"spec %d" % version)
-        store.put_model("anna", b"model %d" % version, {"version": version})
-    found = store.get_model("anna")
-    assert store.get_fleet() == b"spec 2"
+        store.fleet.put({"fleet": b"spec %d" % version}, {})
+        store.model("anna").put({"model": b"model %d" % version}, {"version": version})
+    found = store.model("anna").newest()
+    assert store.fleet.newest().files == {"fleet": b"spec 2"}
     assert (found.files, found.facts) == ({"model": b"model 2"}, {"version": 2})
-    assert store.get_model("anna", after=found.token) is None
+    assert store.model("anna").newest(found.token) is None
 
 
 def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
@@ -131,7 +131,7 @@ def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
     def claimed(turn):
         store = Store(str(tmp_path))
         barrier.wait()
-        return store.claim("cam-7", f"node-{turn}")
+        return store.stream("cam-7").claim(f"node-{turn}")
 
     with ThreadPoolExecutor(8) as pool:
         claims = list(pool.map(claimed, range(8)))
@@ -146,26 +146,26 @@ def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\n", "é", "x" * 65])
 def test_an_invalid_name_of_a_stream_is_refused(tmp_path, name):
     with pytest.raises(FleetError, match="is not a valid name of a stream"):
-        Store(str(tmp_path)).claim(name, "node-1")
+        Store(str(tmp_path)).stream(name).claim("node-1")
 
 
 def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
     """It may be a file system that is not mounted on this machine."""
     store = Store(str(tmp_path / "share"))
     with pytest.raises(StoreError, match="is its file system mounted"):
-        store.claim("cam-7", "node-1")
+        store.stream("cam-7").claim("node-1")
     store.check()
-    assert store.claim("cam-7", "node-1").token == 1
+    assert store.stream("cam-7").claim("node-1").token == 1
 
 
 def test_files_of_a_store_are_readable_by_their_owner_only(tmp_path):
-    Store(str(tmp_path)).put_fleet(b"rtsp://user:password@camera")
+    Store(str(tmp_path)).fleet.put({"fleet": b"rtsp://user:password@camera"}, {})
     (path,) = (tmp_path / "fleet").glob("*/*1")
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
 def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
-    claim = Store(str(tmp_path)).claim("cam-7", "node-1")
+    claim = Store(str(tmp_path)).stream("cam-7").claim("node-1")
     claim.write(STATE, {"frame": 1})
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
@@ -176,19 +176,19 @@ def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
             claim.write({"state": bytes(5000)}, {"frame": 2})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert Store(str(tmp_path)).newest("cam-7").facts == {"frame": 1}
+    assert Store(str(tmp_path)).stream("cam-7").newest().facts == {"frame": 1}
     claim.write(STATE, {"frame": 3})
-    assert Store(str(tmp_path)).newest("cam-7").facts == {"frame": 3}
+    assert Store(str(tmp_path)).stream("cam-7").newest().facts == {"frame": 3}
 
 
 def test_what_a_killed_writer_left_long_ago_is_removed_by_the_next_claim(tmp_path, monkeypatch):
     store = Store(str(tmp_path))
     with monkeypatch.context() as killed:
         killed.setattr(Path, "unlink", lambda *_, **__: None)
-        store.claim("cam-7", "node-1").write(STATE, {})
+        store.stream("cam-7").claim("node-1").write(STATE, {})
     old, recent = tmp_path.glob("streams/cam-7/*/.*.part")
     os.utime(old, (0, 0))
-    store.claim("cam-7", "node-2")
+    store.stream("cam-7").claim("node-2")
     assert list(tmp_path.glob("streams/cam-7/*/.*.part")) == [recent]
 
 
@@ -200,7 +200,7 @@ def test_a_file_is_created_whole_or_not_at_all(tmp_path):
 
 
 def test_a_stopped_server_is_a_store_error_and_the_next_write_succeeds(s3_server):
-    claim = Store("s3://fleet/stopped").claim("cam-7", "node-1")
+    claim = Store("s3://fleet/stopped").stream("cam-7").claim("node-1")
     claim.write(STATE, {"frame": 1})
     s3_server.stop()
     with pytest.raises(StoreError, match=r"streams/cam-7/.* cannot be written: .*check the network and the server"):
@@ -208,7 +208,7 @@ def test_a_stopped_server_is_a_store_error_and_the_next_write_succeeds(s3_server
     s3_server.__init__(*s3_server.get_host_and_port(), verbose=False)  # with the objects that it had
     s3_server.start()
     claim.write(STATE, {"frame": 3})
-    assert Store("s3://fleet/stopped").newest("cam-7").facts == {"frame": 3}
+    assert Store("s3://fleet/stopped").stream("cam-7").newest().facts == {"frame": 3}
 
 
 def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monkeypatch):
@@ -218,7 +218,7 @@ def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monke
         for name, value in SECRETS.items():
             monkeypatch.setenv(name, value)
         with pytest.raises(StoreError, match=r"no answer within 0\.2 s"):
-            Store("s3://fleet").newest("cam-7")
+            Store("s3://fleet").stream("cam-7").newest()
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_no_credential_is_in_a_message_a_repr_a_traceback_or_a_log(url, caplog, 
         monkeypatch.setenv("AWS_ENDPOINT_URL", "http://user:password-not-to-be-seen@127.0.0.1:9")
     store, shown = Store(url), []
     try:
-        claim = store.claim("cam-7", "node-1")
+        claim = store.stream("cam-7").claim("node-1")
         claim.write(STATE, {})
         shown.append(repr(claim))
     except StoreError as error:
@@ -257,13 +257,13 @@ def test_no_credential_is_in_a_message_a_repr_a_traceback_or_a_log(url, caplog, 
 @pytest.mark.usefixtures("s3_server")
 def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
     with pytest.raises(StoreError, match="there is no such bucket: create it"):
-        Store("s3://no-such-bucket").claim("cam-7", "node-1")
+        Store("s3://no-such-bucket").stream("cam-7").claim("node-1")
     for name in SECRETS:
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_METADATA_ENDPOINT", "http://127.0.0.1:9")  # of the machine's role
     monkeypatch.setenv("HOME", "/nowhere")
     with pytest.raises(StoreError, match="no credentials were found: set AWS_PROFILE"):
-        Store("s3://fleet").claim("cam-7", "node-1")
+        Store("s3://fleet").stream("cam-7").claim("node-1")
 
 
 @pytest.mark.usefixtures("s3_server")
@@ -271,7 +271,7 @@ def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
     store = Store("s3://fleet/overwrites")
     monkeypatch.setattr(S3Store, "put", lambda *given, **_: obstore.put(*given))
     with pytest.raises(StoreError, match="ignores If-None-Match"):
-        store.claim("cam-7", "node-1")
+        store.stream("cam-7").claim("node-1")
 
 
 @pytest.fixture
@@ -331,7 +331,7 @@ def test_credentials_of_a_profile_are_used_if_the_environment_has_none(tmp_path,
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
     (tmp_path / "credentials").write_text("[site]\naws_access_key_id = a\naws_secret_access_key = b\n")
     monkeypatch.setenv("AWS_PROFILE", "site")
-    Store("s3://fleet/profile").put_fleet(b"spec")
+    Store("s3://fleet/profile").fleet.put({"fleet": b"spec"}, {})
     monkeypatch.setenv("AWS_PROFILE", "another")
     with pytest.raises(StoreError, match="set AWS_PROFILE"):
-        Store("s3://fleet/profile").get_fleet()
+        Store("s3://fleet/profile").fleet.newest()

@@ -56,14 +56,14 @@ def test_a_stream_runs_to_its_end_and_its_state_is_stored(spec, store, until):
         until(lambda: stream.report().status.state == "ended")
     status = stream.report().status
     assert (status.node, status.frame, status.trouble) == ("n1", FRAMES - 1, "")
-    state = Store(store).newest("cam-7")
+    state = Store(store).stream("cam-7").newest()
     assert (state.facts["end"], state.facts["seq"]) == ("ended", FRAMES)
 
 
 def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
     with started(spec, store) as first:
         until(lambda: first.report().status.frame >= 10)
-    before = Store(store).newest("cam-7").facts["seq"]
+    before = Store(store).stream("cam-7").newest().facts["seq"]
     with started(spec, store, "n2") as second:
         until(lambda: second.report().status.state == "ended")
     after = second.report().status
@@ -72,17 +72,17 @@ def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
     assert claimed == f"cam-7: claimed with token {after.token}, after frame {before - 1}"
     assert tracked == "cam-7: the first frame is tracked"
     assert after.token > first.report().status.token
-    assert Store(store).newest("cam-7").facts["seq"] == FRAMES
+    assert Store(store).stream("cam-7").newest().facts["seq"] == FRAMES
 
 
 def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(spec, store, until):
     with started(spec, store) as old:
         until(lambda: old.report().status.frame >= 3)
-        claim = Store(store).claim("cam-7", "another node")
+        claim = Store(store).stream("cam-7").claim("another node")
         until(lambda: old.report().superseded)
-    assert Store(store).newest("cam-7").token < claim.token
+    assert Store(store).stream("cam-7").newest().token < claim.token
     claim.write({"state": b"newer"}, {"end": ""})
-    assert Store(store).newest("cam-7").files == {"state": b"newer"}
+    assert Store(store).stream("cam-7").newest().files == {"state": b"newer"}
 
 
 def test_a_stream_that_has_ended_is_not_run_again(spec, store, until):
@@ -133,13 +133,13 @@ def test_followed_objects_are_searched_for_by_the_newest_merged_model_once_they_
     with started(replace(long_spec, follow=("anna",)), store, every=0.05) as stream:
         until(lambda: stream.report().status.frame >= 3)
         for number in range(20):
-            Store(store).put_model("anna", b"model %d" % number, {})
+            Store(store).model("anna").put({"model": b"model %d" % number}, {})
         until(lambda: searched and searched[-1] == ("anna", b"model 19"))
         assert threading.active_count() < threads + 20
         found = len(searched)
         stream.report(follow=())
         until(lambda: not stream._follow)
-        Store(store).put_model("anna", b"not followed", {})
+        Store(store).model("anna").put({"model": b"not followed"}, {})
     assert [name for name, _ in searched] == ["anna"] * len(searched)
     assert searched[found:] == []
 
@@ -189,7 +189,7 @@ def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, unti
     with started(spec, store) as stream:
         until(lambda: stream.report().status.state == "ended")
     assert written == ["running", "running"]
-    assert Store(store).newest("cam-7").facts["end"] == "ended"
+    assert Store(store).stream("cam-7").newest().facts["end"] == "ended"
 
 
 @pytest.fixture
@@ -218,7 +218,7 @@ def test_after_a_death_the_lost_frames_are_those_after_the_last_state_and_it_cou
         module, "skip", lambda state, *given: continued.append(position(state).seq) or skip(state, *given)
     )
     with started(live_spec, store, every=0.5) as first:
-        until(lambda: (found := Store(store).newest("gate")) is not None and found.facts["seq"] > 5)
+        until(lambda: (found := Store(store).stream("gate").newest()) is not None and found.facts["seq"] > 5)
         with started(live_spec, store, "n2", every=60.0) as second:  # as if the first node had died
             until(lambda: first.report().superseded)
             until(lambda: numbers["n2"])
