@@ -37,6 +37,7 @@ __all__ = [
     "TeachingSettings",
     "Value",
     "describe",
+    "flat",
 ]
 
 #: The value of a setting.
@@ -404,7 +405,7 @@ class Settings:
                 raise SettingsError(f"there is no preset {preset!r}: there are {', '.join(PRESETS)}")
             values.update(PRESETS[preset])
         if file is not None:
-            values.update(_flat(_read(Path(file))))
+            values.update(flat(_read(Path(file))))
         for variable, text in (os.environ if environment is None else environment).items():
             if variable.startswith("CATSTREAM_"):
                 values[variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)] = text
@@ -420,7 +421,7 @@ class Settings:
         ['run.lockstep=true', 'coreset.share=0.5']
         """
         groups: dict[str, dict[str, object]] = {}
-        for name, value in _flat(values).items():
+        for name, value in flat(values).items():
             _check_name(name)
             group, _, short = name.partition(".")
             groups.setdefault(group, {})[short] = _read_text(name, value) if isinstance(value, str) else value
@@ -456,7 +457,7 @@ class Settings:
         >>> Settings(run={"lockstep": True}).but(["coreset.size=32"]).changed()
         ['run.lockstep=true', 'coreset.size=32']
         """
-        return Settings.from_values(self.values() | _flat(_named(others)))
+        return Settings.from_values(self.values() | flat(_named(others)))
 
     def values(self) -> dict[str, Value]:
         """All values, by full name."""
@@ -531,15 +532,15 @@ def _defaults() -> dict[str, Value]:
     return Settings().values()
 
 
-def _flat(values: Mapping[str, object]) -> dict[str, object]:
+def flat(values: Mapping[str, object]) -> dict[str, object]:
     """Values by full name, from values by full name or in groups."""
-    flat: dict[str, object] = {}
+    found: dict[str, object] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
-            flat |= {f"{name}.{short}": each for short, each in value.items()}
+            found |= {f"{name}.{short}": each for short, each in value.items()}
         else:
-            flat[name] = value
-    return flat
+            found[name] = value
+    return found
 
 
 def _takes(name: str) -> str:

@@ -39,7 +39,7 @@ from catstream.box import Box
 from catstream.errors import CatstreamError, FleetError
 from catstream.messages.names import UNNAMED, boxes_by_name, check_name, listed
 from catstream.run.job import Job
-from catstream.settings import Settings
+from catstream.settings import Settings, flat
 from catstream.video.source import is_live
 
 __all__ = ["FleetSpec", "StreamSpec", "check_fleet_name", "from_json", "to_json"]
@@ -147,7 +147,7 @@ class StreamSpec:
                 values["source"] = str(folder / source)  # its node has another working folder
             values["boxes"] = boxes_by_name(values["boxes"])
             values["models"] = {check_name(each): folder / file for each, file in values["models"].items()}
-            values["settings"] = _flat(values.get("settings", {}))
+            values["settings"] = flat(values.get("settings", {}))
             names = [follow] if isinstance(follow, str) else follow
             values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
         return cls(name, **values)
@@ -269,14 +269,6 @@ def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]])
         except msgspec.ValidationError:
             raise FleetError(f"{key} must be {meaning}, got {reprlib.repr(value)}") from None
     return checked
-
-
-def _flat(settings: Mapping[str, object]) -> dict[str, object]:
-    """Settings by full name: `{ coreset = { size = 128 } }` is `{ "coreset.size" = 128 }`."""
-    flat: dict[str, object] = {}
-    for name, each in settings.items():
-        flat |= {f"{name}.{short}": one for short, one in each.items()} if isinstance(each, Mapping) else {name: each}
-    return flat
 
 
 def check_fleet_name(name: object, kind: str) -> None:

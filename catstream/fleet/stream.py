@@ -48,6 +48,7 @@ from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
 from catstream.run.state import files, position, restore, skip
+from catstream.services.process_title import process_fields
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
@@ -62,6 +63,7 @@ _PORTS = range(21000, 32000)  # below those that the kernel gives to connections
 #: What a pipeline reports if no frames are tracked, as the state of a stream.
 _HOLDING: dict[str, StreamState] = {"waiting": "waiting", "paused": "paused"}
 _TICKS = os.sysconf("SC_CLK_TCK")
+_TIMES = slice(14, 16)  # fields of /proc/PID/stat: in the program, and in the kernel for it
 
 #: Why a stream has ended with a state, which is its last one: "" for a state that is not.
 _End = Literal["", "ended", "moved", "stopped"]
@@ -465,9 +467,8 @@ def _processor_seconds(pids: list[int]) -> float:
     """Processor time of processes so far, in seconds."""
     seconds = 0.0
     for pid in pids:
-        with suppress(OSError, ValueError, IndexError):  # it has ended
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
-            seconds += (int(fields[11]) + int(fields[12])) / _TICKS
+        with suppress(OSError):  # it has ended
+            seconds += sum(map(int, process_fields(pid)[_TIMES])) / _TICKS
     return seconds
 
 
