@@ -15,7 +15,8 @@
     labels = { site = "north" }        # labels that its node must have
     follow = ["anna"]                  # objects whose merged model this stream searches for
 
-Relative paths count from the folder of the file. Every error is a `FleetError` that names the stream.
+Relative paths count from the folder of the file. Every error is a `FleetError` that names the stream, or the line of
+a file that is not TOML.
 """
 
 from __future__ import annotations
@@ -47,7 +48,6 @@ __all__ = ["FleetSpec", "StreamSpec", "check_fleet_name", "from_json", "to_json"
 _T = TypeVar("_T")
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
-_STREAM_HEADER = re.compile(r"\s*\[\s*streams\s*\.\s*[\"']?([\w.-]+)")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
 _CORES = Annotated[float, Meta(gt=0, le=4096)]
 
@@ -210,7 +210,7 @@ class FleetSpec:
         try:
             tables = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise FleetError(f"{path}: {_toml_problem(str(error), text)}") from None
+            raise FleetError(f"{path}: this is not TOML: {error}") from None
         with _errors_in(str(path)):
             values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
             if not values.get("streams"):
@@ -287,19 +287,3 @@ def _errors_in(place: str) -> Iterator[None]:
         yield
     except CatstreamError as error:
         raise FleetError(f"{place}: {error}") from None
-
-
-def _toml_problem(error: str, text: str) -> str:
-    """A message of the TOML parser with the name of the stream that it is about."""
-    if twice := re.search(r"Cannot declare \('streams', '([^']*)'\) twice", error):
-        return f"two streams have the name {twice[1]}: give each a name of its own"
-    lines = text.splitlines()
-    place = re.search(r"line (\d+)", error)
-    number = int(place[1]) if place else len(lines)
-    headers = [match[1] for line in lines[:number] if (match := _STREAM_HEADER.match(line))]
-    stream = f"the stream {headers[-1]}: " if headers else ""
-    inside = re.search(r"(?:immutable namespace \(|inline table key )'([^']*)'", error)
-    if inside or "Cannot overwrite a value" in error:
-        key = inside[1] if inside else lines[number - 1].partition("=")[0].strip()
-        return f"{stream}{key} is given twice, in line {number}: remove one of them"
-    return f"{stream}this is not TOML: {error}"
