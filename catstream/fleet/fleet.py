@@ -17,7 +17,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -308,15 +308,10 @@ class Fleet:
 
     def _on_this_machine(self) -> LocalCluster:
         """The cluster of the fleet with the name, or of the only one that runs on this machine."""
-        if self.name:
-            return LocalCluster(_home() / self.name)
-        running = [each for folder in sorted(_home().glob("*")) if (each := LocalCluster(folder)).running]
-        if len(running) != 1:
-            names = ", ".join(each.folder.name for each in running)
-            help_ = f"say which (--name), there are {names}" if running else "start one with catstream fleet up"
-            raise FleetError(f"{len(running)} fleets run on this machine: {help_}")
-        self.name = running[0].folder.name
-        return running[0]
+        if not self.name:
+            folders = sorted(_home().glob("*"))
+            self.name = _only([each.name for each in folders if LocalCluster(each).running], "this machine")
+        return LocalCluster(_home() / self.name)
 
     def _connect(self) -> None:
         if self._local is None:
@@ -340,7 +335,7 @@ class Fleet:
         from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
         if self._controller is None:
-            self.name = self.name or self._only_fleet()
+            self.name = self.name or _only(cluster.fleets(), f"the cluster at {self._address}")
             try:
                 self._controller = ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE)
             except ValueError:
@@ -366,17 +361,18 @@ class Fleet:
             raise FleetError(f"there is no node {name!r}, or it has died: there are {', '.join(known) or 'none'}")
         return known[name]
 
-    def _only_fleet(self) -> str:
-        """The name of the only fleet of the connected cluster."""
-        if len(names := cluster.fleets()) == 1:
-            return names[0]
-        known = f"say which (--name), there are {', '.join(names)}" if names else "start one with catstream fleet up"
-        raise FleetError(f"{len(names)} fleets run on the cluster at {self._address}: {known}")
-
 
 def _home() -> Path:
     """The folder with one for each fleet of this user."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+
+
+def _only(fleets: Sequence[str], place: str) -> str:
+    """The only fleet of a place."""
+    if len(fleets) != 1:
+        help_ = f"say which (--name), there are {', '.join(fleets)}" if fleets else "start one with catstream fleet up"
+        raise FleetError(f"{len(fleets)} fleets run on {place}: {help_}")
+    return fleets[0]
 
 
 def _about(lines: Iterable[str], names: Collection[str]) -> list[str]:
