@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from time import monotonic
-from typing import Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
+from typing import Any, Generic, Literal, NamedTuple, Self, TypedDict, TypeVar, Unpack, cast, overload
 
 from catstream.client.registry import FollowedStream, described, follow
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.messages.names import check_name
-from catstream.wire.channels import CHANNELS, TRACKS, Channel
+from catstream.wire.channels import CHANNELS, TRACKS
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import GapCounter, Subscriber
 from catstream.wire.readable import Wait, finish, finish_async
@@ -49,37 +49,17 @@ Message = TypeVar("Message", bound=AnyMessage)
 _KINDS: dict[str, type] = {"tracks": Track, "models": Model, "samples": Sample}
 
 
-class _Connection:
+class _Connection(NamedTuple):
     """The sockets of a subscription to one pipeline.
 
-    Parameters
-    ----------
-    only, about : the one kind of message to receive, and the object that it is about; None for all
-    early : whether a pipeline that starts later waits for this subscription
-
-    Attributes
-    ----------
-    messages : receives the messages of the channel
-    endpoint : Endpoint
-    ends : receives the end: if this subscriber is slow, the end could be among the messages that are dropped
+    endpoint  of the pipeline
+    messages  receives the messages of the channel
+    ends      receives the end: if this subscriber is slow, the end could be among the messages that are dropped
     """
 
-    def __init__(
-        self,
-        channel: Channel[Any],
-        endpoint: Endpoint,
-        only: type | None,
-        about: str | None,
-        early: bool = False,
-    ) -> None:
-        self.endpoint = endpoint
-        self.messages = Subscriber(channel, endpoint, only, about=about, early=early)
-        self.ends = Subscriber(TRACKS, endpoint, only=End)
-
-    def close(self) -> None:
-        """Disconnect."""
-        self.messages.close()
-        self.ends.close()
+    endpoint: Endpoint
+    messages: Subscriber[Any]
+    ends: Subscriber[Any]
 
 
 class Subscription(Generic[Message]):
@@ -149,8 +129,7 @@ class Subscription(Generic[Message]):
             place = find(endpoint, keys)
             self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
             self._has_run = not place.lacks_sockets()
-            early = self._channel.keeps == "every"
-            self._connection = _Connection(self._channel, place, self._only, self._about, early)
+            self._connect(place, early=self._channel.keeps == "every")
 
     @property
     def missed(self) -> int:
@@ -228,11 +207,6 @@ class Subscription(Generic[Message]):
         self._has_run = True
         return message
 
-    @property
-    def _only(self) -> type | None:
-        """The one kind of message to receive, None for all of the channel."""
-        return None if self._about is None else _KINDS[self._name]
-
     def _sockets(self) -> list[Subscriber[Any] | FollowedStream]:
         """The sockets that are polled for messages."""
         sockets: list[Subscriber[Any] | FollowedStream] = [] if self._stream is None else [self._stream]
@@ -278,7 +252,7 @@ class Subscription(Generic[Message]):
             self.end, self._close_time = self._stream.end, monotonic() + DRAIN_SECONDS
         elif (moved or self._connection is None) and (place := self._stream.place) is not None:
             self._disconnect()
-            self._connection = _Connection(self._channel, place, self._only, self._about)
+            self._connect(place)
 
     def _look_for_sockets(self) -> None:
         """End if the pipeline has removed its sockets from its folder, which it does once it has ended."""
@@ -287,9 +261,16 @@ class Subscription(Generic[Message]):
             self._pipeline_ended(End(0, _GONE), monotonic() + DRAIN_SECONDS)
         self._has_run = self._has_run or not lacks_sockets
 
+    def _connect(self, place: Endpoint, *, early: bool = False) -> None:
+        """Connect to a pipeline; if `early`, one that starts later waits for this subscription."""
+        only = None if self._about is None else _KINDS[self._name]
+        messages = Subscriber(self._channel, place, only, about=self._about, early=early)
+        self._connection = _Connection(place, messages, Subscriber(TRACKS, place, only=End))
+
     def _disconnect(self) -> None:
         if self._connection is not None:
-            self._connection.close()
+            self._connection.messages.close()
+            self._connection.ends.close()
             self._rejected += self._connection.messages.rejected
             self._connection = None
 
