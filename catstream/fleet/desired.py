@@ -137,7 +137,7 @@ def objection(wanted: Wanted, nodes: Collection[Node]) -> str:
 def shortage(wanted: Collection[Wanted], nodes: Collection[Node]) -> str:
     """Why streams cannot all run at the same time; empty if they can, as far as the sums of cores say.
 
-    >>> shortage([Wanted("a", 1.0)] * 20, [Node("n1", "1", cores=2.0)])
+    >>> shortage([Wanted("a", 1.0)] * 20, [Node("n1", "1", cores=2.0), Node("n2", "2", cores=8.0, draining=True)])
     'the 20 streams need 20 cores, and the nodes have 2'
     """
     needed = sum(each.cores for each in wanted)

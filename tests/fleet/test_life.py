@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 
 from catstream.fleet import life, timing
-from catstream.fleet.desired import objection, shortage
 from catstream.fleet.life import TABLE, Node, Order, Seen, Step, Wanted, diff, event
 
 IDS = st.sampled_from(["1", "2", "3"])
@@ -141,16 +140,3 @@ def test_the_difference_is_that_of_each_stream_by_the_table(wanted, actors, node
         happened = event(wanted.get(name), actor, nodes, 0.0)
         known = (actor.state, happened) in TABLE
         assert steps.get(name) == (Step(happened, *TABLE[actor.state, happened]) if known else None)
-
-
-def test_why_streams_cannot_run_is_said():
-    drained = Node("n2", "2", cores=8.0, draining=True)
-    assert objection(Wanted("a1"), [drained]) == (
-        "needs a node that is not drained, and there is none: there are n2 (drained)"
-    )
-    assert objection(Wanted("a1"), [Node("n1", "1"), drained]) == ""
-    twenty = [Wanted(str(number)) for number in range(20)]
-    assert (
-        shortage(twenty, [Node("n1", "1", cores=2.0), drained]) == "the 20 streams need 20 cores, and the nodes have 2"
-    )
-    assert shortage(twenty[:2], [Node("n1", "1", cores=2.0)]) == ""
