@@ -48,7 +48,7 @@ from catstream.wire.newest import Subscriber
 
 __all__ = ["main", "opening_seconds", "prepare"]
 
-_EVENTS_FILE = "detector_events.ndjson"  # the same, after a crash
+_EVENTS_FILE = "detector_events.ndjson"  # in the folder of the state, after a crash
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
 #: The channel whose acknowledgements are waited for in a phase.
@@ -275,7 +275,7 @@ class DetectorLoop:
                 self._detectors.adopt(model)
                 known = _known(self._detectors.detectors[model.object])
                 self.tell(core.ModelArrived(model.object, model.version, known))
-            elif self.state.seq < self.state.repeats:  # the object may begin again: its trees are ahead of the tracks
+            elif self.state.is_repeating:  # the object may begin again: its trees are ahead of the tracks
                 self._arrived[model.object] = model
 
     def _progressed(self) -> Event | None:
@@ -379,10 +379,11 @@ class DetectorLoop:
                 self._models_of_job.store()  # before the state that names them
                 desired.save(state / DESIRED)
                 self._kept = desired
-                self._models_of_job.keep_only(set(order.models))
             except OSError as error:
                 _log.warning("the desired state cannot be written to %s (%s)", state / DESIRED, error.strerror)
                 lost = f"; a resumed run will not know it, as {state / DESIRED} cannot be written ({error.strerror})"
+        if state is None or desired == self._kept:  # otherwise the file may name a model that is not needed any more
+            self._models_of_job.keep_only(set(order.models))
         for answer in order.answers:
             self._control.answer(replace(answer, reason=answer.reason + lost) if answer.done else answer)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
 
@@ -58,11 +59,12 @@ class ModelFiles:
                 storage.write_atomically(self._file(name), learned.to_bytes(), mode=0o600)
 
     def keep_only(self, names: set[str]) -> None:
-        """Remove all saved models but those of these names, from memory and from the folder."""
+        """Remove all saved models but those of these names; a file that cannot be removed is left to a later call."""
         self._models = {name: learned for name, learned in self._models.items() if name in names}
-        for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
-            if file.stem not in names:
-                file.unlink(missing_ok=True)
+        with suppress(OSError):
+            for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
+                if file.stem not in names:
+                    file.unlink()
 
     def _file(self, name: str) -> Path:
         return (self._folder or Path()) / f"{name}.safetensors"

@@ -73,12 +73,9 @@ def write_atomically(path: str | os.PathLike[str], *data: bytes | memoryview, mo
         part.replace(path)
 
 
-def create_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o600) -> None:
-    """Create a file atomically: it exists with its whole content, or not at all, also after a power cut.
-
-    Parameters
-    ----------
-    mode : permissions of the file, reduced by the umask
+def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
+    """Create a file for its owner only, atomically: it exists with its whole content, or not at all, also after a power
+    cut.
 
     Raises
     ------
@@ -88,7 +85,7 @@ def create_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o6
         If the file cannot be written, or the file system has no hard links.
     """
     path = Path(path)
-    with _written_beside(path, [data], mode) as part:
+    with _written_beside(path, [data], 0o600) as part:
         os.link(part, path)  # unlike a rename, this fails if the file exists
 
 

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import signal
 import stat
+from contextlib import ExitStack, closing
 
 import pytest
 
+from catstream.box import Box
+from catstream.messages.kinds import Command
 from catstream.multi import MultiTracker
+from catstream.run.job import Job
+from catstream.services.core import Commanded
+from catstream.services.detector import DetectorLoop
+from catstream.services.loop import Process
 from catstream.services.model_files import ModelFiles
+from catstream.settings import Settings
 from catstream.video.demo import render
 
 
@@ -50,3 +59,17 @@ def test_without_a_folder_models_are_kept_in_memory(learned):
     files.keep_only({name})
     assert files.get(name) is learned
     assert files.get("another") is None
+
+
+@pytest.mark.parametrize("has_state", [True, False])
+def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp_path, monkeypatch, has_state):
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
+    settings = Settings(coreset={"size": 8}, run={"objects_most": 1})
+    state = tmp_path if has_state else None
+    job = Job("walk.mp4", {"ben": Box(1, 2, 30, 40)}, settings=settings, endpoint=str(folder), state=state)
+    with closing(Process("detector", job)) as process, ExitStack() as stack:
+        loop = DetectorLoop(process, stack)
+        request = loop._request(Command("1", "search", object="anna", model=learned.to_bytes()))
+        loop.tell(Commanded(request))
+        assert list(loop.state.desired.objects) == ["ben"]
+        assert loop._models_of_job.get(request.saved.name) is None
