@@ -50,21 +50,6 @@ def received(subscription):
         return next(subscription)
 
 
-def test_a_stranger_at_the_door_of_a_pipeline_is_counted_in_its_health(video, keys, tcp):
-    path, boxes = video
-    with (
-        Pipeline(path, boxes[0], Settings(run={"endpoint": tcp, "keys": str(keys), "unstored_frames": 16})) as pipeline,
-        subscribe(tcp, "health", keys=str(keys), timeout=60) as health,
-    ):
-        tracks = iter(pipeline)
-        next(tracks)
-        create(keys.parent / "wrong")
-        with subscribe(tcp, "tracks", keys=str(keys.parent / "wrong")) as stranger:
-            while not next(health).counters.get("rejected_handshake"):
-                next(tracks, None)
-            assert not stranger._connection.messages.pending()
-
-
 @pytest.mark.parametrize(
     "place", ["0.0.0.0:0", "192.0.2.1:5700", "example.org:5700", "127.0.0.1,trainer=192.0.2.1:5700"]
 )

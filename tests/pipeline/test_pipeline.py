@@ -18,9 +18,7 @@ from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.sinks.recording.file import Recording
 from catstream.sinks.recording.learning import learn
-from catstream.tracker import Tracker
-from catstream.video.source import open_source
-from catstream.wire.channels import HEALTH, MODELS
+from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
@@ -149,27 +147,6 @@ def test_a_restarted_trainer_continues_to_learn(video):
     assert versions[-1] > versions[8]
 
 
-@pytest.fixture(scope="module")
-def in_lockstep(video):
-    """Tracks of a run in which each frame waits for all learning from those before."""
-    path, boxes = video
-    with Pipeline(path, boxes[0], Settings(run={"lockstep": True})) as pipeline:
-        return list(pipeline)
-
-
-def test_in_lockstep_the_tracks_are_those_of_one_process(in_lockstep, video):
-    path, boxes = video
-    tracker, expected = Tracker(Settings(run={"lockstep": True})), []
-    with open_source(path) as source:
-        for frame in source:
-            if expected:
-                tracker.update(frame.image, frame.time)
-            else:
-                tracker.init(frame.image, boxes[0], frame.time)
-            expected.append(tracker.track)
-    assert in_lockstep == expected
-
-
 def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(video, tmp_path):
     path, boxes = video
     lag = 5
@@ -194,18 +171,6 @@ def test_a_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, fo
         assert set(first.pids) == set(NAMES), "the first one goes on"
     with Pipeline(path, boxes[0], settings) as next_one:
         assert next(iter(next_one)).frame == 0, "the place is free at once"
-
-
-def test_a_late_subscriber_of_a_pipeline_receives_the_last_model(video, until):
-    path, boxes = video
-    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4})) as pipeline:
-        for track in pipeline:
-            if track.frame == 20:
-                break
-        # Nobody takes tracks now: with a full window the detector waits, and no newer model comes.
-        with Subscriber(MODELS, Endpoint.parse(pipeline.endpoint)) as models:
-            model = until(lambda: models.receive(0.1))
-    assert model.version >= track.model_version > 0
 
 
 @pytest.mark.parametrize("box", [(0, 0, 0, 10), (400, 10, 20, 20), (10, 10, float("nan"), 20)])

@@ -314,17 +314,6 @@ def test_programs_share_a_server_that_ends_with_the_process_that_they_name(shari
         assert (second.poll(), third.poll()) == (None, None)
 
 
-def test_a_shared_server_that_was_killed_is_replaced_by_another_one(sharing, until):
-    with subprocess.Popen(["sleep", "600"]) as node:
-        _, one = sharing(node.pid)
-        server = one.parent()
-        server.kill()
-        until(lambda: has_ended(one))
-        _, other = sharing(node.pid)
-        assert other.ppid() != server.pid
-        node.kill()
-
-
 def test_a_shared_server_that_a_signal_has_stopped_is_killed_if_a_process_waits_for_its_start(
     server, start, monkeypatch, until
 ):

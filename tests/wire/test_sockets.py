@@ -10,23 +10,19 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-import zmq
 
 from catstream.errors import ServiceError
 from catstream.messages.kinds import (
     End,
     Model,
-    ObjectPosition,
     Position,
     Sample,
-    Stored,
     Summary,
     Track,
     Tracks,
 )
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
-from catstream.wire.codec import decode, encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher, Subscriber
 
@@ -43,11 +39,6 @@ def tracks(seq):
 
 def model(version, name=""):
     return Model(version, version, np.full(5, version, np.float32), 0.0, object=name)
-
-
-def made(version, name=""):
-    """The objects of a position, one of which has made a sample."""
-    return {name: ObjectPosition(version=version)}
 
 
 def send_up_to(last, sender):
@@ -187,23 +178,6 @@ def test_a_restarted_sender_repeats_no_received_message(endpoint, until):
 
             until(lambda: sender.window.stored == 9, on)
     assert taken == list(range(1, 10))
-
-
-def test_a_repeated_message_receives_the_same_answer(endpoint, stranger, until):
-    told = []
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver:
-        sender = stranger(zmq.DEALER, "results")
-        for _ in range(2):
-            sender.send(encode(tracks(1)))
-
-        def turn():
-            if receiver.receive(0.05) is not None:  # on a full disk
-                receiver.acknowledge(Position(1, objects=made(7), unsaved=1))
-            if sender.poll(0):
-                told.append(decode(sender.recv(), Stored))
-
-        until(lambda: len(told) == 2, turn)
-    assert told == [Stored(1, 1, {"": 7}, unsaved=1)] * 2
 
 
 #: Takes nothing while its queue is full and the sender dies, for longer than any timer of ZeroMQ.
