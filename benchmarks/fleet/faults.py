@@ -162,7 +162,7 @@ class Trial:
             lambda status: all(each.state == "alive" and self.raylets(name) for name, each in status.nodes.items()),
             "all nodes alive",  # Ray may not have noticed yet that one has died
         )
-        self.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams running")
+        self._until_all_run()
         status = self.status()
         for name in self.lockstep:
             if status is not None and status.streams[name].state == "ended":
@@ -170,6 +170,10 @@ class Trial:
                 self.fleet.remove(name, forget=True)
                 self.until(lambda status, name=name: name not in status.streams, f"the end of {name}")
                 self.fleet.add(next(each for each in self._streams() if each.name == name))
+        self._until_all_run()
+
+    def _until_all_run(self) -> None:
+        self.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams running")
 
     def _check_film(self, name: str) -> None:
         state = self.store.stream(name).newest()
