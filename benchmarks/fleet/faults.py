@@ -20,7 +20,6 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
 
@@ -89,15 +88,11 @@ class Trial:
         self.local = LocalCluster(folder / "catstream" / "fleets" / NAME)
         stack.callback(self.local.stop)
         self.fleet = stack.enter_context(Fleet(spec))
-        self.up()
+        self.fleet.up(cores=CORES, detach=True)
         for number, name in enumerate(spec.streams):  # Ray would fill the first node first
             self.fleet.move(name, ("node-1", *NODES)[-1 - number % 3])
         self.registry = stack.enter_context(Registry(NAME, timeout=2.0))
         self.store = Store(spec.store)
-
-    def up(self) -> None:
-        """Start the fleet, or continue it after the death of its head."""
-        self.fleet.up(cores=CORES, detach=True)
 
     def processes(self, node: str) -> list[psutil.Process]:
         """The processes of a node, its raylet first, with its start server and its children; none if it has died."""
@@ -162,7 +157,7 @@ class Trial:
             lambda status: all(each.state == "alive" and self.raylets(name) for name, each in status.nodes.items()),
             "all nodes alive",  # Ray may not have noticed yet that one has died
         )
-        self._until_all_run()
+        self.until_all_run()
         status = self.status()
         for name in self.lockstep:
             if status is not None and status.streams[name].state == "ended":
@@ -170,9 +165,10 @@ class Trial:
                 self.fleet.remove(name, forget=True)
                 self.until(lambda status, name=name: name not in status.streams, f"the end of {name}")
                 self.fleet.add(next(each for each in self._streams() if each.name == name))
-        self._until_all_run()
+        self.until_all_run()
 
-    def _until_all_run(self) -> None:
+    def until_all_run(self) -> None:
+        """Wait until all streams run, or have ended."""
         self.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams running")
 
     def _check_film(self, name: str) -> None:
@@ -255,8 +251,7 @@ def freeze(trial: Trial, status: FleetStatus) -> None:
     sleep(1.0)
     now = trial.status()
     hit = {name: each for name, each in _on(status, node).items() if now is None or now.streams[name] != each}
-    gone = now is None or now.nodes[node].state != "alive"
-    if gone:  # Ray counts it as dead: its streams run elsewhere
+    if now is None or now.nodes[node].state != "alive":  # Ray counts it as dead: its streams run elsewhere
         trial.recovered("node frozen", hit, begin)
         trial.until(lambda status: status.nodes[node].state == "alive", f"the return of {node}")
 
@@ -265,22 +260,18 @@ def kill_stream(trial: Trial, status: FleetStatus) -> None:
     names = sorted(_on(status, "node-1", *NODES))
     if not names:
         return
-    name = str(trial.random.choice(names))
-    node = status.streams[name].node
+    node = status.streams[str(trial.random.choice(names))].node
     actors = [each for each in trial.processes(node) if each.name().startswith("ray::StreamActor")]
     begin = monotonic()
     if actors:
         trial.random.choice(np.array(actors, object)).kill()
-    now = trial.status() or status
     hit: dict[str, StreamStatus] = {}
 
-    def found(status: FleetStatus) -> bool:
+    def found(now: FleetStatus) -> bool:
         hit.update(
-            {
-                each: before
-                for each, before in _on(now, node).items()
-                if status.streams[each].token > before.token or status.streams[each].state not in ("running", "ended")
-            }
+            (each, before)
+            for each, before in _on(status, node).items()
+            if now.streams[each].token > before.token or now.streams[each].state not in ("running", "ended")
         )
         return bool(hit)
 
@@ -297,7 +288,7 @@ def kill_controller(trial: Trial, status: FleetStatus) -> None:
                     process.kill()
     trial.until(lambda status: status.time > 0, "the registry after the controller's return")
     trial.recovery["controller killed"].append(monotonic() - begin)
-    trial.until(lambda status: all(_is_up(each) for each in status.streams.values()), "all streams known again")
+    trial.until_all_run()
     _check_untouched(trial, "controller killed", status)
 
 
@@ -307,7 +298,7 @@ def kill_head(trial: Trial, status: FleetStatus) -> None:
     while trial.local.running:
         sleep(0.05)
     begin = monotonic()
-    trial.up()
+    trial.fleet.up(cores=CORES, detach=True)  # continues it
     trial.recovered("head killed, and `up`", _on(status, "node-1", *NODES), begin)
 
 
@@ -331,14 +322,17 @@ def _stored(trial: Trial, fault: str, before: FleetStatus, hit: dict[str, Stream
 
 
 def _check_untouched(trial: Trial, fault: str, before: FleetStatus) -> None:
-    """All streams must have gone on with the same processes; a film in its last frame may only have ended."""
-    status = trial.status()
-    for name, each in before.streams.items() if status is not None else ():
-        now = status.streams[name]
-        if each.state == "running" and now.token != each.token:
-            trial.wrong.append(f"{fault}: {name} was started again")
-        elif each.state == "running" and now.state != "ended" and now.frame <= each.frame:
-            trial.wrong.append(f"{fault}: {name} stood still")
+    """All streams must go on with the same processes; a film in its last frame may only have ended."""
+    ran = {name: each for name, each in before.streams.items() if each.state == "running"}
+
+    def have_gone_on(status: FleetStatus) -> bool:
+        now = status.streams
+        return all(now[name].state == "ended" or now[name].frame > each.frame for name, each in ran.items())
+
+    trial.until(have_gone_on, f"{fault}: the next frame of each stream")
+    status = trial.status() or before
+    again = (name for name, each in ran.items() if status.streams[name].token != each.token)
+    trial.wrong += [f"{fault}: {name} was started again" for name in again]
 
 
 #: Fault -> how often it occurs in 100.
@@ -383,7 +377,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         )
         trial.settle()
         minutes = (monotonic() - begin) / 60
-        status = trial.status() or replace(FleetStatus(NAME, 0.0))
+        status = trial.status() or FleetStatus(NAME, 0.0)
         lost = [each for name, each in status.streams.items() if name in trial.live]
     yield Table(
         f"Recovery of {done} faults, 3 nodes, {len(trial.live) + len(trial.lockstep)} streams",
