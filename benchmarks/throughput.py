@@ -74,7 +74,7 @@ def costs(sequence: Sequence, settings: Settings) -> list[float]:
     frames = sequence.frames()
     for row in range(len(sequence)):
         image = timed(0, next, frames)
-        frame = timed(1, Pyramid.of, image)
+        frame = timed(1, Pyramid, image)
         given = {} if row else {UNNAMED: timed(1, detectors.begin, UNNAMED, frame, Box(*sequence.boxes[0]))}
         _, features = timed(1, detectors.step, frame, 0.0, given)
         for sample in timed(2, forest.take, features):

@@ -43,7 +43,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 def features_of_a_frame() -> Features:
     """Return the features message of a typical frame."""
     sequence, detectors = rendered(2, (320, 240)), Detectors(Settings())
-    first, second = map(Pyramid.of, sequence.frames())
+    first, second = map(Pyramid, sequence.frames())
     detectors.step(first, given={UNNAMED: detectors.begin(UNNAMED, first, Box(*sequence.boxes[0]))})
     _, features = detectors.step(second)
     return features
