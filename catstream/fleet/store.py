@@ -126,7 +126,7 @@ class States:
         self.folder = folder
 
     def newest(self, after: int = 0) -> Generation | None:
-        """Return the newest state; None if there is none of a holder with a token above `after`, which is quick."""
+        """Return the newest state of a holder with a token above `after`. If there is none, no state is read."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
                 states = (self._read(place) for place in self.listed().newest(after))

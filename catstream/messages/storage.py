@@ -74,8 +74,7 @@ def write_atomically(path: str | os.PathLike[str], *data: bytes | memoryview, mo
 
 
 def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
-    """Create a file for its owner only, atomically: it exists with its whole content, or not at all, also after a power
-    cut.
+    """Create a file for its owner only: it exists with its whole content, or not at all, also after a power cut.
 
     Raises
     ------
