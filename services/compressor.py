@@ -103,8 +103,10 @@ class CompressorLoop:
         before = self._forest.compressors.keys()
         if any(part.model for part in features.objects.values()):
             self._process.watchdog.allow(MODEL_SECONDS)
-        for sample in self._forest.take(features, begun(features, self._process.settings)):
+        beat = self._process.watchdog.beat  # after each object: all of them together may take long on a slow machine
+        for sample in self._forest.take(features, begun(features, self._process.settings), beat):
             self._samples.send(sample)
+            beat()
         if self._forest.compressors.keys() != before:
             self._samples.keep_only(self._forest.compressors)
 
@@ -132,7 +134,7 @@ class CompressorLoop:
     def publish_health(self, *, last: bool = False) -> None:
         """Serve late joiners, send the trees to subscribers, and publish the health."""
         self._samples.serve_late_joiners()
-        self._saved_models.turn(self._forest.compressors)
+        self._saved_models.turn(self._forest.compressors, self._process.watchdog.beat)
         trouble = [self._checkpoints.trouble if self._checkpoints is not None else ""]
         if self._recorder is not None and self._recorder.failed:
             trouble.append(f"{self._recorder.failed}: the run continues without it")

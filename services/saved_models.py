@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from time import monotonic
 
 from catstream.compression.compressor import Compressor
@@ -26,8 +26,13 @@ class SavedModels(Publisher[SavedModel]):
         self._settings = settings
         self._sent: dict[str, tuple[int, float]] = {}  # version and time of the last file of each object
 
-    def turn(self, compressors: Mapping[str, Compressor]) -> None:
-        """Send the files that are due; call it in every turn, as subscribers may join."""
+    def turn(self, compressors: Mapping[str, Compressor], after_each: Callable[[], object]) -> None:
+        """Send the files that are due; call it in every turn, as subscribers may join.
+
+        Parameters
+        ----------
+        after_each : is called after each file
+        """
         self.serve_late_joiners()
         if not self.has_subscribers:
             if self._sent:  # the next subscriber gets new files only
@@ -38,6 +43,7 @@ class SavedModels(Publisher[SavedModel]):
             version, moment = self._sent.get(name, (0, 0.0))
             if compressor.version > version and (not version or monotonic() - moment >= SAVED_MODEL_SECONDS):
                 self._send(name, compressor)
+                after_each()
 
     def _send(self, name: str, compressor: Compressor) -> None:
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from catstream.box import Box
@@ -55,7 +55,12 @@ class Forest:
                         "width",
                     )
 
-    def take(self, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})) -> list[Sample]:
+    def take(
+        self,
+        features: Features,
+        learned: Mapping[str, Compressor] = MappingProxyType({}),
+        after_each: Callable[[], object] = lambda: None,
+    ) -> list[Sample]:
         """Insert the features of one frame; returns the samples that are due.
 
         A message whose `seq` was processed before is ignored.
@@ -63,6 +68,7 @@ class Forest:
         Parameters
         ----------
         learned : compressors of the objects that begin in this message with a saved model
+        after_each : is called after each object
 
         Raises
         ------
@@ -86,6 +92,7 @@ class Forest:
             if part.begins:
                 self._add(compressor.begin(features.frame, self.version + 1), samples)
             self._add(compressor.take(features.frame, part, self.version + 1), samples)
+            after_each()
         self.seq, self.frame = features.seq, features.frame
         return samples
 

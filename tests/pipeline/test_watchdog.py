@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import signal
 import time
+from contextlib import ExitStack, closing
 
+import numpy as np
 import pytest
 
+from catstream.compression.compressor import Compressor
+from catstream.messages.heads import APPEARANCE
+from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
+from catstream.run.job import Job
+from catstream.services.compressor import CompressorLoop
 from catstream.services.detector import opening_seconds
+from catstream.services.loop import Process
 from catstream.services.timing import STUCK_SECONDS
 from catstream.services.watchdog import Watchdog
+from catstream.settings import Settings
 
 
 @pytest.fixture
@@ -57,6 +67,25 @@ def test_a_longer_time_limit_applies_to_each_iteration(watchdog):
         assert watchdog.patience == STUCK_SECONDS + 6
     watchdog.allow(60)
     assert watchdog.patience == 60
+
+
+def test_a_compressor_counts_an_iteration_after_each_object_of_a_message(folder, rng, monkeypatch):
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
+    turns, take = [], Compressor.take
+
+    def counted(*arguments):
+        turns.append(process.watchdog.turns)
+        return take(*arguments)
+
+    monkeypatch.setattr(Compressor, "take", counted)
+    rows = TrainingRows.labelled(rng.normal(size=(16, 5)), np.repeat([0, 1], 8))
+    objects = {name: ObjectFeatures(None, {APPEARANCE: rows}) for name in ("anna", "ben", "carla")}
+    job = Job("walk.mp4", {}, settings=Settings(coreset={"size": 8}), endpoint=str(folder))
+    with closing(Process("compressor", job)) as process, ExitStack() as stack:
+        loop = CompressorLoop(process, stack)
+        loop.insert(Features(1, 0, 0.0, objects))
+        turns.append(process.watchdog.turns)
+    assert len(turns) == len(set(turns)) == 4
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -32,22 +34,27 @@ def compressor(name, rng, frames=6):
     return found
 
 
-def received(publisher, compressors, reader):
+def nothing():
+    """What is called after each file, if that does not matter."""
+
+
+def received(publisher, compressors, reader, after_each=nothing):
     """The first message that a subscriber receives while the publisher takes its turns."""
     for _ in range(200):
-        publisher.turn(compressors)
+        publisher.turn(compressors, after_each)
         if (message := reader.receive(0.05)) is not None:
             return message
     raise AssertionError("nothing was received")
 
 
 def test_a_subscriber_receives_the_whole_trees_of_its_object(endpoint, rng):
-    compressors = {name: compressor(name, rng) for name in ("anna", "ben")}
+    compressors, made = {name: compressor(name, rng) for name in ("anna", "ben")}, Mock()
     with (
         SavedModels(endpoint, SETTINGS) as publisher,
         Subscriber(SAVED_MODELS, endpoint, SavedModel, about="ben") as reader,
     ):
-        message = received(publisher, compressors, reader)
+        message = received(publisher, compressors, reader, made)
+    assert made.call_count == 2, "the process reports that it lives after each file"
     assert (message.object, message.version) == ("ben", compressors["ben"].version)
     assert message.file == Learned.of(compressors["ben"], SETTINGS).to_bytes()
 
@@ -56,7 +63,7 @@ def test_no_file_is_made_without_a_subscriber(endpoint, rng, monkeypatch):
     monkeypatch.setattr(Learned, "of", lambda *_: pytest.fail("a file was made"))
     with SavedModels(endpoint, SETTINGS) as publisher:
         for _ in range(3):
-            publisher.turn({"": compressor("", rng)})
+            publisher.turn({"": compressor("", rng)}, nothing)
 
 
 def test_an_object_that_was_not_found_yet_has_no_file(endpoint, rng):
@@ -72,8 +79,8 @@ def test_a_later_subscriber_receives_the_newest_trees(endpoint, rng):
         with Subscriber(SAVED_MODELS, endpoint) as reader:
             first = received(publisher, compressors, reader)
         while publisher.has_subscribers:
-            publisher.turn(compressors)
+            publisher.turn(compressors, nothing)
         compressors[""] = compressor("", rng, frames=30)
-        publisher.turn(compressors)
+        publisher.turn(compressors, nothing)
         with Subscriber(SAVED_MODELS, endpoint) as reader:
             assert received(publisher, compressors, reader).version == compressors[""].version > first.version
