@@ -111,7 +111,7 @@ class Sender(ChannelSocket[Message]):
 class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
-    Receiving stores nothing. If a sender asks for the position while more was received than is stored,
+    Receiving stores nothing. If a new sender asks for the position while more was received than is stored,
     `window.position_requested` becomes true; the owner then stores what it has, and calls `answer`. In a loop:
 
         message = receiver.receive(0.1)

@@ -11,10 +11,11 @@ replies once the application has processed it:
     Position    requests a retransmission of everything after `seq`
 
 The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
-hello). The sender asks if it was restarted, and after `PATIENCE_SECONDS` without a reply while messages wait.
-So either side may be restarted, and any frame may be lost or arrive twice: each message is still delivered once, in
-order. The end of the stream is delivered at any `seq` up to the next one: a restarted sender may end before it has
-repeated all that was delivered.
+hello) on another connection than that of the last message. On the same one it replies with a Stored, as a connection
+loses no message while it lasts. The sender asks if it was restarted, and after `PATIENCE_SECONDS` without a reply
+while messages wait. So either side may be restarted, any connection may break, and any reply may be lost: each message
+is still delivered once, in order. The end of the stream is delivered at any `seq` up to the next one: a restarted
+sender may end before it has repeated all that was delivered.
 
 `Stored.seq` may include messages that the receiver has only in memory, because its disk cannot be written; `unsaved`
 is their number. If such a receiver is restarted, the sender cannot retransmit them and raises `StreamRewoundError`.
@@ -226,7 +227,9 @@ class ReceiveWindow:
         return bool(self._asking)
 
     def hello(self, peer: bytes) -> list[Reply]:
-        """A sender asks for the position; it is answered at once if all delivered messages are stored."""
+        """A sender asks for the position; it is answered at once if it only waits, or if all messages are stored."""
+        if peer == self._peer:
+            return [Reply(peer, self._stored())]
         if self._position.seq >= self.taken:
             return [Reply(peer, self._position)]
         if len(self._asking) < _MAX_ASKING:

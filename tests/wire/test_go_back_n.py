@@ -1,6 +1,6 @@
-"""The acknowledged window, in random histories: each message is taken once and in order, whatever is lost or restarted.
+"""The acknowledged window, in random histories: each message is taken once and in order, whatever breaks or restarts.
 
-No process, no socket, no clock: the two state machines, a network that loses and repeats frames, and a disk.
+No process, no socket, no clock: the two state machines, a network that breaks and repeats frames, and a disk.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ class Histories(RuleBasedStateMachine):
         self.size, self.now, self.senders = size, 0.0, 0
         self.to_receiver, self.to_sender = deque(), deque()
         self.disk = self.promised = 0  # newest seq on disk; newest seq that was ever reported as stored
+        self.connections = 0
         self.full, self.in_memory = False, False  # the disk takes nothing; messages were acknowledged nevertheless
         self.position = Position()
         self.receiver = ReceiveWindow(self.position, size)
@@ -52,9 +53,14 @@ class Histories(RuleBasedStateMachine):
 
     def start_sender(self):
         self.senders += 1
-        self.peer = b"sender %d" % self.senders
+        self.connect()
         self.sender, self.resumed = SendWindow("features", self.size, self.now), self.senders == 1
         self.known = self.asked = 0  # newest seq of an earlier sender; newest seq whose samples were asked for
+
+    def connect(self):
+        """Each connection counts as another peer."""
+        self.connections += 1
+        self.peer = b"connection %d" % self.connections
 
     # What the shells do.
 
@@ -151,10 +157,12 @@ class Histories(RuleBasedStateMachine):
             self.replied(message)
         self.transmit()
 
-    @precondition(lambda self: self.to_receiver)
-    @rule()
-    def frame_is_lost(self):
-        self.to_receiver.popleft()
+    @rule(transmitted=st.integers(0, 3))
+    def connection_breaks(self, transmitted):
+        """The frames that were not transmitted by then are lost, and all replies."""
+        self.to_receiver = deque(list(self.to_receiver)[:transmitted])
+        self.to_sender.clear()
+        self.connect()
 
     @precondition(lambda self: self.to_sender)
     @rule()
@@ -367,11 +375,24 @@ def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_pati
 def test_a_position_request_is_answered_at_once_if_all_is_stored_and_otherwise_by_the_owner():
     window = ReceiveWindow(Position(), size=4)
     assert window.hello(b"one") == [Reply(b"one", Position())]
-    window.receive(b"one", 1, now=0.0)
+    window.receive(b"zero", 1, now=0.0)
     assert window.hello(b"one") == window.hello(b"two") == window.hello(b"one") == []
     assert window.position_requested
     assert window.answer(Position(1)) == [Reply(b"one", Position(1)), Reply(b"two", Position(1))]
     assert not window.position_requested
+
+
+def test_a_sender_that_only_waits_is_answered_without_a_checkpoint_and_transmits_nothing_again():
+    sender, receiver = filled(size=4, count=3), ReceiveWindow(Position(), size=4)
+    for seq in (1, 2):
+        receiver.receive(b"peer", seq, now=0.0)
+    for stored in (0, 2):
+        receiver.acknowledge(Position(stored))
+        (reply,) = receiver.hello(b"peer")
+        assert not receiver.position_requested
+        sender.receive(reply.message, now=1.0)
+        assert (sender.acknowledged, sender.taken) == (stored, 2)
+        assert frames(sender) == []
 
 
 def test_of_a_flood_of_peers_that_ask_only_some_are_remembered():
