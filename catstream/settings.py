@@ -118,7 +118,7 @@ class RunSettings(_Group):
     ] = False
     unstored_frames: Annotated[
         int,
-        _about("Features messages that may be sent and not yet stored by the compressor.", ge=1, le=65536),
+        _about("Features messages, up to 256 MiB, that may be sent and not yet stored.", ge=1, le=65536),
     ] = 256
     objects_most: Annotated[
         int,

@@ -112,13 +112,13 @@ class CompressorLoop:
 
     def store_and_acknowledge(self, message: Features | End | None) -> None:
         """Write a checkpoint if one is due, then answer position requests and acknowledge the message."""
-        before, seq, run = self._stored, self._forest.seq, self._process.settings.run
+        before, seq, window = self._stored, self._forest.seq, self._features.window
         end = message if isinstance(message, End) else None
-        urgent = self._checkpoints is None or end is not None or before.is_urgent(seq, run.unstored_frames)
-        urgent = urgent or self._features.window.position_requested
-        if (urgent and seq > before.stored) or before.is_due(seq, time.monotonic(), run.checkpoint_seconds):
+        urgent = self._checkpoints is None or end is not None or window.half_full or window.position_requested
+        interval = self._process.settings.run.checkpoint_seconds
+        if (urgent and seq > before.stored) or before.is_due(seq, time.monotonic(), interval):
             self._store(urgent)
-        if self._features.window.position_requested:
+        if window.position_requested:
             self._features.answer(self._stored.position)
         if message is not None or self._stored.position is not before.position:
             self._features.acknowledge(self._stored.acknowledgement(self._forest.position, end))

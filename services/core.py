@@ -254,7 +254,7 @@ def _results(state: State) -> Moved | None:
     """Send the tracks to the owner of the run, if it has one."""
     if not state.rules.owned:
         return replace(state, phase=Phase.OWNER), []
-    return _sent(state, Phase.OWNER, "results", state.progress.owner_acknowledged)
+    return _sent(state, Phase.OWNER, "results", state.progress.owner_limit)
 
 
 def _owner(state: State) -> Moved | None:
@@ -269,13 +269,13 @@ def _owner(state: State) -> Moved | None:
 
 def _features(state: State) -> Moved | None:
     """Send the features to the compressor."""
-    moved = _sent(state, Phase.TAKEN, "features", state.progress.acknowledged)
+    moved = _sent(state, Phase.TAKEN, "features", state.progress.limit)
     if moved is not None and not state.over:
         moved[1].append(actions.Show())
     return moved
 
 
-def _sent(state: State, phase: Phase, channel: actions.DataChannel, acknowledged: int) -> Moved | None:
+def _sent(state: State, phase: Phase, channel: actions.DataChannel, limit: int) -> Moved | None:
     """Send a message if there is room in the window; give it up if the process is to end; otherwise wait.
 
     There is no other time-out, as a receiver that died is restarted. Nothing follows a message that was given up: no
@@ -284,7 +284,7 @@ def _sent(state: State, phase: Phase, channel: actions.DataChannel, acknowledged
     seq = state.seq + state.over
     if channel in state.given_up:
         return replace(state, phase=phase), []
-    if seq - acknowledged <= state.rules.window:
+    if seq <= limit:
         return replace(state, phase=phase), [actions.Send(channel, seq, state.over)]
     if state.stopping >= (_END_SECONDS[channel] if state.over else 0.0):
         state = replace(state, phase=phase, given_up=(*state.given_up, channel))

@@ -40,7 +40,7 @@ class Phase(StrEnum):
 class Rules(msgspec.Struct, frozen=True):
     """What holds for the whole run.
 
-    window        messages of a channel that may be sent and not acknowledged
+    window        messages of a channel that may be sent and not acknowledged, at most
     lag_frames    frames that the detector may be ahead of its models; 0 in lockstep
     lockstep      whether the owner of the run is never behind
     objects_most  the most objects at a time
@@ -80,15 +80,18 @@ class Known(msgspec.Struct, frozen=True):
 class Progress(msgspec.Struct, frozen=True):
     """The progress of the receivers.
 
-    acknowledged  newest message of the features that is acknowledged; `taken`: that is processed
+    acknowledged  newest message of the features that is acknowledged; `taken`: that is processed; `limit`: that may be
+                  sent, as there is room in the window
     owner_...     the same of the results
     samples       version of each object's newest sample of the features up to message `due`
     """
 
     acknowledged: int = 0
     taken: int = 0
+    limit: int = 0
     owner_acknowledged: int = 0
     owner_taken: int = 0
+    owner_limit: int = 0
     due: int = 0
     samples: dict[str, int] = {}
 

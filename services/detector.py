@@ -289,7 +289,9 @@ class DetectorLoop:
         outputs = self._outputs
         features, results = outputs.features.window, (outputs.results or outputs.features).window
         samples = features.count_samples(due)
-        return Progress(features.acknowledged, features.taken, results.acknowledged, results.taken, due, samples)
+        of_features = features.acknowledged, features.taken, features.limit
+        of_results = results.acknowledged, results.taken, results.limit
+        return Progress(*of_features, *of_results, due, samples)
 
     # What the core orders
 

@@ -29,10 +29,6 @@ class StoredPart:
         """Seq of the newest message that is in a checkpoint."""
         return self.position.seq - self.position.unsaved
 
-    def is_urgent(self, seq: int, window: int) -> bool:
-        """Whether half of the sender's window is not stored yet: a full window would block the sender."""
-        return 2 * (seq - self.position.seq) >= window
-
     def is_due(self, seq: int, now: float, interval: float) -> bool:
         """Whether some messages are not stored, and the interval between checkpoints is over.
 

@@ -1,8 +1,8 @@
 """Acknowledged channels (`features`, `results`): every message arrives once and in order, whichever side is restarted.
 
-The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N with a window of
-`window` messages; `catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to
-sockets and to the clock.
+The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N;
+`catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to sockets and to the
+clock.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Sender(ChannelSocket[Message]):
 
     Parameters
     ----------
-    window : messages that may be sent and not acknowledged
+    window : messages that may be sent and not acknowledged; fewer if they are large
 
     Attributes
     ----------
@@ -157,7 +157,8 @@ class Receiver(ChannelSocket[Message]):
         message = self._decode(data, *self.channel.messages, check=self._check)
         if message is None:
             return None
-        actions = self.window.receive(peer, message.seq, monotonic(), last=isinstance(message, End))
+        ends = isinstance(message, End)
+        actions = self.window.receive(peer, message.seq, monotonic(), last=ends, size=len(data))
         self._reply(actions)
         return message if Deliver() in actions else None
 

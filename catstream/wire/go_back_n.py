@@ -4,8 +4,8 @@ Events and the time in seconds go in; frames to transmit and replies come out. `
 connects the machines to sockets.
 
 The sender numbers its messages 1, 2, 3 ... (`seq`). It keeps a copy of each until the receiver acknowledges
-it, and keeps at most `size` copies. The receiver delivers each message to the application once and in order, and
-replies once the application has processed it:
+it: at most `size` copies, and no further one once they take 256 MiB. The receiver delivers each message to the
+application once and in order, and replies once the application has processed it:
 
     Stored      acknowledges messages: those up to `taken` are processed, and the sender drops its copies up to `seq`
     Position    requests a retransmission of everything after `seq`
@@ -37,6 +37,7 @@ __all__ = ["HELLO", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
 #: The frame by which a sender asks for the receiver's position.
 HELLO = b""
 
+_MOST_BYTES = 256 << 20  # of the copies, from which on no other one is added
 _MAX_CHANGES = 65536  # newest samples that a sender remembers until it is asked for them
 _MAX_ASKING = 64  # peers that may wait for a position at a time; any other asks again
 
@@ -68,7 +69,7 @@ class SendWindow:
     Parameters
     ----------
     channel : name of the channel, for errors
-    size : unacknowledged messages that are kept at most
+    size : unacknowledged messages that are kept at most; fewer if they are large
     now : the time
 
     Attributes
@@ -84,6 +85,7 @@ class SendWindow:
         self.sent = self.acknowledged = self.stored = self.taken = 0
         self._channel, self._size = channel, size
         self._unacknowledged: deque[tuple[int, bytes]] = deque()  # oldest first
+        self._bytes = 0  # of them
         self._in_flight = 0  # how many of them were transmitted since the last Position
         self._sent_before = 0  # newest seq that a sender before this one may have sent
         self._last_reply = now
@@ -100,7 +102,12 @@ class SendWindow:
     @property
     def full(self) -> bool:
         """Whether no message can be pushed now."""
-        return len(self._unacknowledged) >= self._size
+        return len(self._unacknowledged) >= self._size or self._bytes >= _MOST_BYTES
+
+    @property
+    def limit(self) -> int:
+        """Newest seq that can be pushed before anything else is acknowledged."""
+        return self.sent if self.full else self.sent + 1
 
     def push(self, seq: int, frame: bytes) -> None:
         """Accept the next message for transmission.
@@ -111,8 +118,10 @@ class SendWindow:
             If the window is full.
         """
         if self.full:
-            raise ValueError(f"message {seq} of {self._channel} was pushed while {self._size} are not acknowledged")
+            kept = f"{len(self._unacknowledged)} of {self._bytes} bytes"
+            raise ValueError(f"message {seq} of {self._channel} was pushed while {kept} are not acknowledged")
         self._unacknowledged.append((seq, frame))
+        self._bytes += len(frame)
         self.sent = seq
 
     def transmit(self, send: Callable[[bytes], object]) -> None:
@@ -192,7 +201,7 @@ class SendWindow:
 
     def _forget(self, reply: Stored | Position) -> None:
         while self._unacknowledged and self._unacknowledged[0][0] <= reply.seq:
-            self._unacknowledged.popleft()
+            self._bytes -= len(self._unacknowledged.popleft()[1])
             self._in_flight = max(self._in_flight - 1, 0)
         self.acknowledged = max(self.acknowledged, min(reply.seq, self.sent))
         self.stored = max(self.stored, min(reply.seq - reply.unsaved, self.sent))
@@ -217,6 +226,7 @@ class ReceiveWindow:
         self.taken = position.seq
         self.ended = self.connected = False
         self._position, self._size = position, size
+        self._bytes = 0  # of the messages that were delivered since all were stored
         self._peer: bytes | None = None  # the sender of the last message: acknowledgements go to it only
         self._asking: dict[bytes, None] = {}  # peers that wait for `answer`, in order
         self._gap_reported = -math.inf  # when a missing message was last reported
@@ -225,6 +235,11 @@ class ReceiveWindow:
     def position_requested(self) -> bool:
         """Whether a sender waits for `answer`: it asked for the position, and more was delivered than is stored."""
         return bool(self._asking)
+
+    @property
+    def half_full(self) -> bool:
+        """Whether half of the sender's window is not stored yet: a full window would block the sender."""
+        return 2 * (self.taken - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def hello(self, peer: bytes) -> list[Reply]:
         """A sender asks for the position; it is answered at once if it only waits, or if all messages are stored."""
@@ -236,13 +251,15 @@ class ReceiveWindow:
             self._asking[peer] = None
         return []
 
-    def receive(self, peer: bytes, seq: int, now: float, last: bool = False) -> list[Deliver | Reply | Reject]:
-        """A message arrived; `last` says whether it is the end of the stream."""
+    def receive(
+        self, peer: bytes, seq: int, now: float, last: bool = False, size: int = 0
+    ) -> list[Deliver | Reply | Reject]:
+        """A message of `size` bytes arrived; `last` says whether it is the end of the stream."""
         ends = last and not self.ended  # also before a restarted sender has repeated what was delivered
         if seq <= self.taken and not ends:  # retransmitted: the sender does not know that it arrived
             return [Reply(peer, self._stored())]
         if seq <= self.taken + 1:
-            self.taken, self.ended = max(seq, self.taken), last
+            self.taken, self.ended, self._bytes = max(seq, self.taken), last, self._bytes + size
             self._peer, self.connected, self._gap_reported = peer, True, -math.inf
             return [Deliver()]
         actions: list[Deliver | Reply | Reject] = []
@@ -255,12 +272,12 @@ class ReceiveWindow:
 
     def acknowledge(self, position: Position) -> list[Reply]:
         """All delivered messages are processed, and stored up to `position.seq`, except the last `position.unsaved`."""
-        self._position = position
+        self._note_position(position)
         return [] if self._peer is None else [Reply(self._peer, self._stored())]
 
     def answer(self, position: Position) -> list[Reply]:
         """Answer all that asked for the position."""
-        self._position = position
+        self._note_position(position)
         replies = [Reply(peer, position) for peer in self._asking]
         self._asking.clear()
         return replies
@@ -268,6 +285,11 @@ class ReceiveWindow:
     def disconnected(self) -> None:
         """A connection ended: it may be the sender's."""
         self.connected = False
+
+    def _note_position(self, position: Position) -> None:
+        self._position = position
+        if position.seq >= self.taken:
+            self._bytes = 0
 
     def _stored(self) -> Stored:
         at = self._position

@@ -40,12 +40,17 @@ class Receiver:
         self.sent = self.taken = self.acknowledged = self.ended = 0
         self.on_the_way = []
 
+    @property
+    def limit(self):
+        room = self.sent - min(self.acknowledged, self.sent) < RULES.window
+        return self.sent + room
+
     def resume(self, seq):
         self.sent, self.on_the_way = seq, []
 
     def send(self, seq, end):
         assert seq == self.sent + 1, "messages are sent in order, each once"
-        assert seq - min(self.acknowledged, self.sent) <= RULES.window, "never beyond the window"
+        assert seq <= self.limit, "never beyond the window"
         self.sent = seq
         self.on_the_way.append((seq, end))
 
@@ -97,9 +102,10 @@ class World:
     def progress_of(self, due):
         features, results = self.receivers["features"], self.receivers["results"]
         samples = {name: version for seq, name, version in self.samples if seq <= due}
-        acknowledged, taken = min(features.acknowledged, features.sent), min(features.taken, features.sent)
-        owner = min(results.acknowledged, results.sent), min(results.taken, results.sent)
-        return Progress(acknowledged, taken, *owner, due, samples)
+        both = (
+            (min(each.acknowledged, each.sent), min(each.taken, each.sent), each.limit) for each in (features, results)
+        )
+        return Progress(*itertools.chain(*both), due, samples)
 
     def receive_all(self):
         for receiver in self.receivers.values():
@@ -571,7 +577,7 @@ def test_a_repeated_frame_reports_an_object_as_absent_that_was_forgotten_later_a
 @given(st.integers(0, 5), st.integers(1, 5), st.integers(0, 3), st.integers(0, 3))
 def test_a_model_is_awaited_for_an_object_that_had_begun_and_whose_sample_is_newer(began, due, newest, version):
     known = {"anna": Known(newest, newest, began, False, PLACE)}
-    progress = Progress(due, due, 0, 0, due, {"anna": version, "ben": 9})
+    progress = Progress(due, due, due=due, samples={"anna": version, "ben": 9})
     state = State(RULES, Phase.TAKEN, seq=due + RULES.lag_frames, desired=ANNA, known=known)
     state, _ = handle(state, core.Progressed(progress))
     assert (state.phase is Phase.MODEL) == (began < due and newest < version)
@@ -584,6 +590,7 @@ def test_a_stop_holds_until_the_end_of_the_stream_is_stored():
     world.tell(core.Ended("the source has ended"))
     assert world.state.ending == STOPPED
     assert world.stored.stopped
+    world.progress()
     world.receive_all()
     assert world.finished
     assert world.stored == ANNA
@@ -597,11 +604,11 @@ def test_an_event_that_cannot_happen_is_an_error():
 @given(st.integers(0, 9), st.sampled_from(["features", "results"]), st.floats(0, 30))
 def test_the_end_is_given_up_only_after_the_process_was_asked_to_end_and_its_patience_is_over(seq, slow, seconds):
     state = State(replace(RULES, owned=True), Phase.FRAME, seq=seq, desired=ANNA)
-    state, _ = handle(state, core.Progressed(Progress(seq, seq, seq, seq)))
+    state, _ = handle(state, core.Progressed(Progress(seq, seq, seq + 1, seq, seq, seq + 1)))
     state, found = handle(state, core.Ended("the source has ended"))
     assert [order for order in found if isinstance(order, actions.Send)] == [actions.Send("features", seq + 1, True)]
     if slow == "results":
-        state, _ = handle(state, core.Progressed(Progress(seq + 1, seq + 1, seq, seq)))
+        state, _ = handle(state, core.Progressed(Progress(seq + 1, seq + 1, seq + 2, seq, seq, seq + 1)))
     waits = state.phase
     state, _ = handle(state, core.Stopping(seconds))
     patience = {"features": 10.0, "results": 0.5}[slow]

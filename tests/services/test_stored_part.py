@@ -8,8 +8,10 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from catstream.messages.kinds import End, ObjectPosition, Position
 from catstream.services.stored_part import StoredPart
+from catstream.wire.go_back_n import ReceiveWindow
 
 WINDOW = 8
+WINDOW_BYTES = 256 << 20
 INTERVAL = 3.0
 
 
@@ -24,8 +26,9 @@ class Storing(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.part = StoredPart(Position(5), 0.0)
+        self.window = ReceiveWindow(Position(5), WINDOW)
         self.seq = self.on_disk = 5
-        self.now = 0.0
+        self.now, self.unstored = 0.0, 0
 
     def store(self, works, urgent, seconds=0.0):
         if works:
@@ -33,11 +36,15 @@ class Storing(RuleBasedStateMachine):
         position = Position(self.seq, objects=objects(self.seq))
         began, self.now = self.now, self.now + seconds
         self.part = self.part.after(position, began, self.now, saved=works, urgent=urgent)
+        self.window.acknowledge(self.part.position)
+        self.unstored = 0 if self.part.position.seq == self.seq else self.unstored
 
-    @rule(works=st.booleans())
-    def receive(self, works):
+    @rule(works=st.booleans(), size=st.integers(0, WINDOW_BYTES // 3))
+    def receive(self, works, size):
         self.seq += 1
-        urgent = self.part.is_urgent(self.seq, WINDOW)
+        self.unstored += size
+        self.window.receive(b"peer", self.seq, self.now, size=size)
+        urgent = self.window.half_full
         if urgent or self.part.is_due(self.seq, self.now, INTERVAL):
             self.store(works, urgent)
 
@@ -65,6 +72,7 @@ class Storing(RuleBasedStateMachine):
     @invariant()
     def half_of_the_window_is_free(self):
         assert 2 * (self.seq - self.part.position.seq) < WINDOW
+        assert 2 * self.unstored < WINDOW_BYTES
 
     @invariant()
     def the_end_is_stored_as_much_as_the_message_before_it(self):

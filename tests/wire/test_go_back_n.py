@@ -68,6 +68,7 @@ class Histories(RuleBasedStateMachine):
         """Push the next message if there is room."""
         seq = self.sender.sent + 1
         if seq - self.sender.acknowledged <= self.size:
+            assert self.sender.limit == seq
             self.sender.push(seq, payload(seq))
         else:
             with pytest.raises(ValueError, match="not acknowledged"):
@@ -300,6 +301,24 @@ def filled(size, count):
         window.push(seq, payload(seq))
     assert len(frames(window)) == count
     return window
+
+
+def test_a_sender_accepts_no_message_once_those_that_it_keeps_take_256_mib():
+    window, large = SendWindow("features", 9, 0.0), bytes(64 << 20)
+    for seq in range(1, 5):
+        assert window.limit == seq
+        window.push(seq, large)
+    assert window.full
+    assert window.limit == 4
+    with pytest.raises(ValueError, match="4 of 268435456 bytes are not acknowledged"):
+        window.push(5, b"")
+    window.receive(Stored(1, 1), now=0.0)
+    assert window.limit == 5
+    window.push(5, bytes(300 << 20))
+    window.receive(Stored(4, 4), now=0.0)
+    assert window.full
+    window.receive(Stored(5, 5), now=0.0)
+    assert not window.full
 
 
 def frames(window):
