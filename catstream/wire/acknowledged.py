@@ -93,6 +93,10 @@ class Sender(ChannelSocket[Message]):
             self._say_hello()
         self._transmit()
 
+    def _disconnected(self) -> None:
+        super()._disconnected()
+        self.window.disconnected()
+
     def _process(self, data: bytes) -> None:
         answer = self._decode(data, *_REPLIES)
         if answer is not None and (rejected := self.window.receive(answer, monotonic())) is not None:

@@ -12,10 +12,10 @@ application once and in order, and replies once the application has processed it
 
 The receiver replies with a Position if a message is missing, and if the sender asks (with an empty frame, the
 hello) on another connection than that of the last message. On the same one it replies with a Stored, as a connection
-loses no message while it lasts. The sender asks if it was restarted, and after `PATIENCE_SECONDS` without a reply
-while messages wait. So either side may be restarted, any connection may break, and any reply may be lost: each message
-is still delivered once, in order. The end of the stream is delivered at any `seq` up to the next one: a restarted
-sender may end before it has repeated all that was delivered.
+loses no message while it lasts; for the same reason, the sender goes back once for several Positions. It asks if it was
+restarted, and after `PATIENCE_SECONDS` without a reply while messages wait. So either side may be restarted, any
+connection may break, and any reply may be lost: each message is still delivered once, in order. The end of the stream
+is delivered at any `seq` up to the next one: a restarted sender may end before it has repeated all that was delivered.
 
 `Stored.seq` may include messages that the receiver has only in memory, because its disk cannot be written; `unsaved`
 is their number. If such a receiver is restarted, the sender cannot retransmit them and raises `StreamRewoundError`.
@@ -30,7 +30,7 @@ from dataclasses import dataclass
 
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import Position, Stored
-from catstream.wire.timing import PATIENCE_SECONDS
+from catstream.wire.timing import AGAIN_SECONDS, PATIENCE_SECONDS
 
 __all__ = ["HELLO", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
 
@@ -89,6 +89,7 @@ class SendWindow:
         self._in_flight = 0  # how many of them were transmitted since the last Position
         self._sent_before = 0  # newest seq that a sender before this one may have sent
         self._last_reply = now
+        self._went_back = -math.inf  # when it last did, on the present connection
         self.versions: dict[str, int] = {}
         self._changes: deque[tuple[int, str, int]] = deque()  # seq that led to a version of an object; 0: it is gone
         self._versions: dict[str, int] = {}  # that `count_samples` returned last
@@ -154,7 +155,7 @@ class SendWindow:
                 "it holds another stream: restart it, or start this process with --resume"
             )
         if isinstance(reply, Position):
-            self._go_back(reply)
+            self._go_back(reply, now)
         elif reply.seq < self.acknowledged or reply.taken < self.taken:
             before = f"{self.taken} were processed and {self.acknowledged} acknowledged before"
             return Reject("acknowledgement", f"expected no step back ({before}), got {reply.taken} and {reply.seq}")
@@ -190,14 +191,19 @@ class SendWindow:
                 if len(self._changes) > _MAX_CHANGES:
                     self._count_oldest()
 
-    def _go_back(self, position: Position) -> None:
-        """Transmit everything again that the receiver has not."""
+    def disconnected(self) -> None:
+        """The connection ended, and what was in flight may be lost."""
+        self._went_back = -math.inf
+
+    def _go_back(self, position: Position, now: float) -> None:
+        """Transmit everything again that the receiver has not, unless that is on its way already."""
         if position.seq < self.acknowledged:
             raise StreamRewoundError(
                 f"the receiver of {self._channel} had {self.acknowledged} messages and now has {position.seq}: "
                 "what came between is made again from the source"
             )
-        self._in_flight = 0
+        if now - self._went_back > AGAIN_SECONDS:
+            self._went_back, self._in_flight = now, 0
 
     def _forget(self, reply: Stored | Position) -> None:
         while self._unacknowledged and self._unacknowledged[0][0] <= reply.seq:

@@ -15,6 +15,7 @@ LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last mes
 
 # Acknowledged channels.
 PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the position; between two reports of a gap
+AGAIN_SECONDS = 2.0  #: after which a sender transmits everything again on the same connection
 
 # Published channels.
 REPEAT_SECONDS = 0.2  #: without a newer message, after which the last ones are sent again; doubled each time
@@ -46,6 +47,7 @@ ORDER: tuple[tuple[float, float, str], ...] = (
     (CONTROLLER_SECONDS, REGISTRY_SECONDS, "a command does not follow a controller that was started again elsewhere"),
     (DESERTED_SECONDS, ANSWER_SECONDS, "a command to a restarted detector is not repeated"),
     (REGISTRY_SECONDS, ANSWER_SECONDS, "a command waits longer for the registry than for its answer"),
+    (PATIENCE_SECONDS, AGAIN_SECONDS, "a sender transmits everything twice to a receiver that was restarted"),
     (PATIENCE_SECONDS, LINGER_SECONDS, "a sender that closes transmits nothing again"),
     (REPEAT_SECONDS, REPORT_SECONDS, "a health report that was lost is not repeated in time"),
     (CHECK_SECONDS, REPORT_SECONDS, "a pipeline that rejects the keys counts as silent"),

@@ -163,6 +163,7 @@ class Histories(RuleBasedStateMachine):
         """The frames that were not transmitted by then are lost, and all replies."""
         self.to_receiver = deque(list(self.to_receiver)[:transmitted])
         self.to_sender.clear()
+        self.sender.disconnected()
         self.connect()
 
     @precondition(lambda self: self.to_sender)
@@ -189,6 +190,8 @@ class Histories(RuleBasedStateMachine):
         self.to_sender.clear()
         self.position = Position(self.disk, objects=made(**made_by(self.disk)))
         self.receiver = ReceiveWindow(self.position, self.size)
+        self.sender.disconnected()
+        self.connect()
 
     @rule()
     def sender_dies(self):
@@ -365,6 +368,16 @@ def test_a_gap_after_a_gap_is_reported_at_once():
 def test_a_position_makes_the_sender_go_back_to_it_whatever_is_in_flight():
     window = filled(size=4, count=4)
     window.receive(Position(2), now=0.0)
+    assert frames(window) == [payload(3), payload(4)]
+
+
+def test_a_sender_goes_back_once_for_all_positions_of_a_connection():
+    window = filled(size=4, count=4)
+    for now in (1.0, 1.3):
+        window.receive(Position(2), now)
+        assert frames(window) == ([payload(3), payload(4)] if now == 1.0 else [])
+    window.disconnected()
+    window.receive(Position(2), now=1.6)
     assert frames(window) == [payload(3), payload(4)]
 
 
