@@ -9,6 +9,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import cast
 from urllib.parse import quote
 
@@ -95,11 +96,18 @@ class Server:
 
 
 class _Uvicorn(uvicorn.Server):
-    """Closes the streams of open pages before the shutdown, which waits for all connections."""
+    """Closes the streams of open pages before the shutdown, which waits for all connections.
+
+    A second Ctrl-C changes nothing: uvicorn would leave out the end of the site, and print the stack of it.
+    """
 
     def __init__(self, config: uvicorn.Config, close: Callable[[], None]) -> None:
         super().__init__(config)
         self._close = close
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        if not self.should_exit:
+            super().handle_exit(sig, frame)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._close()

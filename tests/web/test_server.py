@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import json
 import re
+import signal
 import socket
 import time
 from contextlib import ExitStack
@@ -22,6 +23,7 @@ from catstream.messages.kinds import Health
 from catstream.web import app
 from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
+from catstream.web.feed import PipelineFeed
 from catstream.web.guard import Guard
 from catstream.web.server import Server
 from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
@@ -354,6 +356,25 @@ def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host)
     for url in urls[2:]:
         with socket.socket() as other:  # only what is an address of this machine can be bound
             other.bind((url.hostname, 0))
+
+
+def test_a_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatch):
+    started, stopped, stops = PipelineFeed.start, PipelineFeed.stop, []
+
+    def start(feed):
+        started(feed)
+        signal.raise_signal(signal.SIGINT)
+
+    def stop(feed):
+        stops.append(feed)
+        return stopped(feed)
+
+    monkeypatch.setattr(PipelineFeed, "start", start)
+    monkeypatch.setattr(PipelineFeed, "stop", stop)
+    site = pipeline_site()
+    monkeypatch.setattr(site, "close", lambda: signal.raise_signal(signal.SIGINT))
+    Server(site, port=0, token=TOKEN).run()
+    assert len(stops) == 1
 
 
 def test_a_short_token_is_an_error():
