@@ -318,9 +318,7 @@ def find(text: str | Endpoint = "", keys: str = "", source: str = "") -> Endpoin
             raise ServiceError(f"{len(found)} pipelines track {source!r}: say which (--endpoint){_listed(found)}")
         return found[0]
     if len(endpoints) > 1:
-        raise ServiceError(
-            f"{len(endpoints)} pipelines are running: say which (--endpoint or --source){_listed(endpoints)}"
-        )
+        raise ServiceError(f"{len(endpoints)} pipelines are running: say which (--endpoint){_listed(endpoints)}")
     return endpoints[0]
 
 
