@@ -76,7 +76,9 @@ class Learned:
             If the trees have no leaf yet, or the object was not found yet.
         """
         state = compressor.detector
-        if compressor.box is None or state is None or state.first_window is None or not compressor.version:
+        if state is not None and state.is_sought:
+            raise ServiceError("the object of the saved model was not found yet, so there is nothing new to save")
+        if compressor.box is None or state is None or not compressor.version:
             raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
         trees = {each: tree.copy() for each, tree in compressor.trees.items()}
         centres, name = compressor.centres, compressor.name

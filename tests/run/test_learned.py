@@ -125,6 +125,14 @@ def test_before_the_first_sample_there_is_nothing_to_save():
         learn(stream(1, 1))
 
 
+def test_a_run_that_has_only_searched_for_its_object_has_nothing_new_to_save(learned):
+    (message,) = stream(2, 1)
+    sought = dataclasses.replace(message, box=None, detector=dataclasses.replace(message.detector, first_window=None))
+    compressor = compressed([sought], learned.compressor(SETTINGS))
+    with pytest.raises(ServiceError, match="the object of the saved model was not found yet"):
+        Learned.of(compressor, SETTINGS)
+
+
 def test_a_file_of_another_kind_is_an_error(messages, tmp_path):
     storage.write(tmp_path / "one", *compressed(messages).trees["object"].state())
     with pytest.raises(ProtocolError, match="not a saved model"):
