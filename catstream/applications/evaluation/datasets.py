@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from catstream.errors import VideoError
+from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64, UInt8
 from catstream.video.source import natural_order, open_source
 
@@ -68,7 +69,7 @@ class Sequence:
                 if not left:
                     return
         raise VideoError(
-            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {left} frames too few: "
+            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {counted(left, 'frame')} too few: "
             "each line of the ground truth needs a frame"
         )
 

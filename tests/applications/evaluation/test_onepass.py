@@ -211,7 +211,7 @@ def test_a_failing_sequence_is_named_and_the_others_run(tmp_path, sequence, jobs
     assert load(tmp_path, "mil", sequence, FIRST) is not None
     (error,) = errors
     assert str(error).startswith("mil on longer: ")
-    assert "1 frames too few" in str(error)
+    assert "1 frame too few" in str(error)
 
 
 def test_an_error_without_a_handler_is_raised(sequence):

@@ -124,7 +124,7 @@ def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk, 
     file = tmp_path / "out.json"
     code, output, errors = said("evaluate", walk, torn, "--tracker", "mil", "--json", file)
     assert re.search(r"walk +mil +12 +0\.\d{3}", output)
-    assert re.search(r"mil on torn: .* 1 frames too few", errors)
+    assert re.search(r"mil on torn: .* 1 frame too few", errors)
     assert (code, "1 of 2 runs" in errors.splitlines()[-1]) == (1, True)
     assert [row["name"] for row in json.loads(file.read_text())["sequences"]] == ["walk"]
 
