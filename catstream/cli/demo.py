@@ -49,7 +49,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
       OUTPUT/tracks/                          the results of `catstream track`, with the annotated video
 
     \b
-    Examples
+    EXAMPLES
       catstream demo
       catstream demo --objects 8 --output crowd
       catstream demo --live demo:1

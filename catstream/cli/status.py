@@ -164,11 +164,12 @@ def _format(summary: dict[str, Any]) -> str:
         return "-" if summary[name] is None else f"{summary[name]}"
 
     history = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
-    size = "-" if summary["bytes"] is None else f"{summary['bytes'] / 1e6:.1f}"
     lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "available"
     source = f"source     {lost}, {shown('skipped')} frames skipped"
     if summary["reopened"] is not None:  # a demo is never lost
         source += f", reopened {shown('reopened')} times"
+    size = (summary["bytes"] or 0) / 1e6
+    trees = f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size:.1f} MB"
     return "\n".join(
         (
             f"pipeline   {summary['endpoint']}",
@@ -176,7 +177,7 @@ def _format(summary: dict[str, Any]) -> str:
             f"frames     {shown('frames')}, {shown('frames_per_second')} a second",
             f"learning   {shown('lag')} messages behind, {shown('not_stored')} not stored",
             f"model      {shown('model_version')}",
-            f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size} MB",
+            *([trees] if summary["bytes"] is not None else []),  # None before the first box
             *([source] if summary["skipped"] is not None else []),  # None for a file
             f"rejected   {counted(sum(summary['rejected'].values()), 'message')}",
             f"reports    {', '.join(history)}",

@@ -33,8 +33,10 @@ def test_the_help_lists_the_commands_and_shows_a_first_example(help_of):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_a_help_text(help_of, command):
-    assert help_of(command).startswith(f"Usage: catstream {command}")
+def test_every_command_has_a_help_text_with_examples(help_of, command):
+    text = help_of(command)
+    assert text.startswith(f"Usage: catstream {command}")
+    assert " EXAMPLES catstream " in text
 
 
 def test_an_unknown_command_is_an_error(fail):
