@@ -167,7 +167,7 @@ def _format(summary: dict[str, Any]) -> str:
     lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "available"
     source = f"source     {lost}, {shown('skipped')} frames skipped"
     if summary["reopened"] is not None:  # a demo is never lost
-        source += f", reopened {shown('reopened')} times"
+        source += f", reopened {counted(summary['reopened'], 'time')}"
     size = (summary["bytes"] or 0) / 1e6
     trees = f"trees      {shown('leaves')} leaves, {shown('nodes')} nodes, level {shown('level')}, {size:.1f} MB"
     return "\n".join(
