@@ -315,12 +315,12 @@ _SCALE_HEAD = """
     was run**: the decisions, answers and writes below are the real ones, of streams that do not run; what they add up
     to is arithmetic."""
 _HEAD_OF_A_FLEET = """
-    The controller looks at all streams twice a second, so the decisions of a turn have to stay well below 0.5 s. To
-    that come the calls of Ray that ask each stream for its figures, about 0.3 ms of processor each: with more than
-    about a thousand streams, a turn takes longer than 0.5 s, and a failure is noticed later. Streams track on
-    meanwhile, and Ray restarts them without the controller. `all are answered` is the time until a client, such as
-    the web page, has the state of all streams. Beyond some thousands of streams, run several fleets: a client names the
-    fleet in the address of a stream."""
+    The controller looks at all streams twice a second, so the decisions of a turn have to stay well below 0.5 s. In
+    addition, it asks each stream for its figures through Ray, which costs about 0.3 ms of processor time: with more
+    than about a thousand streams, a turn takes longer than 0.5 s, and a failure is noticed later. Streams continue to
+    track meanwhile, and Ray restarts them without the controller. `all are answered` is the time until a client, such
+    as the web page, has the state of all streams. Beyond some thousands of streams, run several fleets: a client names
+    the fleet in the address of a stream."""
 _NODE_OF_A_FLEET = """
     A stream needs 0.3 to 1 cores, by the size of its frames and their rate: `catstream fleet status` shows what it
     uses, and `cores` in the file is what Ray reserves. A node writes the state of each stream every 5 seconds, about
