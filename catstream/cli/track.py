@@ -258,7 +258,7 @@ def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None
 def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
     """Yield descriptions of options that are valid, but hardly are what was meant."""
     objects = {*request.boxes, *request.models}
-    if objects and (unknown := request.saved.keys() - objects):
+    if objects and (unknown := request.saved.keys() - objects - {UNNAMED}):  # without a name, the only one is meant
         yield f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name"
     yield from doubtful(request.boxes, *pipeline.size)
 

@@ -280,3 +280,5 @@ def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_
     assert code == 1
     assert first == "there is no object c yet: its model is saved if one begins under this name"
     assert "c" in last
+    _, errors = succeed("track", source, "--box", f"a={box}", "--save-model", tmp_path / "only", "--end", 12)
+    assert "there is no object" not in errors, "without a name, the only one is meant"
