@@ -62,9 +62,12 @@ class Desired:
             raise FleetError(f"{name} {reason}")
         return replace(self, pins=self.pins | {name: node.id})
 
-    def drained(self, node: str, *, undo: bool) -> Desired:
-        """With a node that streams leave; `undo` takes that back."""
-        return replace(self, draining=self.draining - {node} if undo else self.draining | {node})
+    def drained(self, node: Node, *, undo: bool) -> Desired:
+        """With a node that streams leave, those too that were moved to it; `undo` lets it take streams again."""
+        if undo:
+            return replace(self, draining=self.draining - {node.name})
+        pins = {name: id_ for name, id_ in self.pins.items() if id_ != node.id}
+        return replace(self, draining=self.draining | {node.name}, pins=pins)
 
     def with_draining(self, nodes: Collection[Node]) -> list[Node]:
         """Nodes, with those marked that streams leave."""

@@ -171,9 +171,9 @@ class Fleet:
 
         Streams wait if the other nodes have no room for them.
         """
-        self._node(node)
+        there = self._node(node)
         count = sum(each.node == node for each in self.status().streams.values())
-        self._change(Desired.drained, node, undo=undo, may_wait=True)
+        self._change(Desired.drained, there, undo=undo, may_wait=True)
         return f"{node} takes streams again" if undo else f"{node} is draining; streams that leave it: {count}"
 
     def status(self) -> FleetStatus:

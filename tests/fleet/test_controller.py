@@ -231,23 +231,35 @@ def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
 
 def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_streams_again(site, ray):
     running(site, ray, "gate")
-    site.change("drained", "n1", undo=False)
+    site.change("drained", ray.nodes[0], undo=False)
     for _ in range(4):
         site._turn()
     assert ray.actors["site/stream/gate"].options["label_selector"] == {"ray.io/node-id": "!in(1)"}
     assert site.status().nodes["n1"].state == "draining"
     running(site, ray, "gate", "2")
-    site.change("drained", "n1", undo=True)
+    site.change("drained", ray.nodes[0], undo=True)
     site._turn()
     assert states(site)["gate"] == "running", "it stays where it is"
 
 
-def test_a_node_that_was_drained_a_moment_ago_has_no_room(site, spec):
-    for node in ("n1", "n2"):
+def test_a_stream_that_was_moved_to_a_drained_node_does_not_return_to_it(site, ray):
+    running(site, ray, "gate")
+    site.change("moved", "gate", ray.nodes[0])
+    site.change("drained", ray.nodes[0], undo=False)
+    for _ in range(4):
+        site._turn()
+    running(site, ray, "gate", "2")
+    site.change("drained", ray.nodes[0], undo=True)
+    site._turn()
+    assert states(site)["gate"] == "running"
+
+
+def test_a_node_that_was_drained_a_moment_ago_has_no_room(site, spec, ray):
+    for node in ray.nodes:
         site.change("drained", node, undo=False, may_wait=True)
     with pytest.raises(FleetError, match=r"roof needs a node that is not drained.* n2 \(drained\)"):
         site.change("applied", spec, "", replace_other=False)
-    site.change("drained", "n1", undo=True)
+    site.change("drained", ray.nodes[0], undo=True)
     site.change("applied", spec, "", replace_other=False)
 
 
@@ -326,7 +338,7 @@ def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, ray, monke
         for change in (
             lambda: site.change("added", replace(GATE, name="new")),
             lambda: site.change("moved", "gate", ray.nodes[1]),
-            lambda: site.change("drained", "n1", undo=False),
+            lambda: site.change("drained", ray.nodes[0], undo=False),
             lambda: site.change("removed", ["gate"]),
         ):
             with pytest.raises(StoreError, match="cannot be reached"):
@@ -343,7 +355,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
         goes_on.wait(60)
 
     monkeypatch.setattr(States, "put", put)
-    change = threading.Thread(target=site.change, args=("drained", "n1"), kwargs={"undo": False})
+    change = threading.Thread(target=site.change, args=("drained", ray.nodes[0]), kwargs={"undo": False})
     change.start()
     try:
         assert hangs.wait(60)
