@@ -396,7 +396,9 @@ class Controller:
         if known.seen.state == "working":
             quiet = time.monotonic() - known.seen.answered
             trouble = f"it has not answered for {quiet:.0f} s" if quiet > QUIET_SECONDS else last.trouble
-            return replace(last, trouble=trouble)
+            wanted = self._desired.wanted(name)
+            leaves = self._phase == "up" and life.event(wanted, known.seen, self._nodes, time.monotonic()) == "unwanted"
+            return replace(last, state="moving" if leaves else last.state, trouble=trouble)
         stored = last.stored_seconds
         age = None if stored is None else stored + time.monotonic() - known.seen.answered
         last = replace(last, endpoint="", server="", rate=0.0, cores=0.0, stored_seconds=age, trouble="")

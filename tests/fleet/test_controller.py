@@ -217,6 +217,7 @@ def test_no_start_server_outlives_its_node(parent, shared, monkeypatch):
 def test_a_stream_that_is_moved_stops_first_and_starts_on_the_node(site, ray):
     running(site, ray, "gate")
     site.change("moved", "gate", ray.nodes[1])
+    assert states(site)["gate"] == "moving", "from the answer on, so that `up` waits for it"
     site._turn()
     assert states(site)["gate"] == "moving"
     assert ray.actors["site/stream/gate"].asked[-1] == ("stop", "moved")
