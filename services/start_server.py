@@ -301,7 +301,9 @@ def _run(
 
 def _connected(program: int) -> socket.socket:
     """A connection to the server that ends with a program and has imported what this process would; it may be new."""
-    os.close(os.pidfd_open(program))  # it lives, and the server will see its end
+    os.close(os.pidfd_open(program))  # the server will see its end
+    if is_ending(program):  # nobody has waited for it yet
+        raise ProcessLookupError(errno.ESRCH, "the program has ended")
     began = process_fields(program)[_BEGAN]
     key = json.dumps([os.getuid(), program, began, _imports()], sort_keys=True)  # variables have no order
     name = f"\0catstream-start-{hashlib.sha256(key.encode()).hexdigest()}"  # the kernel removes it with the server
@@ -569,9 +571,10 @@ def main(requests: int, program: int) -> None:
     logging.basicConfig(format="start server: %(message)s", level=logging.INFO)
     gc.disable()  # nothing of what is imported is garbage
     parent = os.getpid()
-    if (forked := server.serve()) is not None:
-        request, watchdog = forked
-        run_started(request.name, request.job, request.restarted, parent, watchdog)
+    if (forked := server.serve()) is None:
+        os._exit(0)  # at once: its sockets are open until it counts as ending
+    request, watchdog = forked
+    run_started(request.name, request.job, request.restarted, parent, watchdog)
 
 
 def run_started(name: str, job: str, restarted: bool, parent: int, watchdog: int) -> None:

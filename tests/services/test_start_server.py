@@ -356,8 +356,23 @@ def test_a_start_server_of_another_user_is_not_used(monkeypatch):
         node.kill()
 
 
-def test_a_program_whose_partner_has_ended_has_a_server_of_its_own(sharing):
+def test_a_shared_server_counts_as_ending_before_its_sockets_close(server, monkeypatch):
+    """Otherwise the second attempt of a start reaches the same server as the first one."""
+    server.close()
+    with subprocess.Popen(["sleep", "600"]) as node:
+        monkeypatch.setattr(module, "_shared_with", node.pid)
+        shared = start_server()
+        node.kill()
+        shared._requests.settimeout(60)
+        assert shared._requests.recv(1) == b""
+        assert not shared.is_usable
+
+
+@pytest.mark.parametrize("reaped", [True, False])
+def test_a_program_whose_partner_has_ended_has_a_server_of_its_own(reaped, sharing, until):
     with subprocess.Popen(["true"]) as node:
-        node.wait()
+        until(lambda: has_ended(psutil.Process(node.pid)))
+        if reaped:
+            node.wait()
         program, process = sharing(node.pid)
-    assert process.parent().ppid() == program.pid
+        assert process.parent().ppid() == program.pid
