@@ -124,14 +124,20 @@ def up(running: Fleet, replace: bool, **options: Any) -> None:
         if running.is_owner:
             _watch_until_its_end(console, running)
     if running.is_owner:
-        with Console(stderr=True).status("storing the states of all streams"):
-            running.down()
-        click.echo(f"the fleet {running.name} is down")
+        _down(running)
 
 
 def _up(fleet: Fleet, **options: Any) -> list[str]:
     with Console(stderr=True).status("starting the fleet"):
         return fleet.up(**options)
+
+
+def _down(fleet: Fleet) -> None:
+    with Console(stderr=True).status("storing the states of all streams"):
+        unstored = fleet.down()
+    for line in unstored:
+        click.echo(line, err=True)
+    click.echo(f"the fleet {fleet.name} is down")
 
 
 def _watch(console: Console, fleet: Fleet) -> None:
@@ -341,9 +347,7 @@ def down(running: Fleet) -> None:
     On this machine, Ray ends with the fleet. On a cluster, Ray stays.
     `catstream fleet up` continues from the last states.
     """
-    with Console(stderr=True).status("storing the states of all streams"):
-        running.down()
-    click.echo(f"the fleet {running.name} is down")
+    _down(running)
 
 
 def _show(console: Console, status: FleetStatus) -> None:

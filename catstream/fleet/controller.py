@@ -119,6 +119,7 @@ class Controller:
         self._clients_due = 0.0
         self._phase: Literal["idle", "up", "down"] = "idle"  # before the first change; and while the fleet ends
         self._recent = FleetStatus(name, time.time())
+        self._unstored: dict[str, str] = {}  # why the last state of a stream that has stopped is not stored
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
         self._registry: RegistryServer | None = None
@@ -204,13 +205,19 @@ class Controller:
         self._phase = "down"
         return sum(known.handle is not None for known in self._streams.values())
 
-    def end(self) -> None:
-        """End the threads, and the registry; the streams run on."""
+    def end(self) -> list[str]:
+        """End the threads, and the registry; the streams run on.
+
+        Returns
+        -------
+        a line for each stream that was stopped without its last state in the store
+        """
         self._over.set()
         for thread in self._threads:
             thread.join()
         if self._registry is not None:
             self._registry.close()
+        return [f"{name}: {trouble}" for name, trouble in sorted(self._unstored.items()) if trouble]
 
     # What it does.
 
@@ -323,6 +330,7 @@ class Controller:
                 if isinstance(answer, Report):
                     self._take(known, answer)
                 else:  # it has stopped
+                    self._unstored[name] = answer
                     ray.kill(known.handle)
             except RayError as error:
                 _log.warning("%s is interrupted: %s", name, str(error).partition("\n")[0])

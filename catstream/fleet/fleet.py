@@ -202,19 +202,25 @@ class Fleet:
                 raise FleetError(f"there is no stream {name!r}: the streams are {', '.join(spec.streams) or 'none'}")
         return merge_streams(spec.store, names or spec.streams, check_name(object), named=bool(names))
 
-    def down(self) -> None:
-        """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too."""
+    def down(self) -> list[str]:
+        """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too.
+
+        Returns
+        -------
+        a line for each stream whose last state could not be stored
+        """
         if self._local is not None and not self._local.running:
             raise FleetError(f"no fleet {self.name!r} of yours runs on this machine: see catstream fleet status")
         self.is_owner = False
         deadline = time.monotonic() + DOWN_SECONDS
         while self._ask("close") and time.monotonic() < deadline:
             time.sleep(ENDED_SECONDS)
-        self._ask("end")
+        unstored: list[str] = self._ask("end")
         self._kill_controller()
         self.disconnect()
         if self._local is not None:
             self._local.stop()
+        return unstored
 
     @property
     def is_running(self) -> bool:

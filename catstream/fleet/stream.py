@@ -206,8 +206,8 @@ class Stream:
         """The last lines that the stream logged."""
         return list(self._lines)[-lines:]
 
-    def stop(self, end: _End = "stopped") -> None:
-        """End the pipeline, and store its last state; returns when that is done.
+    def stop(self, end: _End = "stopped") -> str:
+        """End the pipeline, and store its last state; returns why it could not be stored, or nothing.
 
         Parameters
         ----------
@@ -217,6 +217,7 @@ class Stream:
         self._stop.set()
         self._thread.join()
         self._stack.close()
+        return self._store_trouble
 
     def _run(self) -> None:
         """Run the pipeline, again after each failure, until the stream ends, is stopped, or is superseded."""

@@ -48,6 +48,7 @@ class Actor:
     def __init__(self, cluster, options, spec, order):
         self.cluster, self.options, self.spec, self.order = cluster, options, spec, order
         self.status, self.superseded, self.asked, self.restarted = None, False, [], 0
+        self.unstored = ""  # why its last state cannot be stored
         for name in ("report", "stop", "logs"):
             setattr(self, name, types.SimpleNamespace(remote=lambda *given, name=name: self._called(name, given)))
 
@@ -58,7 +59,7 @@ class Actor:
     def _called(self, name, given):
         self.asked.append((name, *given))
         if name == "stop":
-            return Call("stopped")
+            return Call(self.unstored)
         if name == "logs":
             return Call(["a line"])
         return Call(Report(self.status, self.order, self.superseded) if self.status else None)
@@ -442,6 +443,7 @@ def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
     running(site, ray, "gate")
     running(site, ray, "roof")
     gate = ray.actors["site/stream/gate"]
+    gate.unstored = "the store is full"
     assert site.close() == 2
     site._turn()
     assert states(site) == {"gate": "stopping", "roof": "stopping"}
@@ -450,6 +452,7 @@ def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
         site._turn()
     assert (site.close(), ray.actors) == (0, {})
     assert states(site) == {"gate": "stopping", "roof": "stopping"}
+    assert site.end() == ["gate: the store is full"]
 
 
 def test_a_controller_that_is_started_after_the_end_of_a_fleet_runs_nothing_before_the_first_up(site, ray, made, spec):

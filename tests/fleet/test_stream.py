@@ -173,6 +173,8 @@ def test_a_stream_goes_on_while_the_store_takes_nothing(long_spec, store, until,
             frame = stream.report().status.frame
             until(lambda: stream.report().status.frame > frame)
         until(lambda: stream.report().status.trouble == "")
+        monkeypatch.setattr(Claim, "write", fails)
+        assert stream.stop() == "its state cannot be stored: the store cannot be reached"
 
 
 def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, until, monkeypatch):
