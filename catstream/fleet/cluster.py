@@ -44,6 +44,7 @@ def connect(address: str, variables: Mapping[str, str] | None = None) -> None:
     if changed and "ray" in sys.modules:  # which reads its variables once
         raise FleetError("this process has used Ray before with other settings: a process uses one cluster only")
     os.environ.update(changed)
+    os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "2")  # of 41 s each if the head dies now; Ray's default is 20
     host, _, port = address.rpartition(":")
     try:
         socket.create_connection((host, int(port)), REACH_SECONDS).close()
