@@ -138,6 +138,8 @@ def _down(fleet: Fleet) -> None:
     for line in unstored:
         click.echo(line, err=True)
     click.echo(f"the fleet {fleet.name} is down")
+    if unstored:
+        sys.exit(1)
 
 
 def _watch(console: Console, fleet: Fleet) -> None:
@@ -345,7 +347,8 @@ def down(running: Fleet) -> None:
     """Stop all streams after their state was stored, and end the fleet.
 
     On this machine, Ray ends with the fleet. On a cluster, Ray stays.
-    `catstream fleet up` continues from the last states.
+    `catstream fleet up` continues from the last states. The exit code is 1 if
+    the last state of a stream could not be stored.
     """
     _down(running)
 

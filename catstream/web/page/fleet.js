@@ -49,6 +49,7 @@ export class FleetPage {
     const message = this.explanation();
     write($("#silence"), message);
     $("#silence").hidden = !message;
+    for (const each of document.querySelectorAll("#streams section")) each.hidden = fleet.phase === "waiting";
     $("#streams").classList.toggle("old", !current);
     this.streams.pictures.paused = !current;
   }

@@ -1,0 +1,19 @@
+"""Commands of a fleet, with a stand-in for it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from catstream.cli.fleet import _down
+
+
+def test_the_end_of_a_fleet_is_an_error_if_the_last_state_of_a_stream_is_not_stored(capsys):
+    _down(SimpleNamespace(name="site", down=list))
+    with pytest.raises(SystemExit) as ended:
+        _down(SimpleNamespace(name="site", down=lambda: ["gate: the store is full"]))
+    assert ended.value.code == 1
+    out, err = capsys.readouterr()
+    assert out == 2 * "the fleet site is down\n"
+    assert "gate: the store is full" in err
