@@ -40,14 +40,16 @@ class DesiredObject:
 class PastObject:
     """An object that was forgotten, or replaced by another one of its name: a restarted detector may repeat its frames.
 
-    name  its name
-    each  its first box, and the message in which it began
-    last  seq of the last message with a track of it
+    name   its name
+    each   its first box, and the message in which it began
+    last   seq of the last message with a track of it
+    place  its place among the objects then
     """
 
     name: str
     each: DesiredObject
     last: int
+    place: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,15 +79,17 @@ class DesiredState:
 
     def without(self, name: str, last: int) -> DesiredState:
         """The state after an object was forgotten; message `last` is the last one that may have a track of it."""
-        each = self.objects[name]
-        past = (*self.past, PastObject(name, each, last))[-_PAST:] if each.begins <= last else self.past
+        each, place = self.objects[name], [*self.objects].index(name)
+        past = (*self.past, PastObject(name, each, last, place))[-_PAST:] if each.begins <= last else self.past
         objects = {other: its for other, its in self.objects.items() if other != name}
         return replace(self, objects=objects, past=past)
 
     def objects_at(self, seq: int) -> dict[str, DesiredObject]:
-        """The objects of which message `seq` has a track, by name."""
-        past = {was.name: was.each for was in self.past if was.each.begins <= seq <= was.last}
-        return past | {name: each for name, each in self.objects.items() if each.begins <= seq}
+        """The objects of which message `seq` has a track, by name, in the order in which they began."""
+        objects = [PastObject(name, each, seq) for name, each in self.objects.items()]
+        for was in reversed(self.past):
+            objects.insert(was.place, was)
+        return {was.name: was.each for was in objects if was.each.begins <= seq <= was.last}
 
     def models_since(self, seq: int) -> set[str]:
         """The names of the saved models that the objects of message `seq`, or of a later one, begin with."""
