@@ -220,15 +220,15 @@ def _rates(speed: Record) -> dict[str, list[float]]:
 
 def _figures(found: Mapping[str, Record]) -> str:
     speed, rates = found["speed"], _rates(found["speed"])
-    overview = (row for row in found["robustness"]["tables"][0]["rows"] if row[2] == "all")
+    overview = [row for row in found["robustness"]["tables"][0]["rows"] if row[2] == "all"]
     means = {(tracker, starts.partition(",")[0]): auc for tracker, starts, _, _, auc, *_ in overview}
     boxes, ours, theirs = (means[key] for key in (("catstream", "jitter"), ("catstream", "OPE"), ("csrt", "OPE")))
     (start, rest), (one_start, one_rest) = rates["catstream, three processes"], rates["catstream, one core"]
     csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     return filled(f"""
-        On 44 public sequences, the area under the success plot (AUC) is **{boxes:.3f}** on average over seven first
-        boxes that differ by at most 2 %. With the true first box it is {ours:.3f}, and that of OpenCV's CSRT is
-        {theirs:.3f}. The defaults were chosen on 20 of the sequences; [Results](docs/results.md) lists the others
+        On {overview[0][3]} public sequences, the area under the success plot (AUC) is **{boxes:.3f}** on
+        average over seven first boxes that differ by at most 2 %. With the true first box it is {ours:.3f}, and that of
+        OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences; [Results](docs/results.md) lists the others
         separately.
 
         On {speed["machine"]["cores"]} cores, `catstream track` processes **{rest:.0f} frames/s** ({start:.0f} in the

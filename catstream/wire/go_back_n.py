@@ -37,7 +37,7 @@ __all__ = ["HELLO", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
 #: The frame by which a sender asks for the receiver's position.
 HELLO = b""
 
-_MOST_BYTES = 256 << 20  # of the copies, from which on no other one is added
+_MOST_BYTES = 256 << 20  # total size of the copies at which no further one is added
 _MAX_CHANGES = 65536  # newest samples that a sender remembers until it is asked for them
 _MAX_ASKING = 64  # peers that may wait for a position at a time; any other asks again
 
@@ -85,7 +85,7 @@ class SendWindow:
         self.sent = self.acknowledged = self.stored = self.taken = 0
         self._channel, self._size = channel, size
         self._unacknowledged: deque[tuple[int, bytes]] = deque()  # oldest first
-        self._bytes = 0  # of them
+        self._bytes = 0  # their total size
         self._in_flight = 0  # how many of them were transmitted since the last Position
         self._sent_before = 0  # newest seq that a sender before this one may have sent
         self._last_reply = now
@@ -232,7 +232,7 @@ class ReceiveWindow:
         self.taken = position.seq
         self.ended = self.connected = False
         self._position, self._size = position, size
-        self._bytes = 0  # of the messages that were delivered since all were stored
+        self._bytes = 0  # total size of the messages that were delivered since all were stored
         self._peer: bytes | None = None  # the sender of the last message: acknowledgements go to it only
         self._asking: dict[bytes, None] = {}  # peers that wait for `answer`, in order
         self._gap_reported = -math.inf  # when a missing message was last reported
@@ -244,7 +244,7 @@ class ReceiveWindow:
 
     @property
     def half_full(self) -> bool:
-        """Whether half of the sender's window is not stored yet: a full window would block the sender."""
+        """Whether half of the sender's window is not stored yet. The sender waits while its window is full."""
         return 2 * (self.taken - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def hello(self, peer: bytes) -> list[Reply]:

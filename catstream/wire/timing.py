@@ -15,7 +15,7 @@ LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last mes
 
 # Acknowledged channels.
 PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the position; between two reports of a gap
-AGAIN_SECONDS = 2.0  #: after which a sender transmits everything again on the same connection
+AGAIN_SECONDS = 2.0  #: within which a sender goes back once only on the same connection
 
 # Published channels.
 REPEAT_SECONDS = 0.2  #: without a newer message, after which the last ones are sent again; doubled each time

@@ -35,7 +35,7 @@ def compressor(name, rng, frames=6):
 
 
 def nothing():
-    """What is called after each file, if that does not matter."""
+    """Do nothing after a file."""
 
 
 def received(publisher, compressors, reader, after_each=nothing):
