@@ -226,10 +226,10 @@ def _figures(found: Mapping[str, Record]) -> str:
     (start, rest), (one_start, one_rest) = rates["catstream, three processes"], rates["catstream, one core"]
     csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     return filled(f"""
-        On {overview[0][3]} public sequences, the area under the success plot (AUC) is **{boxes:.3f}** on
-        average over seven first boxes that differ by at most 2 %. With the true first box it is {ours:.3f}, and that of
-        OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences; [Results](docs/results.md) lists the others
-        separately.
+        On {overview[0][3]} public sequences, the area under the success plot (AUC) is **{boxes:.3f}**
+        on average over seven first boxes that differ by at most 2 %. With the true first box it is {ours:.3f}, and that
+        of OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences;
+        [Results](docs/results.md) lists the others separately.
 
         On {speed["machine"]["cores"]} cores, `catstream track` processes **{rest:.0f} frames/s** ({start:.0f} in the
         first 150 frames), the three processes and the decoding included; `catstream.Tracker` in one process

@@ -330,7 +330,8 @@ class Controller:
                 if isinstance(answer, Report):
                     self._take(known, answer)
                 else:  # it has stopped
-                    self._unstored[name] = answer
+                    if self._phase == "down":
+                        self._unstored[name] = answer
                     ray.kill(known.handle)
             except RayError as error:
                 _log.warning("%s is interrupted: %s", name, str(error).partition("\n")[0])
