@@ -158,7 +158,7 @@ class States:
             token = self.claim(_this_process()).token
             with contextlib.suppress(FileExistsError):
                 self._objects.create(self._name(token, _REMOVED), b"")
-            self.remove_up_to(token, kept=0)
+            self.remove_up_to(token, self.listed(), kept=0)
 
     def listed(self) -> Listing:
         """What is below the folder now."""
@@ -175,9 +175,13 @@ class States:
         arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
         self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
 
-    def remove_up_to(self, token: int, kept: int) -> None:
-        """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
-        found = self.listed()
+    def remove_up_to(self, token: int, found: Listing, kept: int) -> None:
+        """Remove the states up to a token but the newest ones, and the claims below it that have none any more.
+
+        Parameters
+        ----------
+        found : what is below the folder
+        """
         before = sorted(place for place in found.states if place.token <= token)
         stay = before[len(before) - kept :]
         for place in before[: len(before) - kept]:
@@ -240,13 +244,13 @@ class Claim:
         self._number += 1  # whatever becomes of this state, its number is not used again
         with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
             self._states.create(_Place(self.token, self._number), files, facts)
-        self._check()
+        found = self._states.listed()
+        self._check(found.claims)
         with contextlib.suppress(StoreError):  # they are removed after the next write
-            self._states.remove_up_to(self.token, _KEPT)
+            self._states.remove_up_to(self.token, found, _KEPT)
 
-    def _check(self) -> None:
-        """Raise FencedError if there is a higher claim, or this one was removed."""
-        claims = self._states.listed().claims
+    def _check(self, claims: set[int]) -> None:
+        """Raise FencedError if there is a claim with a higher token, or this one was removed."""
         if self.token in claims and max(claims) == self.token:
             return
         newer = self._states.holder(max(claims, default=0))

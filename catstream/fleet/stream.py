@@ -47,7 +47,7 @@ from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
-from catstream.run.state import files, position, restore, skip
+from catstream.run.state import files, restore, skip
 from catstream.services.process_title import process_fields
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
@@ -335,8 +335,8 @@ class Stream:
     def _count_lost(self, pipeline: Pipeline, state: Path, facts: Metadata) -> None:
         """Count the frames of a live source since the last state as lost: their numbers are not used again."""
         seconds = max(0.0, time.time() - facts["time"]) + BEGIN_SECONDS
-        tracked = max(facts["seq"], position(state).seq)
-        lost = skip(state, pipeline.settings, tracked + math.ceil(seconds * max(pipeline.rate, facts["rate"])))
+        frames = math.ceil(seconds * max(pipeline.rate, facts["rate"]))
+        lost = skip(state, pipeline.settings, facts["seq"], frames)
         if facts["holds"]:
             return
         facts["lost_frames"] += lost

@@ -112,8 +112,13 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
             raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 
 
-def skip(folder: Path, settings: Settings, seq: int) -> int:
-    """Count the frames of a live source up to a number as lost: the numbers continue after it.
+def skip(folder: Path, settings: Settings, seq: int, frames: int) -> int:
+    """Count frames of a live source as lost: the numbers continue after them.
+
+    Parameters
+    ----------
+    seq : number of the last message that is known; that of the newest checkpoint counts if it is higher
+    frames : how many were lost after that message
 
     Returns
     -------
@@ -121,7 +126,7 @@ def skip(folder: Path, settings: Settings, seq: int) -> int:
     """
     store = CheckpointStore(folder / TREES)
     forest = store.load(settings)
-    lost = max(0, seq - forest.seq)
+    lost = max(seq, forest.seq) + frames - forest.seq
     forest.skip(lost)
     if not store.save(forest):
         raise ServiceError(f"cannot keep the state in {str(folder)!r}: {store.trouble}")

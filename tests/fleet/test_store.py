@@ -92,6 +92,13 @@ def test_two_states_stay_however_many_are_written(store):
     assert listed(store) == ([claim.token], [(claim.token, 8), (claim.token, 9)])
 
 
+def test_a_write_lists_the_folder_once(tmp_path, monkeypatch):
+    claim, names, listed = Store(tmp_path.as_uri()).stream("gate").claim("n1"), Objects.names, []
+    monkeypatch.setattr(Objects, "names", lambda self, folder: listed.append(folder) or names(self, folder))
+    claim.write(STATE, {})
+    assert listed == ["streams/gate"]
+
+
 def test_a_later_holder_removes_the_states_and_the_claim_of_an_earlier_one(store):
     store.stream("cam-7").claim("node-1").write(STATE, {"frame": 1})
     claim = store.stream("cam-7").claim("node-2")

@@ -30,9 +30,10 @@ def test_a_restored_state_is_at_the_same_position(state, tmp_path):
     assert position(tmp_path / "there").seq == 12
 
 
-def test_numbers_go_on_after_the_frames_that_were_lost(state):
+@pytest.mark.parametrize(("known", "frames"), [(10, 30), (20, 22)])
+def test_numbers_go_on_after_the_frames_that_were_lost(state, known, frames):
     settings = Pipeline(resume=state).settings
-    assert skip(state, settings, 42) == 30
+    assert skip(state, settings, known, frames) == 30, "the checkpoint is of message 12"
     assert (position(state).seq, position(state).frame) == (42, 41)
 
 
