@@ -27,17 +27,22 @@ def assigned(
     Parameters
     ----------
     found : detection of each object of a frame, by name
-    states : detector state of each object; objects whose first boxes overlapped may stay at the same place
+    states : detector state of each object; objects whose first boxes overlapped may stay at the same place, and one
+        that is still sought claims none
     context : setting `search.context`, by which a window is larger than the object's box
 
     Returns
     -------
     the detection of each object; the same one if no other object claims its place
     """
-    boxes = {name: detection.window.box(context) for name, detection in found.items()}
-    firsts = {name: (state.first_frame, _first_box(state, context)) for name, state in states.items()}
+    firsts = {
+        name: (state.first_frame, state.first_window.box(context))
+        for name, state in states.items()
+        if state.first_window is not None
+    }
+    boxes = {name: found[name].window.box(context) for name in firsts}
     rivals = {
-        name: [other for other in found if other != name and _apart(firsts[name], firsts[other])] for name in found
+        name: [other for other in firsts if other != name and _apart(firsts[name], firsts[other])] for name in firsts
     }
 
     def claimed(name: str, places: Mapping[str, Box]) -> list[Box]:
@@ -46,7 +51,7 @@ def assigned(
     def taken(name: str, places: Mapping[str, Box]) -> bool:
         return any(boxes[name].overlap(box) > _SAME_PLACE for box in claimed(name, places))
 
-    contested = [name for name in found if taken(name, boxes)]
+    contested = [name for name in firsts if taken(name, boxes)]
     others = {name: _beside(found[name], claimed(name, boxes), context) for name in contested}
     given = {name: box for name, box in boxes.items() if name not in contested}
     result = dict(found)
@@ -78,7 +83,3 @@ def _beside(found: Detection, claimed: list[Box], context: float) -> Detection:
         if scores[row, column] > 0:
             return Detection(float(scores[row, column]), found.around.window(row, column), found.around)
     return replace(found, score=0.0, redetected=False)
-
-
-def _first_box(state: DetectorState, context: float) -> Box:
-    return (state.first_window or state.window).box(context)

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.detection import motion, teacher
+from catstream.detection import belief, motion, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
-from catstream.detection.step import looked, settled, taught, track_of
+from catstream.detection.step import looked, settled, taught
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
-from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, Track
+from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
 from catstream.messages.storage import Arrays, Metadata
 from catstream.settings import Settings
 
@@ -213,6 +213,12 @@ class Detector:
         return self.state
 
     def _result(self, seq: int, time: float, score: float, training: Training) -> Result:
-        state = self._known()
-        track = track_of(state, seq, time, score, self.model, self.settings, self.name)
-        return track, ObjectFeatures(track.box, training, state, begins=state.first_frame == seq - 1)
+        """The track and the features of a frame; no box is reported if the level of belief forbids it."""
+        state, search, version = self._known(), self.settings.search, self.model.version
+        reported = belief.policies(search.whole_interval)[state.level].report
+        box = state.window.box(search.context) if reported else None
+        present: State = "present" if version else "bootstrapping"
+        shown: State = present if reported else "absent"
+        began = state.first_frame
+        track = Track(seq, seq - 1, time, shown, box, float(score), version, object=self.name, began=began)
+        return track, ObjectFeatures(box, training, state, begins=began == seq - 1)

@@ -9,7 +9,6 @@ from catstream.box import Box
 from catstream.detection.assignment import assigned
 from catstream.detection.detector import Detector, Result
 from catstream.detection.likeness import Likeness
-from catstream.detection.search import Detection
 from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Features, Model, Track, Tracks
@@ -115,19 +114,14 @@ class Detectors:
         results = dict(given or {})
         searched = {name: detector for name, detector in self.detectors.items() if name not in results}
         found = in_parallel(lambda detector: detector.look(frame, self.seq), searched.values())
-        resolved = self._assigned(dict(zip(searched, found, strict=True)))
+        states = {name: detector.state for name, detector in searched.items() if detector.state is not None}
+        resolved = assigned(dict(zip(searched, found, strict=True)), states, self.settings.search.context)
         settled = in_parallel(lambda name: searched[name].settle(resolved[name], frame, self.seq, time), searched)
         results |= zip(searched, settled, strict=True)
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         parts = {name: results[name][1] for name in names}
         return Tracks(self.seq, self.seq - 1, tracks), Features(self.seq, self.seq - 1, time, parts)
-
-    def _assigned(self, found: dict[str, Detection]) -> dict[str, Detection]:
-        """The detections, of which no two are at the same place; those of objects that are still sought claim none."""
-        states = {name: state for name in found if (state := self.detectors[name].state) and state.first_window}
-        claims = {name: found[name] for name in states}
-        return found | assigned(claims, states, self.settings.search.context)
 
     def forget(self, name: str) -> None:
         """Stop tracking an object.

@@ -12,10 +12,10 @@ from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import DetectorState, Model, State, Track
+from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import Settings
 
-__all__ = ["looked", "settled", "taught", "track_of"]
+__all__ = ["looked", "settled", "taught"]
 
 
 def looked(
@@ -48,9 +48,12 @@ def settled(state: DetectorState, found: Detection, size: tuple[int, int], setti
     size : width and height of the frame
     """
     state = belief.updated(state, found.score, found.redetected, settings.belief)
-    if _policy(state, settings).report:
-        state = motion.observed(_followed(state, found, size, settings))
-    return state
+    policy = _policy(state, settings)
+    if not policy.report:
+        return state
+    window = extent.followed(state.window, found.window, policy.resize).with_centre_in(*size)
+    confident = window if policy.resize else state.confident_window
+    return motion.observed(replace(state, window=window, confident_window=confident))
 
 
 def taught(
@@ -68,25 +71,6 @@ def taught(
     if not _policy(state, settings).teach:
         return {}
     return teacher.training_of(frame, state.window, found.around, seq, model, settings)
-
-
-def _followed(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
-    """The state with the window moved to a detection, as far as the belief in it allows."""
-    resize = _policy(state, settings).resize
-    window = extent.followed(state.window, found.window, resize).with_centre_in(*size)
-    return replace(state, window=window, confident_window=window if resize else state.confident_window)
-
-
-def track_of(
-    state: DetectorState, seq: int, time: float, score: float, model: Model, settings: Settings, name: str
-) -> Track:
-    """The reported box of a state, unless the level of belief forbids it."""
-    reported = _policy(state, settings).report
-    box = state.window.box(settings.search.context) if reported else None
-    present: State = "present" if model.version else "bootstrapping"
-    shown: State = present if reported else "absent"
-    began = state.first_frame
-    return Track(seq, seq - 1, time, shown, box, float(score), model.version, object=name, began=began)
 
 
 def _policy(state: DetectorState, settings: Settings) -> belief.Policy:

@@ -74,14 +74,13 @@ class ScoreMap:
         return row, column
 
     def best(self, penalty: np.ndarray | float = 0.0) -> tuple[float, Window]:
-        """The score of the window with the highest score less a penalty; and the window, refined between the cells."""
-        row, column = self.highest(penalty)
-        return float(self.scores[row, column]), self.window(*self.refined(row, column))
+        """The score of the window with the highest score less a penalty; and the window.
 
-    def refined(self, row: int, column: int) -> tuple[float, float]:
-        """The maximum at (row, column) refined between the cells, by a parabola in each direction."""
-        scores = self.scores
-        return row + vertex(scores[:, column], row), column + vertex(scores[row], column)
+        The window is refined between the cells, by a parabola through the scores in each direction.
+        """
+        scores, (row, column) = self.scores, self.highest(penalty)
+        window = self.window(row + vertex(scores[:, column], row), column + vertex(scores[row], column))
+        return float(scores[row, column]), window
 
     def apart(self, window: Window) -> ScoreMap:
         """The same, but the score of each window that touches another one is -inf."""
