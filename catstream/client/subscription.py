@@ -195,7 +195,8 @@ class Subscription(Generic[Message]):
     def _next(self) -> Generator[Wait, None, Message | None]:
         """Wait for the next message, and return it; None at the end."""
         deadline = float("inf") if self.timeout is None else monotonic() + self.timeout
-        while (message := self._take()) is None:
+        while (message := self._receive()) is None:
+            self._follow()
             if self.end is not None and monotonic() >= self._close_time:
                 # One object may have been forgotten before; the end of a fleet's stream may have no number.
                 if self._channel.keeps == "every" and self._about is None and self.end.seq:
@@ -212,14 +213,10 @@ class Subscription(Generic[Message]):
         sockets: list[Subscriber[Any] | FollowedStream] = [] if self._stream is None else [self._stream]
         return sockets if self._connection is None else [*sockets, self._connection.messages, self._connection.ends]
 
-    def _take(self) -> Message | None:
-        """Return the next message if one was received, without waiting."""
-        if self._connection is not None and (message := self._receive(self._connection)) is not None:
-            return message
-        self._follow()
-        return None
-
-    def _receive(self, connection: _Connection) -> Message | None:
+    def _receive(self) -> Message | None:
+        """Return the next message if one has arrived, without waiting."""
+        if (connection := self._connection) is None:
+            return None
         while (message := connection.messages.receive(0)) is not None:
             if self._stream is not None and not isinstance(message, End) and not self._stream.take(message):
                 continue  # the stream was started again, and repeats a frame

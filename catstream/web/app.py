@@ -40,7 +40,7 @@ from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages.kinds import Answer, ObjectName
+from catstream.messages.kinds import ObjectName
 from catstream.messages.schema import OnlyWith
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
@@ -151,7 +151,7 @@ class Site:
         command = decode_json(await body_of(request), Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
-        answer = await run_in_threadpool(_execute, feed, command)
+        answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
         return JSONResponse({"done": True} | result)
 
@@ -214,12 +214,6 @@ class Command:
     object: ObjectName = ""
     box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
     keep: bool = False
-
-
-def _execute(feed: PipelineFeed, command: Command) -> Answer:
-    """Send a command and wait for its answer."""
-    with feed.control() as pipeline:
-        return pipeline.execute(command.verb, command.object, box=command.box, keep=command.keep)
 
 
 def _failed(_: Request, error: Exception) -> Response:

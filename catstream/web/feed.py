@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from time import monotonic
 
+from catstream.box import Box
 from catstream.client.control import Control
 from catstream.client.registry import locate
 from catstream.client.subscription import AnyMessage, Subscription
 from catstream.errors import CatstreamError
-from catstream.messages.kinds import End
+from catstream.messages.kinds import Answer, End, Verb
 from catstream.web.dashboard import Dashboard, Parts
 from catstream.web.timing import DRAIN_SECONDS, PAUSE_SECONDS, SILENCE_SECONDS
 from catstream.wire.channels import CHANNELS
@@ -127,9 +128,10 @@ class PipelineFeed(Feed):
     def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
         return self
 
-    def control(self) -> Control:
-        """Connect to the pipeline to send commands."""
-        return Control(self.place or self._endpoint, keys=self._keys)
+    def execute(self, verb: Verb, object: str, box: Box | None, keep: bool) -> Answer:
+        """Send a command to the pipeline, and wait for its answer."""
+        with Control(self.place or self._endpoint, keys=self._keys) as pipeline:
+            return pipeline.execute(verb, object, box=box, keep=keep)
 
     async def _feed(self) -> None:
         self.place = await asyncio.to_thread(locate, self._endpoint, self._keys)
