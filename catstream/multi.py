@@ -21,7 +21,6 @@ import numpy as np
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
-from catstream.detection.detector import Detector
 from catstream.detection.likeness import Likeness
 from catstream.detection.objects import Detectors, prepare
 from catstream.errors import BoxError, FrameError, MissingFileError, ObjectError, ProtocolError, ServiceError
@@ -329,8 +328,11 @@ class MultiTracker:
                     f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
                     f"catstream {metadata['program']} wrote it"
                 )
-            self._resume(self.detectors.add(str(each["name"])), model)
-            detector = self.detectors.detectors[each["name"]]
+            detector = self.detectors.add(str(each["name"]))
+            state = self.forest.compressors[detector.name].detector
+            if state is None:
+                raise ValueError(f"it does not say where the object {detector.name!r} was")
+            detector.resume(state, model)
             detector.resume_scm(with_prefix(arrays, f"bootstrap.{i}."), each["bootstrap"])
             if likeness := with_prefix(arrays, f"likeness.{i}."):
                 detector.likeness = Likeness.from_state(likeness)
@@ -340,12 +342,6 @@ class MultiTracker:
         check_message(tracks)
         self._tracks = tracks.tracks
         return self
-
-    def _resume(self, detector: Detector, model: Model) -> None:
-        state = self.forest.compressors[detector.name].detector
-        if state is None:
-            raise ValueError(f"it does not say where the object {detector.name!r} was")
-        detector.resume(state, model)
 
     def _learn(
         self, tracks: Tracks, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})

@@ -12,7 +12,6 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from secrets import token_hex
-from typing import NamedTuple
 
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.messages.kinds import Health, Run
@@ -29,7 +28,6 @@ __all__ = [
     "PERMANENT_FAILURE",
     "RECORDER",
     "SOURCE_FAILED",
-    "Parent",
     "Process",
     "die_with",
     "log_as",
@@ -48,17 +46,6 @@ RECORDER = "recorder"
 _QUICK_SIZE = 128  # coreset size up to which one turn of compressor and trainer is short on any machine
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 _log = logging.getLogger(__name__)
-
-
-class Parent(NamedTuple):
-    """The parent process; this process ends with it.
-
-    pid       its process id
-    watchdog  file descriptor of the watchdog's shared memory
-    """
-
-    pid: int
-    watchdog: int
 
 
 class Process:
@@ -134,7 +121,9 @@ class Process:
         self._stop_moment = min(self._stop_moment, time.monotonic())
 
 
-def run(name: str, job: Job | Path, parent: Parent | None = None, *, restarted: bool = False) -> int:
+def run(
+    name: str, job: Job | Path, parent: int | None = None, watchdog: int | None = None, *, restarted: bool = False
+) -> int:
     """Run the detector, the compressor or the trainer; return its exit code.
 
     The code is 0 at the end of the stream or after SIGTERM, `SOURCE_FAILED` if the source failed, and
@@ -143,11 +132,12 @@ def run(name: str, job: Job | Path, parent: Parent | None = None, *, restarted: 
     Parameters
     ----------
     job : the job, or the file that contains it
-    parent : the process that started this one and that ends it; None for a process that was started by hand
+    parent : id of the process with which this one ends; None for a process that was started by hand
+    watchdog : descriptor of the memory of its watchdog; None to make a new one
     restarted : whether it continues the work of a process that died
     """
     if parent is not None:
-        die_with(parent.pid)
+        die_with(parent)
     set_process_title(name)
     log_as(name)
     service = import_module(f"catstream.services.{name}")
@@ -155,7 +145,7 @@ def run(name: str, job: Job | Path, parent: Parent | None = None, *, restarted: 
     try:
         job = Job.load(job) if isinstance(job, Path) else job
         job = replace(job, resume=job.resume or restarted)
-        process = Process(name, job, parent.watchdog if parent else None)
+        process = Process(name, job, watchdog)
         try:
             service.main(process)
         finally:

@@ -580,6 +580,6 @@ def main(requests: int, program: int) -> None:
 def run_started(name: str, job: str, restarted: bool, parent: int, watchdog: int) -> None:
     """Run a process that the server with this process id has started, and exit with its code."""
     limit_process()  # before anything imports numpy
-    from catstream.services.loop import Parent, run
+    from catstream.services.loop import run
 
-    sys.exit(run(name, Path(job), Parent(parent, watchdog), restarted=restarted))
+    sys.exit(run(name, Path(job), parent, watchdog, restarted=restarted))
