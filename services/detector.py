@@ -272,9 +272,9 @@ class DetectorLoop:
                 self._arrived[model.object] = model
                 self.tell(core.ModelArrived(model.object, model.version))
             elif model.object in self.state.known:
-                self._detectors.adopt(model)
-                known = _known(self._detectors.detectors[model.object])
-                self.tell(core.ModelArrived(model.object, model.version, known))
+                detector = self._detectors.detectors[model.object]
+                detector.adopt(model)
+                self.tell(core.ModelArrived(model.object, model.version, _known(detector)))
             elif self.state.is_repeating:  # the object may begin again: its trees are ahead of the tracks
                 self._arrived[model.object] = model
 

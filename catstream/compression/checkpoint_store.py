@@ -36,11 +36,9 @@ class CheckpointStore:
     Attributes
     ----------
     trouble : description of what is wrong now, empty if nothing is
-    failing : whether the last checkpoint could not be written
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.failing = False
         self._folder = Path(folder)
         self._damaged: list[Path] = []
         self._found_damaged = ""  # description of the damaged files
@@ -98,11 +96,11 @@ class CheckpointStore:
             why = f"no checkpoint can be written to {self._folder} ({error.strerror})"
             if why != self._not_written:
                 _log.warning("%s: what is learned is kept in memory only, and it is tried again", why)
-            self.failing, self._not_written = True, why
+            self._not_written = why
             return False
-        if self.failing:
+        if self._not_written:
             _log.warning("checkpoints are written again")
-        self.failing, self._not_written = False, ""
+        self._not_written = ""
         for path in self._damaged:
             path.replace(self._folder / _DAMAGED)
         self._damaged = []

@@ -116,7 +116,11 @@ class Compressor:
         if features.box is not None:
             self.box = features.box
         self._follow(features.box)
-        return self._sample(version) if self._due() else None
+        if not self._due():
+            return None
+        self._sampled_leaves = self.leaves
+        self.last_sample = sample_of(self.trees, version, frame, self.centres, self.name, self.began)
+        return self.last_sample
 
     @property
     def version(self) -> int:
@@ -205,11 +209,6 @@ class Compressor:
         leaves, last = self.leaves, self.last_sample
         waited = last is not None and self.frame - last.frame >= self.settings.coreset.sample_interval
         return leaves > self._sampled_leaves and (waited or leaves >= _GROWTH * self._sampled_leaves)
-
-    def _sample(self, version: int) -> Sample:
-        self._sampled_leaves = self.leaves
-        self.last_sample = sample_of(self.trees, version, self.frame, self.centres, self.name, self.began)
-        return self.last_sample
 
 
 def sample_of(

@@ -124,7 +124,7 @@ def _at_likely_size(frame: Pyramid, found: Detection, model: Model, likeness: Li
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
         best = Detection(*scores.best())
-        return min(best.score, 1.0) + likeness(scores.row(*scores.highest())), best
+        return min(best.score, 1.0) + likeness(scores.cells.row(*scores.highest())), best
 
     return max((tried(step) for step in range(-_LIKELY_STEPS, _LIKELY_STEPS + 1)), key=lambda each: each[0])[1]
 
@@ -233,13 +233,13 @@ def _sighting(
     """
     maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
     scores = _best_map(maps, factors)
-    best, alike = Detection(*scores.best()), likeness(scores.row(*scores.highest()))
+    best, alike = Detection(*scores.best()), likeness(scores.cells.row(*scores.highest()))
     apart = max((each.apart(best.window) for each in maps), key=lambda each: float(each.scores.max()))
     rival = max(float(apart.scores.max()), 0.0)
     lead = best.score - rival
     if alike < limits.sighting_likeness or lead < _SIGHTING_LEAD:
         return best, False
-    alike_rival = likeness(apart.row(*apart.highest())) if rival else 0.0
+    alike_rival = likeness(apart.cells.row(*apart.highest())) if rival else 0.0
     return best, lead >= _LEAD_OVER_ALIKE or alike_rival < alike / 2
 
 
@@ -270,7 +270,7 @@ def _at_best_size(frame: Pyramid, found: Detection, first: Window, model: Model,
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
         best = Detection(*scores.best())
-        fit = _fit(scores.row(1, 1), model, SIZE, settings)
+        fit = _fit(scores.cells.row(1, 1), model, SIZE, settings)
         return best.score + fit - extent.cost(step * extent.SIZE_CHANGE, grown, settings.prior), best
 
     best, _, beside = _climb(tried, settings.size_count // 2)
@@ -284,7 +284,7 @@ def _at_best_aspect(
 
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step)), WINDOW, model)
-        fit = _fit(scores.row(0, 0), model, ASPECT, settings)
+        fit = _fit(scores.cells.row(0, 0), model, ASPECT, settings)
         cost = extent.cost(step * extent.ASPECT_CHANGE, widened, settings.prior)
         return float(scores.scores[0, 0]) + fit - cost, found
 

@@ -165,7 +165,7 @@ def _mined(frame: Pyramid, window: Window, seq: int, model: Model, teaching: Tea
 def _strongest(scores: ScoreMap, window: Window, most: int, least: float = -math.inf) -> list[np.ndarray]:
     """The rows of the windows with the highest scores above `least` that hardly overlap another window."""
     places = non_maximum_suppression(scores.scores, most + 1, WINDOW // 2, least)
-    rows = [scores.row(*place) for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP]
+    rows = [scores.cells.row(*place) for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP]
     return rows[:most]
 
 

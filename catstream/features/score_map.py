@@ -64,10 +64,6 @@ class ScoreMap:
         (x, y), (w, h), (left, top) = window.centre, self.step, self.origin
         return (y - top) / h - WINDOW / 2, (x - left) / w - WINDOW / 2
 
-    def row(self, row: int, column: int) -> np.ndarray:
-        """Feature row of the window at (row, column), float32 (d,)."""
-        return self.cells.row(row, column)
-
     def highest(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
         """Row and column of the window with the highest score less a penalty."""
         row, column = divmod(int((self.scores - penalty).argmax()), self.scores.shape[1])

@@ -103,14 +103,10 @@ class Trainer:
         labels = rows[:, d + 1 + tree.heads.index(head)]
         if beside is not None:
             labels = labels - rows[:, :d] @ beside
-        return self._regression(sample, tree.name, rows[:, : d + 1]).fit(labels, head.penalty)
-
-    def _regression(self, sample: Sample, tree: str, rows: np.ndarray) -> ridge.Regression:
-        """The regression on the rows of a tree, as it was made for the last sample if that had the same."""
-        known = self._regressions[sample.object]
-        if tree not in known or not np.array_equal(known[tree].rows, rows):
-            known[tree] = ridge.Regression(rows)
-        return known[tree]
+        known, rows = self._regressions[sample.object], rows[:, : d + 1]
+        if tree.name not in known or not np.array_equal(known[tree.name].rows, rows):  # not those of the last sample
+            known[tree.name] = ridge.Regression(rows)
+        return known[tree.name].fit(labels, head.penalty)
 
 
 def _between(sample: Sample) -> np.ndarray:

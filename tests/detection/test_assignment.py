@@ -88,7 +88,7 @@ def test_objects_whose_first_boxes_overlap_may_stay_at_one_place():
 def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng):
     frame = Pyramid(rng.integers(0, 256, (200, 300, 3), np.uint8))
     window = Window.around(Box(100, 50, 40, 40), CONTEXT)
-    row = ScoreMap.around(frame, window, WINDOW, None).row(0, 0)
+    row = ScoreMap.around(frame, window, WINDOW, None).cells.row(0, 0)
     found = local(frame, window, Model(1, 0, row, 0.0), SearchSettings())
     result = assigned({"anna": Detection(1e9, found.window), "ben": found}, APART, CONTEXT)["ben"]
     assert 0 < result.score < found.score

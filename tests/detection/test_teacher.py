@@ -37,7 +37,7 @@ def cut(frame, model, around=None, window=OBJECT):
 def places(scored, rows):
     """Row and column of the windows that feature rows were taken from."""
     rows = {row.tobytes() for row in rows}
-    return [place for place in np.ndindex(scored.scores.shape) if scored.row(*place).tobytes() in rows]
+    return [place for place in np.ndindex(scored.scores.shape) if scored.cells.row(*place).tobytes() in rows]
 
 
 def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance(frame, model):
@@ -45,7 +45,8 @@ def test_the_label_of_a_near_miss_is_a_gaussian_of_its_distance(frame, model):
     rows, _, misses, _ = cut(frame, model, around)
     row, column = around.place(OBJECT)
     assert (row, column) == (6, 6)
-    worth = {around.row(*place).tobytes(): np.hypot(place[0] - row, place[1] - column) for place in np.ndindex(13, 13)}
+    places, features_at = np.ndindex(13, 13), around.cells.row
+    worth = {features_at(*place).tobytes(): np.hypot(place[0] - row, place[1] - column) for place in places}
     assert misses.sum() > 100
     for features, label in zip(rows.rows[misses], rows.labels[misses], strict=True):
         assert label == pytest.approx(np.exp(-((worth[features.tobytes()] / 0.9) ** 2) / 2))
@@ -128,7 +129,7 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
 @pytest.mark.parametrize("most", [5000, 700, 200], ids=["at once", "in parts", "in more parts than frames"])
 def test_hard_negatives_of_a_round_are_as_many_however_many_parts_are_searched_in_turn(frame, model, monkeypatch, most):
     monkeypatch.setattr(teacher, "_MOST_CELLS", most)
-    monkeypatch.setattr(teacher, "_strongest", lambda scores, _, most: [scores.row(0, 0)] * most)
+    monkeypatch.setattr(teacher, "_strongest", lambda scores, _, most: [scores.cells.row(0, 0)] * most)
     teaching = SETTINGS.teaching
     parts = frame.region.split(OBJECT, most)
     frames = max(len(parts), teacher._MINING_INTERVAL)

@@ -10,7 +10,6 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -60,14 +59,9 @@ class _Searched:
     window: Window
     settings: Settings
 
-    @classmethod
-    def of(cls, learned: Learned) -> Self:
-        window = Window.around(learned.box, learned.settings.search.context)
-        return cls(learned.model, learned.likeness(), window, learned.settings)
-
     def seen(self, scores: ScoreMap, row: int, column: int, window: Window) -> Seen:
         """A window whose features are at (row, column) of a map of appearance scores."""
-        score = min(1.0, float(scores.scores[row, column])) * self.likeness(scores.row(row, column))
+        score = min(1.0, float(scores.scores[row, column])) * self.likeness(scores.cells.row(row, column))
         return Seen(window, window.box(self.settings.search.context), score)
 
 
@@ -91,7 +85,10 @@ class Scan:
         sizes: tuple[float, float] = SIZES,
     ) -> None:
         self._threshold = threshold
-        self._models = [_Searched.of(each) for each in learned]
+        self._models = [
+            _Searched(each.model, each.likeness(), Window.around(each.box, each.settings.search.context), each.settings)
+            for each in learned
+        ]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
         for number, searched in enumerate(self._models):
             for entry in _entries(searched.window, sizes):
