@@ -30,6 +30,7 @@ import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -79,7 +80,7 @@ _STREAM: dict[str, tuple[Any, str]] = {
 _OWN_SETTINGS = ("run.endpoint", "run.keys")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StreamSpec:
     """A stream that a fleet should run.
 
@@ -152,7 +153,7 @@ class StreamSpec:
             values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
         return cls(name, **values)
 
-    @property
+    @cached_property  # the controller asks for that of each stream twice a second
     def digest(self) -> str:
         """Text that changes exactly if the stream has to start again: with its source, objects or settings.
 

@@ -268,6 +268,8 @@ class Stream:
                     self._status = replace(self._status, state="ended", frame=int(facts["frame"]), restarts=restarts)
                 return
             claim.state, facts = None, {}  # it was changed since: it begins again
+        # Token of the pipeline with which frames began to count from 0; 0 if it was the first one of the stream.
+        began = int(facts["began"]) if facts else claim.token if claim.token > 1 else 0
         with ExitStack() as stack:
             pipeline = stack.enter_context(self._made(claim))
             with self._lock:
@@ -279,7 +281,7 @@ class Stream:
                     endpoint=pipeline.endpoint,
                     server=public_key(self._keys) if self._place.address else "",
                     token=claim.token,
-                    began=self._began(claim),
+                    began=began,
                     lost_frames=int(facts.get("lost_frames", 0)),
                     lost_seconds=float(facts.get("lost_seconds", 0.0)),
                 )
@@ -312,12 +314,6 @@ class Stream:
                 return
             if not ended or self._stop.wait(self._every):
                 return
-
-    def _began(self, claim: Claim) -> int:
-        """Token of the pipeline with which frames began to count from 0; 0 if it was the first one of the stream."""
-        if claim.state is not None:
-            return int(claim.state.facts["began"])
-        return claim.token if claim.token > 1 else 0
 
     def _made(self, claim: Claim) -> Pipeline:
         """The pipeline, which continues from the state of the claim if there is one."""

@@ -91,6 +91,15 @@ def test_each_fleet_comes_back_from_json(fleet, streams):
     assert from_json(to_json(fleet), FleetSpec) == fleet
 
 
+def test_the_digest_of_a_stream_is_computed_once_and_not_stored(monkeypatch):
+    """The controller asks for it twice a second, for every stream."""
+    stream = StreamSpec("cam-7", "0", {"": Box(1, 2, 30, 40)})
+    stored, digest = to_json(stream), stream.digest
+    monkeypatch.setattr("catstream.fleet.spec.Settings", None)  # by whose values it is computed
+    assert stream.digest == digest
+    assert to_json(stream) == stored
+
+
 @pytest.mark.parametrize(
     ("change", "restarts"),
     [
