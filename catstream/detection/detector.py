@@ -1,4 +1,8 @@
-"""The detector of one object: frames in, tracks and training rows out. It holds state and model between the frames."""
+"""The detector of one object: frames in, tracks and training rows out (paper, "Classification").
+
+It holds state and model between the frames. The steps from one frame to the next are the pure functions `looked`,
+`settled` and `taught`: the same state, frame, model and settings give the same result.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.detection import belief, motion, teacher
+from catstream.detection import belief, extent, motion, search, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
-from catstream.detection.step import looked, settled, taught
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import WINDOW, row_length
@@ -24,7 +27,7 @@ from catstream.settings import Settings
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
 
-__all__ = ["Detector", "Result"]
+__all__ = ["Detector", "Result", "looked", "settled", "taught"]
 
 #: The track and the features of an object in one frame.
 Result = tuple[Track, ObjectFeatures]
@@ -214,11 +217,70 @@ class Detector:
 
     def _result(self, seq: int, time: float, score: float, training: Training) -> Result:
         """The track and the features of a frame; no box is reported if the level of belief forbids it."""
-        state, search, version = self._known(), self.settings.search, self.model.version
-        reported = belief.policies(search.whole_interval)[state.level].report
-        box = state.window.box(search.context) if reported else None
+        state, version = self._known(), self.model.version
+        reported = _policy(state, self.settings).report
+        box = state.window.box(self.settings.search.context) if reported else None
         present: State = "present" if version else "bootstrapping"
         shown: State = present if reported else "absent"
         began = state.first_frame
         track = Track(seq, seq - 1, time, shown, box, float(score), version, object=self.name, began=began)
         return track, ObjectFeatures(box, training, state, begins=began == seq - 1)
+
+
+def looked(
+    state: DetectorState, frame: Pyramid, seq: int, model: Model, likeness: Likeness | None, settings: Settings
+) -> tuple[DetectorState, Detection]:
+    """Search the object in the next frame.
+
+    Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
+    always, if `search.mode` is "full").
+
+    Parameters
+    ----------
+    likeness : to the object of a saved model, which is sought in the whole frame as long as it has not been found
+
+    Returns
+    -------
+    the state with the place that was expected, and the detection
+    """
+    state = motion.expected(state)
+    if state.first_window is None and likeness is not None:
+        return search.seek(frame, state, seq, model, likeness, settings)
+    return state, search.find(frame, state, seq, model, settings)
+
+
+def settled(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
+    """The state after a detection: its belief in it, and the window moved as far as the belief allows.
+
+    Parameters
+    ----------
+    size : width and height of the frame
+    """
+    state = belief.updated(state, found.score, found.redetected, settings.belief)
+    policy = _policy(state, settings)
+    if not policy.report:
+        return state
+    window = extent.followed(state.window, found.window, policy.resize).with_centre_in(*size)
+    confident = window if policy.resize else state.confident_window
+    return motion.observed(replace(state, window=window, confident_window=confident))
+
+
+def taught(
+    state: DetectorState,
+    found: Detection,
+    frame: Pyramid,
+    seq: int,
+    model: Model,
+    likeness: Likeness | None,
+    settings: Settings,
+) -> Training:
+    """The training rows of a frame, as far as the belief in its detection allows."""
+    if state.first_window is None and likeness is not None:
+        return teacher.training_beside(frame, found.window, model, likeness, settings)
+    if not _policy(state, settings).teach:
+        return {}
+    return teacher.training_of(frame, state.window, found.around, seq, model, settings)
+
+
+def _policy(state: DetectorState, settings: Settings) -> belief.Policy:
+    return belief.policies(settings.search.whole_interval)[state.level]

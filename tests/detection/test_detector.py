@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection.detector import Detector
+from catstream.detection.detector import Detector, looked, settled, taught
 from catstream.detection.likeness import Likeness
-from catstream.detection.step import looked, settled, taught
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
