@@ -22,7 +22,7 @@ from typing import Self
 
 from catstream.errors import ProtocolError, RecordingError, ServiceError, SettingsError, require_extra
 from catstream.messages.kinds import Health, Position, Track
-from catstream.messages.names import Boxes, check_boxes
+from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
@@ -147,9 +147,11 @@ class Pipeline:
         start_server()  # it imports while this process opens the source
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
         self._state = Path(state or resume or "") if state or resume else None
-        job = self._resumed_job or Job(started=time.time())
+        boxes = {} if box is None else boxes_by_name(box)
+        models = {name: file.absolute() for name, file in files_by_name(model).items()}
+        job = self._resumed_job or Job(boxes=boxes, models=models, started=time.time())
         job = replace(
-            job if resume is not None else job.with_objects(box, model),
+            job,
             source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),

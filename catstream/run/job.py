@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -18,7 +18,7 @@ import msgspec
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
-from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
+from catstream.messages.names import UNNAMED, check_count, check_name, listed
 from catstream.settings import Settings
 
 __all__ = ["Job", "Models", "Results", "files_by_name"]
@@ -104,11 +104,6 @@ class Job:
                 "give one of them"
             )
         check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
-
-    def with_objects(self, box: Boxes | None, model: Models | None) -> Job:
-        """The job with these objects instead of its own, which have boxes or are searched for by saved models."""
-        models = {name: file.absolute() for name, file in files_by_name(model).items()}
-        return replace(self, boxes={} if box is None else boxes_by_name(box), models=models)
 
     def save(self, folder: Path) -> Path:
         """Write the job to a folder, readable by its owner only: the source may contain a password.
