@@ -98,9 +98,10 @@ class RecordingWriter:
         self.path, self.written, self._run = Path(path), 0, run
         self._metadata = {_SERIES: token_hex(8)}
         with ExitStack() as self._stack:
-            continues = resume and self.path.exists() and self.path.stat().st_size > 0
-            if resume and not continues:
-                self.path.unlink(missing_ok=True)  # its process was killed before it wrote anything
+            exists = resume and self.path.exists()
+            continues = exists and self.path.stat().st_size > 0
+            if exists and not continues:
+                self.path.unlink()  # its process was killed before it wrote anything
             if continues:
                 self._lock()
                 earlier, self._metadata = _opening(self.path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import resource
+import subprocess
 from pathlib import Path
 
 import msgpack
@@ -351,3 +352,9 @@ def test_a_file_that_is_not_a_recording_is_rejected(tmp_path):
         Recording(tmp_path / "none.rec")
     with pytest.raises(RecordingError, match="give a path that you may write to"):
         RecordingWriter(tmp_path / "none" / "run.rec", Run.from_settings(Settings().portable()))
+
+
+def test_a_recording_on_a_read_only_disk_is_rejected(disk):
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+    with pytest.raises(RecordingError, match="Read-only file system"):
+        RecordingWriter(disk / "run.mcap", Run.from_settings(Settings().portable()), resume=True)
