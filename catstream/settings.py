@@ -397,7 +397,7 @@ class Settings:
         Raises
         ------
         SettingsError
-            For a preset that does not exist, or a file that cannot be read.
+            For a preset that does not exist, a file that cannot be read, or a variable of no setting.
         """
         values: dict[str, object] = {}
         if preset is not None:
@@ -408,7 +408,9 @@ class Settings:
             values.update(flat(_read(Path(file))))
         for variable, text in (os.environ if environment is None else environment).items():
             if variable.startswith("CATSTREAM_"):
-                values[variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)] = text
+                name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
+                _check_name(name, variable)
+                values[name] = text
         return values | _named(overrides)
 
     @classmethod
@@ -556,11 +558,15 @@ def _takes(name: str) -> str:
     return " ".join([text, ", ".join(bounds)]).strip()
 
 
-def _check_name(name: str) -> None:
+def _check_name(name: str, variable: str = "") -> None:
+    """Raise SettingsError for the name of no setting; `variable` is that of the environment which gives it, if any."""
     if name not in _kinds():
         near = [repr(other) for other in _nearest(name)]
         meant = f", did you mean {' or '.join(near)}?" if near else ":"
-        raise SettingsError(f"there is no setting {name!r}{meant} `catstream settings` lists all {len(_kinds())}")
+        origin = f" for the environment variable {variable}" if variable else ""
+        raise SettingsError(
+            f"there is no setting {name!r}{origin}{meant} `catstream settings` lists all {len(_kinds())}"
+        )
 
 
 def _nearest(name: str) -> list[str]:

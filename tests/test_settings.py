@@ -73,7 +73,8 @@ def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(w
 def test_an_unknown_name_is_rejected_with_the_nearest_ones(way):
     with pytest.raises(SettingsError) as error:
         WAYS[way]("coreset.sice", 64)
-    assert str(error.value).startswith("there is no setting 'coreset.sice', did you mean 'coreset.size'")
+    variable = " for the environment variable CATSTREAM_CORESET_SICE" if way == "environment" else ""
+    assert str(error.value).startswith(f"there is no setting 'coreset.sice'{variable}, did you mean 'coreset.size'")
     assert "`catstream settings` lists all" in str(error.value)
     assert len(str(error.value)) < 200
 
