@@ -6,6 +6,7 @@ as one argument of the command's function.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import wraps
 from inspect import signature
@@ -22,6 +23,7 @@ __all__ = [
     "PATH",
     "Command",
     "Decorator",
+    "NumberRange",
     "combined",
     "with_files",
     "with_given",
@@ -42,6 +44,17 @@ _Converter = Callable[[dict[str, str]], object]
 
 #: Parameter type of a file or folder.
 PATH = click.Path(path_type=Path)
+
+
+class NumberRange(click.FloatRange):
+    """A number within bounds; NaN is none, although it is neither below nor above any bound."""
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> float:
+        number: float = super().convert(value, parameter, context)
+        if math.isnan(number):
+            self.fail(f"expected a number, got {value!r}", parameter, context)
+        return number
+
 
 with_overwrite = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 with_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from catstream.client.registry import address_of
 from catstream.client.subscription import wait_until_running
-from catstream.services.options import combined, with_keys
+from catstream.services.options import NumberRange, combined, with_keys
 from catstream.wire.endpoint import Endpoint
 
 __all__ = ["wait_for_pipeline", "with_endpoint", "with_fleet_address", "with_wait"]
@@ -39,7 +39,12 @@ with_endpoint = combined(
 )
 
 with_wait = click.option(
-    "--wait", default=30.0, show_default=True, metavar="SECONDS", help="Longest wait for the pipeline at --endpoint."
+    "--wait",
+    type=NumberRange(0),
+    default=30.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Longest wait for the pipeline at --endpoint.",
 )
 
 

@@ -17,7 +17,7 @@ from catstream.errors import ServiceError
 from catstream.messages.names import UNNAMED, check_name, split_name
 from catstream.run.job import Job
 from catstream.run.state import learned
-from catstream.services.options import PATH, combined
+from catstream.services.options import PATH, NumberRange, combined
 
 __all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
 
@@ -66,7 +66,7 @@ _with_pipeline = combined(
         "--source", default="", metavar="SOURCE", help="The source that the pipeline tracks, instead of --endpoint."
     ),
     click.option(
-        "--timeout", default=5.0, show_default=True, type=click.FloatRange(0), help="Seconds to wait for an answer."
+        "--timeout", default=5.0, show_default=True, type=NumberRange(0), help="Seconds to wait for an answer."
     ),
     click.option("--yes", is_flag=True, help="Do not ask for confirmation."),
 )

@@ -13,7 +13,7 @@ from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.errors import CatstreamError, VideoError
 from catstream.messages.names import counted
 from catstream.numerics.threads import one_thread
-from catstream.services.options import PATH, with_overwrite, with_skip_damaged
+from catstream.services.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 from catstream.settings import RunSettings
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 @with_overwrite
 @click.option(
     "--threshold",
-    type=click.FloatRange(0, 2),
+    type=NumberRange(0, 2),
     default=0.5,
     show_default=True,
     metavar="N",
@@ -60,7 +60,7 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 )
 @click.option(
     "--every",
-    type=click.FloatRange(0, 3600),
+    type=NumberRange(0, 3600),
     default=0.2,
     show_default=True,
     metavar="SECONDS",

@@ -13,7 +13,7 @@ from catstream.cli.files import with_json_file, write_json
 from catstream.cli.interrupts import stopped
 from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.messages.storage import writing
-from catstream.services.options import with_settings
+from catstream.services.options import NumberRange, with_settings
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.limits import Limit
@@ -42,12 +42,12 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="How many of them are slow or frozen.")
 @click.option(
     "--rate",
-    type=click.FloatRange(0.5, 1000),
+    type=NumberRange(0.5, 1000),
     default=25.0,
     show_default=True,
     help="Frames per second of each stream.",
 )
-@click.option("--duration", type=click.FloatRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
+@click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
 @click.option(
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
 )

@@ -12,7 +12,7 @@ from rich.console import Console
 from catstream.cli.output import line_of, messages, screen, table
 from catstream.errors import RecordingError
 from catstream.messages.kinds import Features, Model, Run, Track
-from catstream.services.options import PATH
+from catstream.services.options import PATH, NumberRange
 from catstream.sinks.recording.file import Recording, RecordingWriter
 from catstream.sinks.recording.learning import Prequential, Retraining, learn, prequential_of_recorded, require_features
 from catstream.sinks.recording.player import Player
@@ -25,7 +25,7 @@ __all__ = ["replay"]
 @click.argument("recording", type=PATH)
 @click.option("--endpoint", default="", metavar="PLACE", help="Endpoint for subscribers; a new one by default.")
 @click.option("--keys", default="", metavar="DIR", help="Folder of keys; subscribers then need keys.")
-@click.option("--speed", type=click.FloatRange(0, min_open=True), default=1.0, help="Multiple of the recorded speed.")
+@click.option("--speed", type=NumberRange(0, min_open=True), default=1.0, help="Multiple of the recorded speed.")
 @click.option("--fast", is_flag=True, help="Play without pauses.")
 @click.option("--wait", is_flag=True, help="Start when the tracks have a subscriber.")
 @click.option("--learn", "learns", is_flag=True, help="Train from the recorded features again.")

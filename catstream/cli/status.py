@@ -17,7 +17,7 @@ from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health
 from catstream.messages.names import counted
-from catstream.services.options import with_json
+from catstream.services.options import NumberRange, with_json
 from catstream.wire.channels import CHANNELS
 
 __all__ = ["status"]
@@ -32,7 +32,7 @@ _NAMES = CHANNELS["health"].senders
     "--wait",
     default=3.0,
     show_default=True,
-    type=click.FloatRange(0),
+    type=NumberRange(0),
     help="Maximum seconds to wait for health reports.",
 )
 def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:

@@ -7,9 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 
-from catstream.cli import COMMANDS
+from catstream.cli import COMMANDS, load_command
 from catstream.services.start_server import NAMES
 
 
@@ -41,6 +42,19 @@ def test_every_command_has_a_help_text_with_examples(help_of, command):
 
 def test_an_unknown_command_is_an_error(fail):
     assert "No such command 'trakc'" in fail("trakc")
+
+
+NUMBERS = [
+    (name, option.opts[0])
+    for name in COMMANDS
+    for option in load_command(name).params
+    if isinstance(option.type, click.FloatRange)
+]
+
+
+@pytest.mark.parametrize(("name", "option"), NUMBERS)
+def test_nan_is_within_no_bounds(fail, name, option):
+    assert f"Invalid value for '{option}': expected a number, got 'nan'" in fail(name, option, "nan")
 
 
 @pytest.mark.parametrize("name", [*NAMES, "supervisor"])
