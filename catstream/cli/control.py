@@ -12,12 +12,13 @@ import click
 
 from catstream.box import Box
 from catstream.cli.attach import with_endpoint
+from catstream.cli.files import check_file
 from catstream.client.control import Control, control
 from catstream.errors import ServiceError
 from catstream.messages.names import UNNAMED, check_name, split_name
 from catstream.run.job import Job
 from catstream.run.state import learned
-from catstream.services.options import PATH, NumberRange, combined
+from catstream.services.options import PATH, NumberRange, combined, with_overwrite
 
 __all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
 
@@ -176,8 +177,9 @@ def resume(pipeline: Control) -> str:
 @click.argument("file", type=PATH)
 @click.option("--object", "name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one.")
 @click.option("--state", type=PATH, metavar="FOLDER", help="State folder of a run, which may have ended.")
+@with_overwrite
 @_with_pipeline
-def save(target: _Target, file: Path, state: Path | None, name: str) -> None:
+def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: bool) -> None:
     """Save everything that a pipeline has learned of an object to FILE.
 
     The file has the coreset trees whole, and a model. `catstream track SOURCE
@@ -195,6 +197,7 @@ def save(target: _Target, file: Path, state: Path | None, name: str) -> None:
       catstream save walker.safetensors --state checkpoints
       catstream track other.mp4 --model walker.safetensors
     """
+    check_file(file, overwrite=overwrite)
     if state is None:
         with target.control() as pipeline:
             version = pipeline.save(file, name).version

@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.cli.attach import with_fleet_address
+from catstream.cli.files import check_file
 from catstream.cli.output import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
@@ -27,7 +28,7 @@ from catstream.fleet.timing import SHOW_SECONDS, UP_SECONDS
 from catstream.messages import storage
 from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, split_name
-from catstream.services.options import PATH, with_json, with_keys
+from catstream.services.options import PATH, with_json, with_keys, with_overwrite
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
@@ -317,8 +318,9 @@ def logs(running: Fleet, name: str, lines: int) -> None:
     help="Name of the object; default: the only one of NAMES.",
 )
 @click.option("-o", "--output", type=PATH, metavar="FILE", help="Write the model to a file, too.")
+@with_overwrite
 @with_fleet
-def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path | None) -> None:
+def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path | None, overwrite: bool) -> None:
     """Merge what the streams NAMES have learned of an object; default: all.
 
     The model is kept in the store of the fleet, and each stream that follows
@@ -330,6 +332,8 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
       catstream fleet merge --object anna
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
+    if output is not None:
+        check_file(output, overwrite=overwrite)
     with Console(stderr=True).status("merging"):
         merged = running.merge(*names, object=object_name)
     if output is not None:

@@ -114,7 +114,7 @@ def test_a_saved_model_finds_the_object_in_another_run(video, follow, succeed, s
     run = follow(camera(lambda _: image).url, box)
 
     def saved():
-        code, answer = steer("save", tmp_path / "one")
+        code, answer = steer("save", tmp_path / "one", "--overwrite")
         return code == 0 and int(answer.removeprefix("model ").removesuffix(f" is in {tmp_path / 'one'}"))
 
     until(lambda: saved() >= 3)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 
 from catstream.cli.fleet import _down
+from catstream.fleet import fleet
 
 
 def test_the_end_of_a_fleet_is_an_error_if_the_last_state_of_a_stream_is_not_stored(capsys):
@@ -17,3 +19,9 @@ def test_the_end_of_a_fleet_is_an_error_if_the_last_state_of_a_stream_is_not_sto
     out, err = capsys.readouterr()
     assert out == 2 * "the fleet site is down\n"
     assert "gate: the store is full" in err
+
+
+def test_a_merged_model_replaces_a_file_only_if_asked_to(fail, monkeypatch, tmp_path):
+    monkeypatch.setattr(fleet, "Fleet", lambda *_, **__: nullcontext(None))
+    (tmp_path / "anna").touch()
+    assert "anna exists already: replace it with --overwrite" in fail("fleet", "merge", "-o", tmp_path / "anna")

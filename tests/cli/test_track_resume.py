@@ -66,7 +66,7 @@ def killed(wreck):
     return shutil.copytree(copy, place)
 
 
-def test_a_run_whose_processes_were_all_killed_resumes_without_a_difference(killed, whole_run, succeed, tmp_path):
+def test_a_run_whose_processes_were_all_killed_resumes_without_a_difference(killed, whole_run, succeed, fail, tmp_path):
     kept, out = killed / "kept", killed / "out"
     before = len(frames(out))
     assert before < 32
@@ -79,6 +79,8 @@ def test_a_run_whose_processes_were_all_killed_resumes_without_a_difference(kill
     saved = Learned.load(tmp_path / "one")
     assert output == f"model {saved.model.version} is in {tmp_path / 'one'}\n"
     assert saved.model.version == CheckpointStore(kept / TREES).load(Settings()).version
+    assert "one exists already: replace it with --overwrite" in fail("save", tmp_path / "one", "--state", kept)
+    succeed("save", tmp_path / "one", "--state", kept, "--overwrite")
     succeed("track", "--resume", kept)
     assert frames(out) == list(range(32)), "a run that is complete gets no row more"
 
