@@ -85,6 +85,7 @@ def published(service):
 def test_there_is_a_service_for_each_process_one_for_the_page_and_one_for_the_network():
     assert set(SERVICES) == {*NAMES, "view", "network"}
     assert {service["image"] for service in SERVICES.values()} == {"catstream"}
+    assert all("build" in service for service in SERVICES.values()), "each of them may be the first that is run"
 
 
 @PROCESSES
