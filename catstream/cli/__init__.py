@@ -96,3 +96,5 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         complain(f"cannot write any more: {error.strerror}")
         sys.exit(1)
+    finally:
+        INTERRUPTS.end()

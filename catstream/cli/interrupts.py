@@ -55,6 +55,11 @@ class Interrupts:
         if pending:
             raise KeyboardInterrupt
 
+    def end(self) -> None:
+        """Ignore these signals from now on: the process ends, and they would only interrupt its last cleaning up."""
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
     def _handle(self, *_: object) -> None:
         if self._leaving:
             os.write(2, b"stopped\n")

@@ -293,11 +293,14 @@ class _Run:
         request, folder = self._request, self._request.folder
         if request.resume is not None and not self._progress.frames and not interrupted:
             self._console.print(f"no frames were left to track: the run in {request.resume} is complete")
-        for file in self._pipeline.saved_models:
+        saved = self._pipeline.saved_models
+        for file in saved:
             self._console.print(f"saved model: {file}")
         if interrupted:
+            unsaved = [str(file) for file in self._pipeline.results.models.values() if file not in saved]
+            lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
             hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
-            stopped(f"the results so far are kept{hint}")
+            stopped(f"the results so far are kept{lost}{hint}")
         if self._recording is not None and not self._recording.complete:
             raise RecordingError(
                 f"{request.record} is not complete: see why above, and record the run again if you need it whole"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -63,3 +64,10 @@ def test_ignored_signals_stay_ignored(interrupts):
     interrupts.install()
     with interrupts.leaving():
         signal.raise_signal(signal.SIGHUP)
+
+
+def test_a_second_signal_does_not_disturb_the_end_of_a_command():
+    send = "import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT)"
+    command = [sys.executable, "-P", "-c", f"{send}; from catstream.cli import main; main()", "--version"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stderr == ""

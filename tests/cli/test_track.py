@@ -265,6 +265,7 @@ def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video,
     assert (code, list(tmp_path.iterdir())) == (130, [])
     assert "saved model:" not in errors
     assert "nothing was learned" in errors
+    assert errors.endswith(f"stopped: the results so far are kept; not saved: {tmp_path / 'model'}\n")
 
 
 def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_after_it(
