@@ -249,6 +249,7 @@ def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None
         resumable=request.folder is not None,
         known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
     )
+    files.check_source_kept(request.saved.values())
     for file in request.saved.values():
         check_file(file, overwrite=request.overwrite, made=files.output)
         if [*request.saved.values()].count(file) > 1:

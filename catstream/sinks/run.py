@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,6 +77,7 @@ class RunFiles:
                 f"results of {self.name!r} are in {str(self.output)!r} already ({', '.join(existing)}), of this source "
                 "or of another of that name: replace them all with --overwrite, or give another folder"
             )
+        self.check_source_kept([*with_logs(self.files), *([self._video_file()] if self.video else [])])
         if twice := [file for count, file in enumerate(self.files) if file in self.files[:count]]:
             raise VideoError(f"{twice[0]} is named twice: give each file once")
         for file in with_logs(self.files):
@@ -89,6 +90,11 @@ class RunFiles:
                 f"{files[0]} does not hold all tracks, so the run could not be resumed: add a file that does, "
                 "--write tracks.ndjson or --output FOLDER"
             )
+
+    def check_source_kept(self, files: Iterable[Path]) -> None:
+        """Raise VideoError if a file to be written is the one that the frames are read from."""
+        for file in filter(self._is_source, files):
+            raise VideoError(f"{file} is the source, which would be lost: give another name or folder")
 
     def make_folder(self) -> None:
         """Make the folder of the results, in which other files of the run may be, too."""
@@ -176,7 +182,7 @@ class RunFiles:
         # An object that begins later finds no file of an earlier run in its place.
         left = results.objects_of(self.output, self.name) - {*self.objects}
         files = results.result_files(self.name, [*(self.objects or [UNNAMED]), *sorted(left)])
-        return [*(self.output / file for file in files), self._video_file()]
+        return [*(self.output / file for file in files), *self._earlier_video()]
 
     def _discarded(self) -> list[Path]:
         """Return the results files that a new run removes: the video, and the files of objects of an earlier run."""
@@ -186,10 +192,17 @@ class RunFiles:
         names = {*self.objects, *earlier, *results.objects_of(self.output, self.name)}
         names -= {UNNAMED} & {*self.objects}  # these files are replaced by those of this run
         files = [file for name in names for file in results.object_files(self.name, name)]
-        return [self._video_file(), *(self.output / file for file in files)]
+        return [*self._earlier_video(), *(self.output / file for file in files)]
 
     def _video_file(self) -> Path:
         return (self.output or Path()) / f"{self.name}.mp4"
+
+    def _earlier_video(self) -> list[Path]:
+        """Return the video of an earlier run, which may exist; the source has its name if the results are beside it."""
+        return [] if self._is_source(self._video_file()) else [self._video_file()]
+
+    def _is_source(self, file: Path) -> bool:
+        return file.exists() and Path(self.source).exists() and file.samefile(self.source)
 
     def _logs(self) -> list[tuple[Path, Callable[[Path], Iterator[Track]]]]:
         """Return the files that hold all tracks, and the functions that read them: NDJSON first, it has all fields."""

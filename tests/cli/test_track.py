@@ -258,6 +258,12 @@ def readable(path):
     return len(frames)
 
 
+def test_a_model_does_not_replace_the_video_that_is_tracked(video, fail):
+    source, box = video
+    message = fail("track", source, "--box", box, "--save-model", source, "--overwrite")
+    assert f"{source} is the source, which would be lost" in message
+
+
 def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video, said, monkeypatch, tmp_path):
     monkeypatch.setattr(Pipeline, "by_frame", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
     source, box = video

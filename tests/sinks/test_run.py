@@ -286,3 +286,17 @@ def test_files_that_an_earlier_run_left_of_an_object_are_seen_before_the_run_and
     assert len((run.output / "demo-carla.txt").read_text().splitlines()) == 2
     assert not (run.output / "demo-anna.txt").exists()
     assert source_of_such_a_name.read_text() == (run.output / "demo-2.txt").read_text() == "kept"
+
+
+def test_the_video_that_is_tracked_is_neither_replaced_nor_removed(files):
+    source = Path(files("a").source)
+    content = source.read_bytes()
+    beside = replace(files("a"), output=source.parent, video=False, files=[])
+    beside.check_writable(overwrite=False, resumable=False)
+    fill(beside, 0, 3)
+    beside.check_writable(overwrite=True, resumable=False)
+    fill(beside, 0, 3)
+    assert source.read_bytes() == content
+    for lost in replace(beside, video=True), replace(beside, output=None, files=[source]):
+        with pytest.raises(VideoError, match=r"demo\.mp4 is the source, which would be lost"):
+            lost.check_writable(overwrite=True, resumable=False)
