@@ -180,11 +180,13 @@ def revoke(folder: Path, name: str) -> None:
     Raises
     ------
     ServiceError
-        If there is no client of that name.
+        If there is no client of that name, or it is the pipeline, which could not start any more.
     """
     known = clients(folder)
     if name not in known:
         raise ServiceError(f"there is no client {name!r}: there are {', '.join(known)}")
+    if name == _OWN:
+        raise ServiceError(f"{name!r} is the key of the pipeline itself: to replace it, make keys in another folder")
     (folder / _CLIENTS / name).unlink(missing_ok=True)
 
 

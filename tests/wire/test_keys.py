@@ -248,6 +248,13 @@ def test_a_client_that_may_only_watch_gets_an_error_if_it_sends(name, place, lis
         until(lambda: False, lambda: (turn(), client._wait(0.02)))
 
 
+def test_the_key_of_the_pipeline_itself_cannot_be_revoked(keys):
+    before = clients(keys)
+    with pytest.raises(ServiceError, match="make keys in another folder"):
+        revoke(keys, "pipeline")
+    assert clients(keys) == before
+
+
 def test_a_revoked_client_receives_until_its_connection_ends_and_cannot_reconnect(keys, place, until):
     heard = []
     with Subscriber(TRACKS, place("watcher")) as reader:
