@@ -20,6 +20,7 @@ from catstream.messages.names import boxes_by_name, split_name
 from catstream.settings import PRESETS, Settings
 
 __all__ = [
+    "FOLDER",
     "PATH",
     "Command",
     "Decorator",
@@ -44,6 +45,9 @@ _Converter = Callable[[dict[str, str]], object]
 
 #: Parameter type of a file or folder.
 PATH = click.Path(path_type=Path)
+
+#: Parameter type of a folder, which may not exist.
+FOLDER = click.Path(path_type=Path, file_okay=False)
 
 
 class NumberRange(click.FloatRange):

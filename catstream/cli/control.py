@@ -18,7 +18,7 @@ from catstream.errors import ServiceError
 from catstream.messages.names import UNNAMED, check_name, split_name
 from catstream.run.job import Job
 from catstream.run.state import learned
-from catstream.services.options import PATH, NumberRange, combined, with_overwrite
+from catstream.services.options import FOLDER, PATH, NumberRange, combined, with_overwrite
 
 __all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
 
@@ -176,7 +176,7 @@ def resume(pipeline: Control) -> str:
 @click.command()
 @click.argument("file", type=PATH)
 @click.option("--object", "name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one.")
-@click.option("--state", type=PATH, metavar="FOLDER", help="State folder of a run, which may have ended.")
+@click.option("--state", type=FOLDER, metavar="FOLDER", help="State folder of a run, which may have ended.")
 @with_overwrite
 @_with_pipeline
 def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: bool) -> None:

@@ -13,7 +13,7 @@ from catstream.cli.files import with_json_file, write_json
 from catstream.cli.interrupts import stopped
 from catstream.cli.output import complain, line_of, messages, screen, table
 from catstream.messages.storage import writing
-from catstream.services.options import NumberRange, with_settings
+from catstream.services.options import FOLDER, NumberRange, with_settings
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.limits import Limit
@@ -56,7 +56,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
     "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
 )
 @with_json_file
-@click.option("--output", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html.")
+@click.option("--output", type=FOLDER, help="Folder for report.html.")
 @with_settings
 def loadtest(
     find_limit: bool,

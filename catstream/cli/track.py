@@ -25,6 +25,7 @@ from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results
 from catstream.services.options import (
+    FOLDER,
     PATH,
     with_files,
     with_given,
@@ -139,7 +140,7 @@ class _Request:
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
 @click.option("--state", type=PATH, help="Folder for checkpoints, to resume the run from.")
-@click.option("--resume", type=PATH, help="Resume the run of such a folder.")
+@click.option("--resume", type=FOLDER, help="Resume the run of such a folder.")
 @with_object
 @with_part
 @with_given

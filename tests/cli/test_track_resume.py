@@ -196,3 +196,9 @@ def test_new_results_of_a_run_to_resume_have_all_frames_although_the_models_are_
     succeed("track", "--resume", killed / "kept")
     succeed("track", "--resume", killed / "kept", "--output", killed / "new")
     assert frames(killed / "new") == [*range(32)]
+
+
+@pytest.mark.parametrize("words", [["track", "--resume"], ["save", "one", "--state"]], ids=" ".join)
+def test_a_file_is_not_the_folder_of_a_run(fail, tmp_path, words):
+    (tmp_path / "walk.mp4").write_bytes(b"a video")
+    assert "walk.mp4' is a file" in fail(*words, tmp_path / "walk.mp4", cwd=tmp_path)
