@@ -266,8 +266,7 @@ class DetectorLoop:
 
     def _receive_models(self, seconds: float) -> None:
         """Receive models, waiting at most this long for the first; the detectors adopt those of their objects."""
-        first = self._models.receive(seconds)
-        for model in (*([first] if first is not None else []), *self._models.receive_all()):
+        for model in self._models.receive_all(seconds):
             if self.state.phase is Phase.POSITIONS:
                 self._arrived[model.object] = model
                 self.tell(core.ModelArrived(model.object, model.version))

@@ -85,10 +85,9 @@ class Sender(ChannelSocket[Message]):
         StreamRewoundError
             If the receiver has lost messages that it had acknowledged.
         """
-        if self._wait(seconds):
-            with contextlib.suppress(zmq.Again):
-                while True:
-                    self._process(self._socket.recv(zmq.NOBLOCK))
+        while self._wait(seconds):
+            self._process(self._socket.recv())
+            seconds = 0.0
         if self.window.must_ask(monotonic()):
             self._say_hello()
         self._transmit()

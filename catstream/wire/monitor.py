@@ -9,6 +9,8 @@ from enum import Enum
 
 import zmq
 
+from catstream.wire.context import arrives
+
 __all__ = ["Event", "Monitor"]
 
 #: The first frame of a report. zmq.utils.monitor reads it, too, but imports asyncio, in 20 ms.
@@ -52,9 +54,9 @@ class Monitor:
         self._events.set(zmq.RCVHWM, 0)
         self._events.connect(address)
 
-    def events(self, milliseconds: int = 0) -> Iterator[Event]:
-        """The events that are here, and those that come within so many milliseconds of the one before."""
-        while not self._events.closed and self._events.poll(milliseconds):
+    def events(self, seconds: float) -> Iterator[Event]:
+        """The events that are here, and those that come within so many seconds of the one before."""
+        while not self._events.closed and arrives(self._events, seconds):
             report, _ = self._events.recv_multipart()  # and the address of the other end
             kind, value = _REPORT.unpack(report)
             event = _EVENTS[kind]

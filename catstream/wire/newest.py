@@ -31,6 +31,7 @@ import zmq
 from catstream.messages.kinds import End, Health, Run
 from catstream.wire.channels import Channel
 from catstream.wire.codec import opening, topic_of
+from catstream.wire.context import arrives
 from catstream.wire.endpoint import Endpoint, Note, names_of_early_subscribers, note_early_subscriber
 from catstream.wire.socket import ChannelSocket
 from catstream.wire.timing import REPEAT_SECONDS
@@ -117,10 +118,9 @@ class Publisher(ChannelSocket[Message]):
         self._read_events()
         joined = False
         for _ in range(_MAX_CHANGES):  # the rest waits for the next call: a flood does not stop the process
-            try:
-                change = self._socket.recv(zmq.NOBLOCK)
-            except zmq.Again:
+            if not arrives(self._socket, 0):
                 break
+            change = self._socket.recv()
             joined |= self._process(subscribes=change.startswith(b"\x01"), topic=change[1:])
         if joined or monotonic() >= self._repeat_at:
             self._due = list(dict.fromkeys([*self._due, *self._last]))
@@ -218,9 +218,10 @@ class Subscriber(ChannelSocket[Message]):
                 return message
         return None
 
-    def receive_all(self) -> list[Message]:
-        """All messages that have arrived, oldest first."""
-        return list(iter(lambda: self.receive(0), None))
+    def receive_all(self, seconds: float = 0.0) -> list[Message]:
+        """All messages that have arrived, oldest first; if none has, wait at most this long for one."""
+        first = self.receive(seconds)
+        return [] if first is None else [first, *iter(lambda: self.receive(0), None)]
 
     def close(self) -> None:
         """Disconnect."""

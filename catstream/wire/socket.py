@@ -18,7 +18,7 @@ from catstream.errors import ProtocolError, ServiceError
 from catstream.wire import timing
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
-from catstream.wire.context import context
+from catstream.wire.context import arrives, context
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.monitor import Event, Monitor
 from catstream.wire.rejects import count, reject
@@ -28,7 +28,7 @@ __all__ = ["ChannelSocket"]
 
 
 def _milliseconds(seconds: float) -> int:
-    return max(0, round(seconds * 1000))
+    return round(seconds * 1000)
 
 
 #: No ZeroMQ heartbeats: libzmq aborts the process if one is due to a peer that disconnected while its queue was full
@@ -162,7 +162,7 @@ class ChannelSocket(Generic[Message]):
     def _wait(self, seconds: float) -> bool:
         """Whether something arrives within so many seconds; handles the events of connections first."""
         self._read_events()
-        return bool(self._socket.poll(_milliseconds(seconds)))
+        return arrives(self._socket, seconds)
 
     def _decode(
         self, data: bytes | memoryview, *kinds: type[Kind], check: Callable[[Kind], None] | None = None
@@ -209,7 +209,7 @@ class ChannelSocket(Generic[Message]):
         """
         if self._monitor is None:
             return
-        for event in self._monitor.events(_milliseconds(seconds)):
+        for event in self._monitor.events(seconds):
             if event is Event.DISCONNECTED:
                 self._disconnected()
             elif self._listens:

@@ -59,8 +59,8 @@ class Turns(RuleBasedStateMachine):
         self.newest, self.received = {}, {}  # version of each object that arrived, and that was received last
         self.since = {}  # when the first message of each object arrived that was not received yet
 
-    def poll(self, _):
-        return len(self.queue)
+    def get(self, _):
+        return zmq.POLLIN if self.queue else 0
 
     def recv(self, copy):
         assert not copy
