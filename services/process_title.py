@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import ctypes
 import os
+import signal
 from contextlib import suppress
 from pathlib import Path
 
 __all__ = ["is_ending", "is_suspended", "process_fields", "set_process_title"]
 
 _SET_NAME = 15  # PR_SET_NAME
-#: Fields of /proc/PID/stat: the state, the flags, and the addresses of the command's arguments.
-_STATE, _FLAGS, _ARGUMENTS = 3, 9, slice(48, 50)
+#: Fields of /proc/PID/stat: the state, the flags, the signals that wait, and the addresses of the command's arguments.
+_STATE, _FLAGS, _SIGNALS, _ARGUMENTS = 3, 9, 31, slice(48, 50)
 _EXITING = 0x4  # PF_EXITING, one of the flags
+_KILLED = 1 << signal.SIGKILL - 1  # one of the signals that wait, until the process runs for the last time
 
 
 def process_fields(pid: int) -> list[str]:
@@ -35,9 +37,10 @@ def is_suspended(pid: int) -> bool:
 
 
 def is_ending(pid: int) -> bool:
-    """Whether a process has ended, or the kernel is ending it: its sockets may be open a little longer."""
+    """Whether a process has ended, or was killed: its sockets may be open a little longer."""
     try:
-        return bool(int(process_fields(pid)[_FLAGS]) & _EXITING)
+        fields = process_fields(pid)
+        return bool(int(fields[_FLAGS]) & _EXITING or int(fields[_SIGNALS]) & _KILLED)
     except OSError:  # it has ended
         return True
 
