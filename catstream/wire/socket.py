@@ -8,6 +8,7 @@ connects needs a key with the role of the channel (`catstream.wire.zap`).
 from __future__ import annotations
 
 import atexit
+import warnings
 from collections.abc import Callable
 from typing import Any, Generic, Self, TypeVar
 from weakref import WeakSet
@@ -114,6 +115,17 @@ class ChannelSocket(Generic[Message]):
         if self._domain:
             ZAP.unregister(self._domain)
             self._domain = b""
+
+    def __del__(self) -> None:
+        # The monitor of a socket that was dropped has no reader any more, and would block ZeroMQ's thread: nothing more
+        # would arrive at any socket of this program.
+        socket = getattr(self, "_socket", None)
+        if socket is not None and not socket.closed:
+            socket.disable_monitor()
+            socket.close()
+            if self._monitor is not None:
+                self._monitor.close()
+            warnings.warn("a subscription or control was not closed: use it in a `with`", ResourceWarning, stacklevel=1)
 
     def __enter__(self) -> Self:
         return self

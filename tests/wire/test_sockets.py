@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import zmq
 
 from catstream.errors import ServiceError
 from catstream.messages.kinds import (
@@ -23,7 +24,9 @@ from catstream.messages.kinds import (
 )
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
+from catstream.wire.context import context
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
 
 WINDOW = 4
@@ -312,3 +315,15 @@ def test_ipv6_loopback_is_an_endpoint(until):
     endpoint = Endpoint.parse(f"tcp://[::1]:{min(port, 65000)}")
     with Publisher(MODELS, endpoint) as models, Subscriber(MODELS, endpoint) as reader:
         until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
+
+
+def test_sockets_that_are_dropped_without_close_do_not_block_the_thread_on_which_all_others_depend(endpoint):
+    with Publisher(TRACKS, endpoint):
+        dropped = [Subscriber(TRACKS, endpoint) for _ in range(10)]
+        with pytest.warns(ResourceWarning, match="not closed"):
+            dropped.clear()
+    other = context().socket(zmq.PUB)
+    events = Monitor(other)
+    other.close()
+    assert Event.STOPPED in events.events(10_000)
+    events.close()
