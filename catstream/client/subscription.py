@@ -16,6 +16,7 @@ continues if the stream moves to another node.
 from __future__ import annotations
 
 from collections.abc import Generator
+from contextlib import ExitStack
 from time import monotonic
 from typing import Any, Generic, Literal, NamedTuple, Self, TypedDict, TypeVar, Unpack, cast, overload
 
@@ -261,8 +262,10 @@ class Subscription(Generic[Message]):
     def _connect(self, place: Endpoint, *, early: bool = False) -> None:
         """Connect to a pipeline; if `early`, one that starts later waits for this subscription."""
         only = None if self._about is None else _KINDS[self._name]
-        messages = Subscriber(self._channel, place, only, about=self._about, early=early)
-        self._connection = _Connection(place, messages, Subscriber(TRACKS, place, only=End))
+        with ExitStack() as stack:
+            messages = stack.enter_context(Subscriber(self._channel, place, only, about=self._about, early=early))
+            self._connection = _Connection(place, messages, Subscriber(TRACKS, place, only=End))
+            stack.pop_all()
 
     def _disconnect(self) -> None:
         if self._connection is not None:

@@ -15,8 +15,13 @@ _POLLIN = int(zmq.POLLIN)  # an operation with a member of an enumeration would 
 
 @cache
 def context() -> zmq.Context[zmq.Socket[bytes]]:
-    """Return the context; a process that was forked gets its own."""
-    return zmq.Context()
+    """Return the context; a process that was forked gets its own.
+
+    Only the limit of open files of the process limits the number of its sockets.
+    """
+    made = zmq.Context()
+    made.set(zmq.MAX_SOCKETS, made.get(zmq.SOCKET_LIMIT))
+    return made
 
 
 def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:

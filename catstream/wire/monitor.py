@@ -49,9 +49,13 @@ class Monitor:
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         address = f"inproc://events-{next(_NUMBERS)}"
-        socket.monitor(address, sum(_EVENTS))
-        self._events: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)
+        self._events: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)  # first: nothing is reported without it
         self._events.set(zmq.RCVHWM, 0)
+        try:
+            socket.monitor(address, sum(_EVENTS))
+        except zmq.ZMQError:
+            self._events.close()
+            raise
         self._events.connect(address)
 
     def events(self, seconds: float) -> Iterator[Event]:

@@ -52,6 +52,14 @@ Kind = TypeVar("Kind")
 _OPEN: WeakSet[ChannelSocket[Any]] = WeakSet()  # sockets that were not closed yet
 
 
+def _too_many(error: zmq.ZMQError) -> ServiceError:
+    """The error for a socket that ZeroMQ could not make: it has its files, and those of its monitor."""
+    return ServiceError(
+        f"cannot open a socket ({error.strerror}): close the subscriptions and pipelines that are not needed, "
+        "or raise the limit of open files (ulimit -n)"
+    )
+
+
 @atexit.register
 def _transmit_rest() -> None:
     """Wait until the messages that closed sockets have queued are transmitted, at most `LINGER_SECONDS`.
@@ -85,7 +93,10 @@ class ChannelSocket(Generic[Message]):
         self._listens = False
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
-        self._socket: zmq.Socket[bytes] = context().socket(kind)
+        try:
+            self._socket: zmq.Socket[bytes] = context().socket(kind)
+        except zmq.ZMQError as error:
+            raise _too_many(error) from None
         _OPEN.add(self)
         for option, value in _OPTIONS.items():
             self._socket.set(option, value)
@@ -163,7 +174,11 @@ class ChannelSocket(Generic[Message]):
             self._socket.set(zmq.CURVE_SERVERKEY, keys.server)
             self._socket.set(zmq.CURVE_PUBLICKEY, keys.public)
             self._socket.set(zmq.CURVE_SECRETKEY, keys.secret)
-        self._monitor = Monitor(self._socket)
+        try:
+            self._monitor = Monitor(self._socket)
+        except zmq.ZMQError as error:
+            self.close()
+            raise _too_many(error) from None
         for sender in self.channel.senders:
             self._socket.connect(self._endpoint.address(self.channel, sender))
 

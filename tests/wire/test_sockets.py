@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import resource
 import select
 import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
 import zmq
 
+import catstream
 from catstream.errors import ServiceError
 from catstream.messages.kinds import (
     End,
@@ -327,3 +331,29 @@ def test_sockets_that_are_dropped_without_close_do_not_block_the_thread_on_which
     other.close()
     assert Event.STOPPED in events.events(10_000)
     events.close()
+
+
+@pytest.fixture
+def open_files(until):
+    """Sets the limit of open files of this process to as many more than it has now."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+
+    def count():
+        return len([*Path("/proc/self/fd").iterdir()])
+
+    before = count()
+    yield lambda more: resource.setrlimit(resource.RLIMIT_NOFILE, (before + more, hard))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    until(lambda: count() <= before + 10)  # ZeroMQ closes its files some time later
+
+
+def test_a_program_may_have_as_many_sockets_as_files(open_files):
+    open_files(1200)
+    with ExitStack() as stack:
+        assert all(stack.enter_context(context().socket(zmq.PAIR)) for _ in range(1100))
+
+
+def test_too_many_open_files_are_an_error_that_names_the_limit(folder, open_files):
+    open_files(40)
+    with ExitStack() as stack, pytest.raises(ServiceError, match="ulimit -n"):
+        [stack.enter_context(catstream.subscribe(str(folder), "tracks")) for _ in range(40)]
