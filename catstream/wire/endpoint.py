@@ -45,6 +45,7 @@ _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
 _FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
+_ANY_BYTES = "surrogateescape"  # in notes: the name of a file need not be UTF-8
 _EARLY = f"{_PREFIX}early-"  # begins the names of the notes of subscribers that wait for a pipeline
 
 
@@ -366,7 +367,7 @@ class Note:
 
     def __init__(self, path: Path, text: str) -> None:
         hidden = path.with_name(f".{path.name}")
-        self._path, self._file = path, hidden.open("w")
+        self._path, self._file = path, hidden.open("w", encoding="utf-8", errors=_ANY_BYTES)
         lock(self._file.fileno(), math.inf)
         self._file.write(text)
         self._file.flush()
@@ -412,7 +413,7 @@ def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | 
     for folder in folders:
         for path in folder.glob(pattern):
             # It may be removed by now, or belong to another user.
-            with contextlib.suppress(OSError), path.open() as file:
+            with contextlib.suppress(OSError), path.open(encoding="utf-8", errors=_ANY_BYTES) as file:
                 if os.fstat(file.fileno()).st_uid == os.geteuid():
                     yield path, file.read() if is_locked(file.fileno()) else None
 

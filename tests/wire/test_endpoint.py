@@ -159,6 +159,12 @@ def test_a_running_pipeline_is_found_until_it_ends(folder):
     assert endpoint not in running()
 
 
+def test_a_pipeline_is_found_by_a_source_whose_name_is_not_utf_8():
+    source = os.fsdecode(b"walk\xff.mp4")
+    with private_folder() as own, meeting_place("", own, source=source) as endpoint:
+        assert find(source=source) == endpoint
+
+
 def test_a_pipeline_of_this_user_is_known_to_run_without_a_connection_to_it(folder):
     """Its detector would count a peer that says nothing as a rejected one."""
     with (
