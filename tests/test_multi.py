@@ -191,6 +191,7 @@ def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
     for search, error, why in [
         ({"ben": cleo, "cleo": cleo}, ObjectError, "3 objects are more than 2"),
         ({"no name": cleo}, ObjectError, "is not a name"),
+        ({3: cleo}, ObjectError, "3 is not a name: expected text"),
         ({"cleo": replace(cleo, settings=Settings())}, SettingsError, "learned with coreset.size=64"),
     ]:
         with pytest.raises(error, match=why):

@@ -48,9 +48,9 @@ def check_name(name: str) -> str:
     >>> check_name("anna-2")
     'anna-2'
     """
-    if not is_name(name):
+    if not isinstance(name, str) or not is_name(name):
         raise ObjectError(
-            f"{name[:80]!r} is not a name: expected 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
+            f"{name!r:.80} is not a name: expected text of 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
             "the first of them a letter, a digit or '_'"
         )
     return name

@@ -154,7 +154,7 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
         ("source = '0'\nbox = [1, 2, 3]", "a box is four numbers x,y,w,h in pixels, got [1, 2, 3]"),
         ("source = '0'\nbox = [1, 2, 30, 0]", "the box of the object without a name: a box needs a width and a height"),
         ("source = '0'\nboxes = { anna = [1, 2, nan, 4] }", "the box of anna: a box needs four finite numbers"),
-        ("source = '0'\nboxes = { 'a b' = [1, 2, 3, 4] }", "'a b' is not a name: expected 1 to 64 letters"),
+        ("source = '0'\nboxes = { 'a b' = [1, 2, 3, 4] }", "'a b' is not a name: expected text of 1 to 64 letters"),
         ("source = '0'\nboxes = [1, 2, 3, 4]", "boxes must be a table, for example { anna = [120, 80, 64, 48] }, got"),
         ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "it has both box and boxes: write all objects in boxes"),
         ("source = '0'\nbox = [1, 2, 3, 4]\nmodel = 'a'", "the object without a name: a box gives the position of an "
