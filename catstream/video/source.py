@@ -404,7 +404,7 @@ class _Damage:
         if not self._skip:
             raise VideoError(
                 f"{str(self._path)!r} is damaged at frame {good} ({problem}): the frames before it are good; "
-                "--skip-damaged (skip_damaged=True) continues after the damage"
+                "--skip-damaged (run.skip_damaged=true) continues after the damage"
             )
 
 
