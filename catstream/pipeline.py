@@ -228,6 +228,7 @@ class Pipeline:
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
             stack.callback(reader.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._reader, self._stack = str(endpoint), reader, stack.pop_all()
+            self._pid = os.getpid()  # a copy of this process that is forked later does not end the run
         return self
 
     def _started(self, endpoint: str) -> Job:
@@ -246,7 +247,7 @@ class Pipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         stack, self._stack = self._stack, _CLOSED
-        if stack is not None and stack is not _CLOSED:
+        if stack is not None and stack is not _CLOSED and self._pid == os.getpid():
             stack.__exit__(kind, error, trace)
 
     async def __aenter__(self) -> Self:

@@ -8,6 +8,7 @@ connects needs a key with the role of the channel (`catstream.wire.zap`).
 from __future__ import annotations
 
 import atexit
+import os
 import warnings
 from collections.abc import Callable
 from typing import Any, Generic, Self, TypeVar
@@ -98,6 +99,7 @@ class ChannelSocket(Generic[Message]):
         except zmq.ZMQError as error:
             raise _too_many(error) from None
         _OPEN.add(self)
+        self._pid = os.getpid()
         for option, value in _OPTIONS.items():
             self._socket.set(option, value)
         self._socket.set(zmq.IPV6, int("[" in str(endpoint)))
@@ -112,6 +114,8 @@ class ChannelSocket(Generic[Message]):
     def close(self) -> None:
         """Transmit what is queued, then close; the address is free for the next socket."""
         _OPEN.discard(self)
+        if self._pid != os.getpid():  # a copy in a process that was forked, which lacks ZeroMQ's threads
+            return
         if self._listens:
             self._socket.close()
             # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
@@ -131,7 +135,7 @@ class ChannelSocket(Generic[Message]):
         # The monitor of a socket that was dropped has no reader any more, and would block ZeroMQ's thread: nothing more
         # would arrive at any socket of this program.
         socket = getattr(self, "_socket", None)
-        if socket is not None and not socket.closed:
+        if socket is not None and not socket.closed and self._pid == os.getpid():
             socket.disable_monitor()
             socket.close()
             if self._monitor is not None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +161,25 @@ def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(video, t
     assert due[-1] > 2
     late = [i for i in range(lag, len(tracks)) if tracks[i].model_version < due[i - lag]]
     assert not late
+
+
+FORKS = """
+import os, sys, catstream
+
+with catstream.Pipeline(sys.argv[1], sys.argv[2]) as pipeline, catstream.subscribe(pipeline.endpoint, "tracks"):
+    tracks = iter(pipeline)
+    first = next(tracks)
+    if not (child := os.fork()):
+        sys.exit(7)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), 1 + len([*tracks]), pipeline.totals["restarts"])
+"""
+
+
+def test_a_copy_of_a_program_that_was_forked_ends_without_ending_the_run(video):
+    path, boxes = video
+    command = [sys.executable, "-c", FORKS, path, ",".join(map(str, boxes[0]))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert done.stdout.split() == ["7", str(len(boxes)), "0"], done.stderr
 
 
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
