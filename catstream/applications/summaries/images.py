@@ -71,7 +71,7 @@ def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> 
     SettingsError
         If k is below 1, or there are fewer than k images.
     VideoError
-        If a file is not an image that can be read.
+        If a file is not an image that can be read, or if `images` is one path.
     FrameError
         If an array is not an image.
 
@@ -82,6 +82,11 @@ def summarize(images: Iterable[np.ndarray | str | os.PathLike[str]], k: int) -> 
     >>> sorted(summarize([red, red, green, red], k=2).selected)
     [0, 2]
     """
+    if isinstance(images, str | os.PathLike):
+        raise VideoError(
+            f"expected an iterable of images, got the path {os.fspath(images)!r}: give a list of files, such as "
+            "[*Path(FOLDER).iterdir()]"
+        )
     selection = RowSelection[int](k)
     for number, image in enumerate(images):
         with one_thread():

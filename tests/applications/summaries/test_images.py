@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -31,6 +33,12 @@ def test_a_row_changes_little_with_the_size_of_the_image(photographs):
     for image, other in zip(photographs[:10:2], photographs[1:10:2], strict=True):
         row, smaller = describe(image), describe(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         assert np.linalg.norm(row - smaller) < 0.3 * np.linalg.norm(row - describe(other))
+
+
+@pytest.mark.parametrize("path", [str, Path])
+def test_one_path_in_place_of_an_iterable_is_an_error_with_the_remedy(path, tmp_path):
+    with pytest.raises(VideoError, match=r"got the path .*: give a list of files"):
+        summarize(path(tmp_path), k=1)
 
 
 def test_invalid_input_is_an_error_of_one_line(photographs, tmp_path):
