@@ -97,7 +97,10 @@ class Endpoint:
             raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
         folder = Path(text)
         if any(len(os.fsencode(file)) > _MAX_PATH_BYTES for file in _files(folder)):
-            raise ServiceError(f"the name of the folder {text!r} is too long for a Unix socket: give another")
+            raise ServiceError(
+                f"the name of the folder {text!r} is too long for a Unix socket: give a shorter one "
+                "(--set run.endpoint=FOLDER), or set TMPDIR to a shorter folder for temporary files"
+            )
         return cls(folder=folder, keys=known)
 
     @classmethod
