@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Self
 
 from catstream.errors import ServiceError
-from catstream.messages.storage import is_locked, lock
+from catstream.messages.storage import is_locked, lock, writing
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 
@@ -197,17 +197,24 @@ def _files(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes."""
-    home = _homes()[0]
-    for path, text in _notes([home], f"{_PREFIX}*/{_OWNER}"):
+    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes.
+
+    Raises
+    ------
+    ServiceError
+        If no folder for temporary files can be written to.
+    """
+    if not (homes := _homes()):
+        raise ServiceError("no folder for temporary files can be written to: set TMPDIR to one")
+    for path, text in _notes(homes[:1], f"{_PREFIX}*/{_OWNER}"):
         if text is None:
             shutil.rmtree(path.parent, ignore_errors=True)
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
-    with Note(folder / _OWNER, ""):
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.ExitStack() as stack:
+        with writing(homes[0]):
+            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=homes[0]))
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            stack.enter_context(Note(folder / _OWNER, ""))
+        yield folder
 
 
 @contextlib.contextmanager
@@ -262,7 +269,8 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
 def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Note:
     """Note an endpoint with its source or its fleet, until the note is closed or the process ends."""
     keys = str(endpoint.keys.folder) if endpoint.keys is not None else ""
-    return Note(folder / (_FLEET_NOTE if fleet else _NOTE), "\n".join([str(endpoint), keys, fleet or source]))
+    with writing(folder):
+        return Note(folder / (_FLEET_NOTE if fleet else _NOTE), "\n".join([str(endpoint), keys, fleet or source]))
 
 
 def running() -> list[Endpoint]:
@@ -371,10 +379,14 @@ class Note:
     def __init__(self, path: Path, text: str) -> None:
         hidden = path.with_name(f".{path.name}")
         self._path, self._file = path, hidden.open("w", encoding="utf-8", errors=_ANY_BYTES)
-        lock(self._file.fileno(), math.inf)
-        self._file.write(text)
-        self._file.flush()
-        hidden.rename(path)
+        with contextlib.ExitStack() as unfinished:
+            unfinished.callback(self._file.close)
+            unfinished.callback(hidden.unlink)
+            lock(self._file.fileno(), math.inf)
+            self._file.write(text)
+            self._file.flush()
+            hidden.rename(path)
+            unfinished.pop_all()
 
     def close(self) -> None:
         """Remove the file."""
@@ -423,5 +435,7 @@ def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | 
 
 def _homes() -> list[Path]:
     """The parent folders of private folders, preferred first; a pipeline started by a timer has no runtime folder."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    return list(dict.fromkeys(Path(home) for home in (runtime, tempfile.gettempdir()) if os.access(home, os.W_OK)))
+    homes = [os.environ.get("XDG_RUNTIME_DIR", "")]
+    with contextlib.suppress(FileNotFoundError):  # there is no temporary folder that can be written to
+        homes.append(tempfile.gettempdir())
+    return list(dict.fromkeys(Path(home) for home in homes if os.access(home, os.W_OK)))

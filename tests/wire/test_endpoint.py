@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -99,6 +100,27 @@ def test_a_private_folder_is_for_this_user_and_removed_afterwards():
         assert mode(folder) == 0o700
         (folder / "features").touch()
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("disk", [65_536], indirect=True)
+def test_a_full_disk_for_temporary_files_is_an_error_that_names_it(disk, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(disk))
+    (disk / "ballast").write_bytes(bytes(65_536))
+    with (
+        pytest.raises(ServiceError, match=f"{disk}.*No space left"),
+        private_folder() as folder,
+        meeting_place("tcp://127.0.0.1:5700", folder, source="walk.mp4"),
+    ):
+        pass
+    assert [file.name for file in disk.iterdir()] == ["ballast"]
+
+
+def test_no_folder_for_temporary_files_is_an_error(monkeypatch):
+    monkeypatch.setattr(tempfile, "gettempdir", Mock(side_effect=FileNotFoundError))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    with pytest.raises(ServiceError, match="TMPDIR"), private_folder():
+        pass
+    assert running() == []
 
 
 def test_a_folder_that_is_made_is_for_this_user_alone(folder):
