@@ -213,6 +213,8 @@ def event(wanted: Wanted | None, seen: Seen, nodes: Collection[Node], now: float
         return "wanted" if wanted is not None and now - seen.since >= PAUSE_SECONDS else None
     if seen.happened == "gone":
         return "gone"
+    if (seen.state, seen.happened) == ("working", "interrupted"):
+        return "interrupted"  # it cannot be asked to stop
     last = seen.since if seen.state == "stopping" else seen.answered
     is_silent = now - last > _SILENT.get(seen.state, float("inf"))
     if seen.state != "stopping" and (wanted is None or not _is_as_wanted(wanted, seen, nodes, now)):

@@ -63,11 +63,13 @@ def test_no_stream_is_sent_to_a_node_that_drains(wanted, nodes):
 
 @given(seen(), NODES)
 def test_a_stream_that_is_not_wanted_ends(actor, nodes):
-    """By the table, it is absent after two more events at most."""
+    """By the table, it is absent after two more events at most; three if its process has just died."""
     happened = event(None, actor, nodes, 1.0)
     if actor.state == "stopping":
         assert event(None, replace(actor, happened="gone"), nodes, 1.0) == "gone"
         assert event(None, actor, nodes, 1000.0) in ("silent", actor.happened)
+    elif (actor.state, actor.happened) == ("working", "interrupted"):
+        assert TABLE[actor.state, happened] == ("pending", "")
     else:
         assert happened == "unwanted"
         assert TABLE[actor.state, happened][0] == "stopping"
@@ -108,6 +110,16 @@ def test_a_stream_whose_node_died_is_left_to_ray_and_stays_elsewhere_if_the_node
     assert wanted.order(without) == Order("a1", 1.0, {})
     again = [Node("n1", "3"), Node("n2", "2")]
     assert event(wanted, Seen("working", order=order, answered=0.0, node="2"), again, 0.0) is None
+
+
+def test_a_stream_whose_node_died_is_not_asked_to_stop_if_it_may_run_again_on_a_node_that_was_drained():
+    """Its order still excludes that node. Nobody would answer, and it would be killed only later."""
+    wanted, nodes = Wanted("a1"), [Node("n1", "1", alive=False), Node("n2", "2")]
+    order = wanted.order([Node("n1", "1"), Node("n2", "2", draining=True)])
+    died = Seen("working", order=order, answered=0.0, happened="interrupted")
+    assert diff({"gate": wanted}, {"gate": died}, nodes, 0.0) == {"gate": Step("interrupted", "pending", "")}
+    pending = replace(died, state="pending")
+    assert diff({"gate": wanted}, {"gate": pending}, nodes, 0.0) == {"gate": Step("unwanted", "stopping", "kill")}
 
 
 def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed():
