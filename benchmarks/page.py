@@ -328,7 +328,7 @@ _NODE_OF_A_FLEET = """
     uses, and `cores` in the file is what Ray reserves. A node writes the state of each stream every 5 seconds, about
     14 MB for one object of four trees once it has tracked for long: 100 streams write 280 MB a second to the store.
     With `every = 30`, it is a sixth of that; a failure then costs a live stream up to 30 s of learning, and no row of
-    a file. Requests to a bucket are one PUT and two listings for each state. Merging takes two saved models at a time,
+    a file. Requests to a bucket are one PUT and one listing for each state. Merging takes two saved models at a time,
     as tasks on all nodes: merging 1,000 streams takes 999 merges, a few at a time on each node."""
 _FOUND = """
     Every fourth object is learned from the first third of its sequence, and searched in frames of the rest and of all

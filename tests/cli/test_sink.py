@@ -10,6 +10,7 @@ import time
 from contextlib import closing
 
 from catstream.messages.kinds import Health, Run, Track
+from catstream.messages.names import counted
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import open_source
@@ -52,7 +53,7 @@ def written(folder, errors):
     """The frames whose tracks are there, in each of the files."""
     frames = [json.loads(line)["frame"] for line in (folder / "tracks.ndjson").read_text().splitlines()]
     assert frames == list(range(frames[0], frames[0] + len(frames)))
-    assert f"{len(frames)} tracks, {frames[0]} missed" in errors, "those before it came"
+    assert f"{counted(len(frames), 'track')}, {frames[0]} missed" in errors, "those before it came"
     with closing(sqlite3.connect(folder / "tracks.sqlite")) as database:
         assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == frames
     with open_source(str(folder / "walk.mp4")) as shown:
