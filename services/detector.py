@@ -367,10 +367,11 @@ class DetectorLoop:
         return None
 
     def _show(self, order: actions.Show) -> None:
-        tracks, frame = self._tracks.tracks, self._frame
+        tracks = self._tracks.tracks
         wanted = self.state.desired.objects if order.held else tracks
         boxes = {name: each.box for name, each in tracks.items() if each.box is not None and name in wanted}
-        self._outputs.previews.show(frame.number, frame.image, boxes)
+        number = self.state.seq if order.held else self._tracks.frame  # a live source counts the skipped frames too
+        self._outputs.previews.show(number, self._frame.image, boxes)
 
     def _conclude(self, order: actions.Conclude) -> None:
         """Store the desired state if it has changed, then send the answers; those say so if it could not be stored."""

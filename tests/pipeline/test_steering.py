@@ -271,6 +271,23 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
     assert pipeline.totals["skipped"] > passed["skipped"]
 
 
+def test_a_picture_of_a_live_source_has_the_number_and_the_boxes_of_the_track_of_its_frame(video, camera):
+    path, boxes = video
+    with open_source(path) as source:
+        images = [frame.image for frame, _ in zip(source, range(4), strict=False)]
+    moving = camera(lambda number: images[number % 4])
+    with (
+        steered(moving.url) as (pipeline, steering, _),
+        subscribe(pipeline.endpoint, "previews", timeout=SECONDS) as pictures,
+    ):
+        told(pipeline, lambda counters: counters["waiting"] and counters["skipped"] >= 3)
+        assert [next(pictures).frame for _ in range(3)] == [0, 0, 0], "that of the frame that is tracked next"
+        steering.set_box(boxes[0])
+        picture = next(picture for picture in pictures if picture.boxes)
+        track = next(track for track in pipeline if track.frame == picture.frame)
+    assert picture.boxes == {"": track.box}
+
+
 def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_path):
     path, boxes = video
     torn = tmp_path / "torn"

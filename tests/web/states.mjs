@@ -124,7 +124,11 @@ await withBrowser(executablePath, profile, async (browser) => {
     await page.addInitScript(() => {
       window.EventSource = class { constructor() { window.events = this; } close() {} };
     });
-    await page.route("**/pictures/*", (route) => route.fulfill({ path: picture, contentType: "image/jpeg" }));
+    let loaded = 0; // pictures
+    await page.route("**/pictures/*", (route) => {
+      loaded += 1;
+      return route.fulfill({ path: picture, contentType: "image/jpeg" });
+    });
     const sent = []; // commands
     await page.route("**/control", async (route) => {
       sent.push(route.request().postDataJSON());
@@ -145,7 +149,7 @@ await withBrowser(executablePath, profile, async (browser) => {
         folded: !(await page.locator(".trees").isVisible()), lines: await page.locator("polyline").evaluateAll(colours),
         frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
         wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
-        violations: await violationsOf(page) });
+        violations: await violationsOf(page), loaded });
       if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: ["present", "three objects"].includes(name) });
     }
     await page.close();

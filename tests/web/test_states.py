@@ -44,6 +44,8 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
             "waiting for a box",
             "present",
         ]
+        pictures = [seen[scheme, name]["loaded"] for name in ("waiting for a box", "bootstrapping", "present")]
+        assert pictures == sorted(set(pictures)), "the frames of a paused live source have one number"
         assert seen[scheme, "three objects"]["header"].startswith("2 of 3 present"), "the state is first"
         assert len(seen[scheme, "three objects"]["lines"]) == 1, "colours are those of objects"
         assert [seen[scheme, name]["role"] for name in ("drawing one more", "drawing")] == ["new", "new"]

@@ -47,7 +47,7 @@ export class Stage {
     while (this.next) {
       const [wanted, turn, image] = [this.next, this.turn, new Image()];
       this.next = null;
-      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: `pictures/${wanted.frame}.jpg` });
+      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: `pictures/${wanted.frame}.jpg?${Date.now()}` });
       const loaded = await image.decode().then(() => true, () => false);
       // A picture of the previous pipeline is not shown, nor a newer one than that on which a box is drawn.
       if (!loaded || turn !== this.turn || (this.still && this.still.frame < wanted.frame)) continue;
