@@ -33,8 +33,9 @@ await withBrowser(executablePath, profile, async (browser) => {
   await is("present");
   console.log("state", await state.innerText());
 
+  const pausing = () => page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.", null, patience);
   await click("#draw"); // a second object, of which only the name is of interest
-  await page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.", null, patience);
+  await pausing();
   console.log("paused"); // until the box is set
   await draw(20, 150, 60, 60);
   await page.fill("#name", "no name");
@@ -50,6 +51,9 @@ await withBrowser(executablePath, profile, async (browser) => {
   await page.waitForSelector("#objects", { state: "hidden", ...patience });
   console.log("forgotten", (await page.locator("#message").innerText()).replace(/\d+$/, "N"));
   await page.waitForSelector("#message:empty", { state: "attached", ...patience });
+  await click("#draw");
+  await pausing();
+  await page.reload(); // ends the drawing, and the pause
 
   await is("absent");
   console.log("state", await state.innerText());

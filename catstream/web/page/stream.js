@@ -36,6 +36,7 @@ export class StreamPage {
     $("#pause").onclick = () => this.send(this.status.paused ? "resume" : "pause");
     $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
       "Stop it", "Continue", () => this.send("stop"));
+    addEventListener("pagehide", () => this.stage.cancel()); // nobody else would resume
     const trees = $("#trees details");
     trees.open = matchMedia("(min-width: 40rem)").matches; // on a phone, they are much longer than the rest
     const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
@@ -75,6 +76,7 @@ export class StreamPage {
       const response = await fetch("control", {
         method: "POST",
         headers: { "Content-Type": "application/json" },
+        keepalive: true, // also if the page is closed
         body: JSON.stringify({ verb, ...more }),
       });
       const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
