@@ -15,7 +15,6 @@ import threading
 from collections.abc import Callable, Iterator
 from time import monotonic
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
 import cv2
 
@@ -201,7 +200,7 @@ def _open_container(text: str) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     import av
 
-    kind = urlsplit(text).scheme.rstrip("s")
+    kind = text.partition(":")[0].rstrip("s") if "://" in text else ""
     where = f"/dev/video{text}" if text.isdigit() else text
     container = av.open(
         where,
@@ -223,12 +222,13 @@ def _open_container(text: str) -> InputContainer:
 def _name(text: str) -> str:
     """Return the name for results: the last part of the address, or the host; without user and password.
 
-    >>> [_name(text) for text in ("0", "/dev/video2", "rtsp://me:secret@10.0.0.7:554/cam/one.sdp?x=1", "http://10.0.0.7")]
+    >>> [_name(text) for text in ("0", "/dev/video2", "rtsp://me:sec[ret@10.0.0.7:554/cam/one.sdp?x=1", "http://10.0.0.7")]
     ['video0', 'video2', 'one', '10.0.0.7']
     """
     if text.isdigit():
         return f"video{text}"
-    address = urlsplit(text)
-    word = address.path.rstrip("/").rpartition("/")[2]
-    word = word.partition(".")[0] or address.hostname or "live"
+    # By hand: urlsplit raises ValueError for a bracket in a password.
+    host, _, path = re.sub(r"^\w+://|[?#].*", "", without_password(text)).partition("/")
+    word = path.rstrip("/").rpartition("/")[2].partition(".")[0]
+    word = word or re.sub(r":\d+$", "", host).strip("[]").lower() or "live"
     return re.sub(r"[^\w.-]", "_", word)

@@ -133,6 +133,12 @@ def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     assert not caplog.records, "what never was there is not lost, and not opened again"
 
 
+def test_a_password_may_contain_a_bracket(camera):
+    with open_source(camera(numbered).url.replace("//", "//me:sec[ret@")) as source:
+        assert source.name == "one"
+        next(source)
+
+
 def test_a_camera_that_does_not_exist_is_an_error():
     with pytest.raises(VideoError, match=r"no such file.*\./987$"):
         open_source("987")
