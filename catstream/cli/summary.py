@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from catstream.messages.kinds import Features, Health
 from catstream.messages.names import boxes_by_name, listed, split_name
 from catstream.numerics.threads import one_thread
 from catstream.run.job import Job
-from catstream.services.options import PATH, with_overwrite, with_settings
+from catstream.services.options import PATH, with_given, with_overwrite
 from catstream.settings import Settings
 from catstream.sinks.recording.container import MAGIC
 from catstream.sinks.recording.file import Recording
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["summary"]
 
 _RECORDING = ".mcap"
+_SETTINGS = "--settings, --preset or --set"
 
 
 @click.command()
@@ -36,7 +38,7 @@ _RECORDING = ".mcap"
 @click.option("-k", "count", type=click.IntRange(1), default=12, show_default=True, help="Number of images or frames.")
 @click.option("--box", metavar="X,Y,W,H", help="Object in the first frame of a video that is tracked.")
 @click.option("--object", "name", metavar="NAME", help="Object of a recording or run that has several.")
-@click.option("--source", metavar="PATH", help="Video of a recording, if it has moved since.")
+@click.option("--source", metavar="PATH", help="Video of a recording or run, if it has moved since.")
 @click.option(
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -46,9 +48,9 @@ _RECORDING = ".mcap"
     help="Contact sheet; the JSON file is written beside it.",
 )
 @with_overwrite
-@with_settings
+@with_given
 def summary(
-    settings: Settings,
+    given: dict[str, object],
     path: Path,
     count: int,
     box: str | None,
@@ -94,15 +96,18 @@ def summary(
     _check_output(output, json_beside(output), overwrite)
     console = messages()
     if _is_recording(path):
+        _reject("a recording", {"--box": box, _SETTINGS: given})
         sheet = _of_recording(Recording(path), count, name, source, console)
-    elif box is not None or (path.is_dir() and Job.is_in(path)):
-        if box is None:
-            job = Job.load(path)
-        else:
-            job = Job(str(path), boxes_by_name(dict([split_name(box)])), settings=settings)
-        with tempfile.TemporaryDirectory(prefix="catstream-summary-") as folder:
-            sheet = _of_recording(_tracked(job, Path(folder), console), count, name, source or job.source, console)
+    elif path.is_dir() and Job.is_in(path):
+        _reject("the folder of a run", {"--box": box, _SETTINGS: given})
+        job = Job.load(path)
+        sheet = _of_job(replace(job, source=source or job.source), count, name, console)
+    elif box is not None:
+        _reject("a video with --box", {"--object": name, "--source": source})
+        job = Job(str(path), boxes_by_name(dict([split_name(box)])), settings=Settings.from_values(given))
+        sheet = _of_job(job, count, None, console)
     else:
+        _reject("images, or a video without --box", {"--object": name, "--source": source, _SETTINGS: given})
         sheet = _of_images(path, count, console)
     with INTERRUPTS.deferred():
         sheet.save(output)
@@ -116,8 +121,14 @@ def _is_recording(path: Path) -> bool:
         return path.suffix == _RECORDING or file.read(len(MAGIC)) == MAGIC
 
 
+def _reject(kind: str, options: dict[str, object]) -> None:
+    """Raise an error if options were given that do not apply to this kind of PATH."""
+    if given := " and ".join(option for option, value in options.items() if value):
+        raise click.UsageError(f"{given} cannot be used with {kind}: omit the option, or give another PATH")
+
+
 def _check_output(output: Path, json: Path, overwrite: bool) -> None:
-    if output == json:
+    if output.suffix.lower() not in {".html", ".htm"}:  # so that no video, image or recording is replaced
         raise SettingsError(f"--output is the contact sheet, got {str(output)!r}: give a name that ends in .html")
     for file in (output, json):
         check_file(file, overwrite=overwrite)
@@ -144,6 +155,11 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
         for reason in collection.skipped:
             console.print(f"skipped {reason}", style="yellow")
         return sheet_of_images(path.resolve().name, collection, selection.result())
+
+
+def _of_job(job: Job, count: int, name: str | None, console: Console) -> Sheet:
+    with tempfile.TemporaryDirectory(prefix="catstream-summary-") as folder:
+        return _of_recording(_tracked(job, Path(folder), console), count, name, job.source, console)
 
 
 def _tracked(job: Job, folder: Path, console: Console) -> Recording:

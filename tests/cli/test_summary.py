@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from catstream.applications.summaries import images
+from catstream.messages.names import boxes_by_name
 from catstream.run.job import Job
 
 
@@ -70,6 +71,7 @@ def test_a_video_with_a_box_is_tracked(video, succeed, tmp_path):
         (["empty"], "the folder 'empty' and its subfolders hold neither images nor videos"),
         (["photos", "--output", "no/where.html"], "give a file in a folder that exists"),
         (["photos", "--output", "some.json"], "give a name that ends in .html"),
+        (["walk.mp4", "--output", "walk.mp4", "--overwrite"], "give a name that ends in .html"),
         (["photos", "--output", "old.html"], "old.html exists already: replace it with --overwrite"),
         (["0"], "0 is a live source: record it to a video first"),
     ],
@@ -80,6 +82,34 @@ def test_bad_input_is_an_error_of_one_line_and_nothing_is_written(arguments, pro
     before = sorted(tmp_path.rglob("*"))
     assert problem in fail("summary", *arguments, cwd=folder.parent)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("path", "options", "problem"),
+    [
+        ("photos", ["--object", "anna"], "--object cannot be used with images, or a video without --box"),
+        ("photos", ["--source", "walk.mp4"], "--source cannot be used with images"),
+        ("photos", ["--set", "coreset.size=32"], "--settings, --preset or --set cannot be used with images"),
+        ("photos", ["--box", "1,2,30,40", "--source", "walk.mp4"], "--source cannot be used with a video with --box"),
+        ("rec", ["--box", "1,2,30,40"], "--box cannot be used with a recording: omit the option"),
+        ("state", ["--box", "1,2,30,40"], "--box cannot be used with the folder of a run"),
+    ],
+)
+def test_an_option_that_does_not_apply_is_an_error(path, options, problem, folder, whole_run, said):
+    (folder.parent / "rec").symlink_to(whole_run / "rec")
+    (folder.parent / "state").mkdir()
+    Job("walk.mp4").save(folder.parent / "state")
+    code, _, errors = said("summary", path, *options, cwd=folder.parent)
+    assert code == 2
+    assert problem in errors
+    assert not (folder.parent / "summary.html").exists()
+
+
+def test_the_video_of_a_run_may_have_moved(video, succeed, tmp_path):
+    source, box = video
+    Job("gone.mp4", boxes_by_name({"": box})).save(tmp_path)
+    succeed("summary", tmp_path, "-k", 3, "--source", source, cwd=tmp_path)
+    assert (tmp_path / "summary.html").read_text().count("<img ") == 3
 
 
 def test_an_object_that_is_not_in_the_run_is_an_error(whole_run, fail, tmp_path):
