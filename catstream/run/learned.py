@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -261,7 +261,7 @@ def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
 
 
 @one_thread()  # of the trees, too: more threads add in another order, which changes the bits
-def merge(parts: Sequence[Learned], *, force: bool = False) -> Learned:
+def merge(parts: Iterable[Learned], *, force: bool = False) -> Learned:
     """One saved model from several of the same object, as if one stream had contained all their frames.
 
     The trees are merged, and a model is trained from them. The bound of the merged tree is the sum of the bounds plus
@@ -283,8 +283,11 @@ def merge(parts: Sequence[Learned], *, force: bool = False) -> Learned:
     ------
     SettingsError
         If there are fewer than two, if their settings or names differ, if two contain the same frames, or if their
-        objects do not look alike (below 0.25).
+        objects do not look alike (below 0.25); or if a part is no `Learned`, but for example the name of a file.
     """
+    parts = list(parts)
+    if wrong := [part for part in parts if not isinstance(part, Learned)]:
+        raise SettingsError(f"a merge takes saved models, got {wrong[0]!r}: read a file with catstream.Learned.load")
     if len(parts) < 2:
         raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
     first, origins = parts[0], set(parts[0].origins)

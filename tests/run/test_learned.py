@@ -214,6 +214,8 @@ def test_models_that_do_not_fit_are_not_merged(learned):
             merge([learn(stream(1), name="anna"), wrong])
     with pytest.raises(SettingsError, match="two or more"):
         merge([learned])
+    with pytest.raises(SettingsError, match=r"got 'a.safetensors': read a file with catstream.Learned.load"):
+        merge([learned, "a.safetensors"])
 
 
 def turned(*parts):
