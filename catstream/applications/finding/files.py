@@ -47,7 +47,8 @@ class File:
         Parameters
         ----------
         opened : function that is called with the frame rate and the number of frames, if known, before the first frame
-        damaged : function that is called with the reason for each image that cannot be read
+        damaged : function that is called with the reason for each image that cannot be read, and at the end of a video
+            of which frames were skipped
 
         Raises
         ------
@@ -59,6 +60,8 @@ class File:
                 opened(source.rate, source.frames)
                 with closing(read_ahead(source)) as frames:
                     yield from ((frame, "") for frame in frames)
+                if skipped := source.counters.get("damaged"):
+                    damaged(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
             return
         images = self.paths()
         opened(settings.image_rate, len(images))

@@ -253,11 +253,14 @@ def _digest(learned: Learned) -> str:
 def _sightings(search: Search, files: list[File]) -> Iterator[Sighting]:
     problems: list[VideoError] = []
     for file in files:
+        unread: list[str] = []
         try:
-            for step in search.file(file, damaged=lambda reason: problems.append(VideoError(reason))):
+            for step in search.file(file, damaged=unread.append):
                 yield from step.sightings
         except VideoError as error:
             problems.append(error)
+        if file.kind != "video":  # of a video, the caller asked to skip them
+            problems += map(VideoError, unread)
     if problems:
         raise problems[0]
 

@@ -11,6 +11,7 @@ import signal
 
 import pytest
 
+import catstream
 from catstream.applications.finding.log import SearchLog
 
 
@@ -79,6 +80,17 @@ def test_a_damaged_file_is_reported_and_the_others_are_searched(run, video, tmp_
         assert "a.mp4' is not a video" in output
     assert {row["file"] for row in rows(tmp_path / "found", "sightings.csv")} == {str(tmp_path / "b.mp4")}
     assert "is not a video" in (tmp_path / "found" / "report.html").read_text()
+
+
+def test_the_frames_of_a_video_that_are_skipped_are_counted(run, video, model_files, rng, tmp_path):
+    data = bytearray(video.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 20_000] = rng.bytes(20_000)
+    (tmp_path / "b.mp4").write_bytes(data)
+    code, output = run(tmp_path / "b.mp4", "--skip-damaged")
+    assert code == 1
+    assert re.search(r"b.mp4' is damaged: [1-9]\d* of its frames were skipped", output)
+    assert "frames were skipped" in (tmp_path / "found" / "report.html").read_text()
+    assert list(catstream.find(model_files, tmp_path / "b.mp4", skip_damaged=True))
 
 
 @pytest.mark.parametrize("sizes", ["2,1", "0,1", "1", "a,b", "1,nan"])
