@@ -110,11 +110,10 @@ def _learn(
     results.add_row("as recorded", f"{recorded}", *["-"] * 5, *_prequential_cells(prequential_of_recorded(recording)))
     with ExitStack() as stack:
         progress = stack.enter_context(line_of(console))
-        writer = (
-            stack.enter_context(RecordingWriter(output, Run.from_settings(trials[newest].portable())))
-            if output
-            else None
-        )
+        writer = None
+        if output:
+            writer = stack.enter_context(RecordingWriter(output, Run.from_settings(trials[newest].portable())))
+            stack.push(lambda kind, *_: output.unlink() if kind else None)  # Ctrl-C leaves no part of the models
         for name, settings in trials.items():
             task = progress.add_task(name, total=total)
             result = learn(

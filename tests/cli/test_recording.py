@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 
+from catstream.cli import replay
 from catstream.messages.kinds import Features, Model, Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
@@ -61,6 +62,15 @@ def test_rejected_training_leaves_no_file_and_may_be_requested_again(recorded, f
     assert not output.exists()
     succeed(*learn, "--incomplete")
     assert Recording(output).counts[Model]
+
+
+def test_an_interrupt_leaves_no_part_of_the_models(recorded, said, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(replay, "learn", interrupted)
+    code, _, _ = said("replay", recorded, "--learn", "--output", tmp_path / "again.rec")
+    assert (code, [*tmp_path.iterdir()]) == (130, [])
 
 
 def test_a_recording_is_watched_like_a_pipeline(recorded, catstream, tmp_path):
