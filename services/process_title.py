@@ -37,7 +37,7 @@ def is_suspended(pid: int) -> bool:
 
 
 def is_ending(pid: int) -> bool:
-    """Whether a process has ended, or was killed: its sockets may be open a little longer."""
+    """Return whether a process has ended, or was killed: its sockets may be open a little longer."""
     try:
         fields = process_fields(pid)
         return bool(int(fields[_FLAGS]) & _EXITING or int(fields[_SIGNALS]) & _KILLED)

@@ -25,7 +25,7 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
 
 
 def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
-    """Whether a socket has a message, or gets one within so many seconds."""
+    """Return whether a socket has a message, or gets one within so many seconds."""
     # To look costs half as much as `poll`, and most sockets that are looked at have no message.
     has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
     return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))

@@ -244,7 +244,7 @@ class ReceiveWindow:
 
     @property
     def half_full(self) -> bool:
-        """Whether half of the sender's window is not stored yet. The sender waits while its window is full."""
+        """Return whether half of the sender's window is not stored yet: the sender waits while its window is full."""
         return 2 * (self.taken - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def hello(self, peer: bytes) -> list[Reply]:
