@@ -181,10 +181,11 @@ def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
 
 def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video, tmp_path):
     path, boxes = video
-    with Pipeline(path, boxes[0], SETTINGS, state=tmp_path / "kept") as pipeline:
+    settings = SETTINGS.but({"run.lockstep": True})  # the video does not end before the second model
+    with Pipeline(path, boxes[0], settings, state=tmp_path / "kept") as pipeline:
         before = next(track for track in pipeline if track.model_version >= 2)
     (tmp_path / "kept" / "desired_state.json").write_text("{")
-    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS) as pipeline:
+    with Pipeline(resume=tmp_path / "kept", settings=settings) as pipeline:
         tracks = list(pipeline)
     assert "the desired state cannot be read" in pipeline.trouble["detector"]
     assert pipeline.restarts == 0
