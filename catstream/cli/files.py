@@ -35,6 +35,8 @@ def check_file(file: Path, *, overwrite: bool, made: Path | None = None) -> None
 
 def _checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
     if file is not None:
+        if file.is_file() and file.suffix != ".json":
+            raise ServiceError(f"{file} exists already, and only a file whose name ends with .json is replaced")
         check_file(file, overwrite=True)
     return file
 

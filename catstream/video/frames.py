@@ -111,5 +111,8 @@ def without_password(source: str) -> str:
 
     >>> without_password("rtsp://me:secret@10.0.0.7/stream1")
     'rtsp://10.0.0.7/stream1'
+    >>> without_password("rtsp://me:sec/ret@10.0.0.7/stream1")  # no address: the slash is not escaped
+    'rtsp://10.0.0.7/stream1'
     """
-    return re.sub(r"(?<=://)[^/]*@", "", source)
+    no_port = r"[^/@:\[]*:(?!\d*(/|$))"
+    return re.sub(rf"(?<=://)([^/]*|{no_port}.*)@", "", source)

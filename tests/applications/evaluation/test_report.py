@@ -133,3 +133,9 @@ def test_an_unwritable_json_path_is_an_error_before_the_work(tmp_path, walk, fai
     for place in (tmp_path, tmp_path / "a" / "b"):
         error = fail("evaluate", walk, "--tracker", "mil", "--json", place)
         assert "give a file in a folder that exists" in error
+
+
+def test_figures_replace_no_file_that_is_not_json(tmp_path, walk, fail):
+    (tmp_path / "video.mp4").write_bytes(b"a video")
+    error = fail("evaluate", walk, "--tracker", "mil", "--json", tmp_path / "video.mp4")
+    assert "only a file whose name ends with .json is replaced" in error
