@@ -258,8 +258,8 @@ class ChannelSocket(Generic[Message]):
     def _failed_to_connect(self, event: Event) -> None:
         """A peer failed the handshake; a key that was denied is counted by the ZAP handler already."""
         if event in (Event.OTHER_MECHANISM, Event.FAILED):
-            missing = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
-            reject(self.channel.name, "handshake", f"a peer was rejected: it {missing}")
+            other = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
+            reject(self.channel.name, "handshake", f"a peer has failed the handshake: it has ended, or it {other}")
 
     def _raise_if_denied(self, event: Event) -> None:
         if event is Event.DENIED:
