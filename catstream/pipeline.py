@@ -149,9 +149,11 @@ class Pipeline:
         self._state = Path(state or resume or "") if state or resume else None
         boxes = {} if box is None else boxes_by_name(box)
         models = {name: file.absolute() for name, file in files_by_name(model).items()}
-        job = self._resumed_job or Job(boxes=boxes, models=models, started=time.time())
+        job = self._resumed_job or Job(started=time.time())
         job = replace(
             job,
+            boxes=boxes or job.boxes,
+            models=models or job.models,
             source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),

@@ -213,6 +213,12 @@ def test_frames_in_memory_are_rejected_with_the_way_to_go(frames):
         Pipeline(frames, (0, 0, 10, 10))
 
 
+def test_a_run_starts_with_more_objects_than_by_default_if_the_setting_allows_them(video):
+    boxes = {f"n{number}": video[1][0] for number in range(33)}
+    with Pipeline(video[0], boxes, {"run.objects_most": 33}, part=slice(0, 1)) as pipeline:
+        assert {track.object for track in pipeline} == boxes.keys()
+
+
 def test_a_path_is_a_source(video):
     with Pipeline(Path(video[0]), video[1][0], part=slice(0, 3)) as pipeline:
         assert len(list(pipeline)) == 3
