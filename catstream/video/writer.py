@@ -47,7 +47,7 @@ class VideoWriter:
 
         self.path = Path(path)
         self.frames = 0
-        self._rate = Fraction(rate).limit_denominator(1001)
+        self._rate = Fraction(rate).limit_denominator(1001) or Fraction(1, 1001)
         self._first_time = 0.0
         self._last_tick = -1
         self._part = self.path.with_name(self.path.name + ".part")

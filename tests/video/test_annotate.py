@@ -89,13 +89,15 @@ def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
     assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
 
 
-def test_frames_keep_the_time_stamps_of_the_source(tmp_path):
-    times = [2.0, 2.04, 2.5, 2.52, 9.0]
-    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)) as video:
+@pytest.mark.parametrize(
+    ("rate", "times", "precision"), [(25, [2.0, 2.04, 2.5, 2.52, 9.0], 0.001), (1 / 3600, [2.0, 3602.0, 7202.0], 10)]
+)
+def test_frames_keep_the_time_stamps_of_the_source(tmp_path, rate, times, precision):
+    with VideoWriter(tmp_path / "out.mp4", rate, (64, 64)) as video:
         for time in times:
             video.write(np.zeros((64, 64, 3), np.uint8), time)
     with open_source(tmp_path / "out.mp4") as source:
-        assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=0.001)
+        assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=precision)
 
 
 @pytest.fixture
