@@ -20,12 +20,12 @@ _SHORTEST_BAR = 6
 
 def screen() -> Console:
     """The standard output, for tables."""
-    return Console(width=None if sys.stdout.isatty() else _WIDTH)
+    return Console(width=None if sys.stdout.isatty() else _WIDTH, markup=False, emoji=False)
 
 
 def messages() -> Console:
     """The standard error, for the progress, and lines of text above it."""
-    return Console(stderr=True, soft_wrap=True, highlight=False)
+    return Console(stderr=True, soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 def complain(problem: object) -> None:

@@ -258,6 +258,12 @@ def readable(path):
     return len(frames)
 
 
+def test_brackets_in_a_path_are_printed_as_they_are(video, succeed, tmp_path):
+    source, box = video
+    _, errors = succeed("track", source, "--box", box, "--end", 2, "--output", tmp_path / "[red]a[/b]")
+    assert "[red]a[/b]" in errors
+
+
 def test_a_model_does_not_replace_the_video_that_is_tracked(video, fail):
     source, box = video
     message = fail("track", source, "--box", box, "--save-model", source, "--overwrite")
