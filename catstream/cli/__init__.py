@@ -89,6 +89,9 @@ def main() -> None:
     except CatstreamError as error:
         complain(error)
         sys.exit(1)
+    except PermissionError as error:
+        complain(f"cannot use {error.filename!r} ({error.strerror}): change its permissions, or give another path")
+        sys.exit(1)
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import signal
 import time
@@ -262,6 +263,16 @@ def test_brackets_in_a_path_are_printed_as_they_are(video, succeed, tmp_path):
     source, box = video
     _, errors = succeed("track", source, "--box", box, "--end", 2, "--output", tmp_path / "[red]a[/b]")
     assert "[red]a[/b]" in errors
+
+
+def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tmp_path):
+    def denied(*_):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path))
+
+    monkeypatch.setattr(Path, "is_dir", denied)
+    code, _, errors = said("evaluate", tmp_path)
+    expected = f"cannot use {str(tmp_path)!r} (Permission denied): change its permissions, or give another path"
+    assert (code, errors) == (1, f"catstream: {expected}\n")
 
 
 def test_a_model_does_not_replace_the_video_that_is_tracked(video, fail):
