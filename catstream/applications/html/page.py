@@ -92,5 +92,5 @@ def write_page(path: Path, title: str, body: Iterable[str]) -> Path:
         + "\n</body></html>\n"
     )
     with writing(path):
-        write_atomically(path, page.encode())
+        write_atomically(path, page.encode(errors="surrogateescape"))
     return path

@@ -93,6 +93,15 @@ def test_the_frames_of_a_video_that_are_skipped_are_counted(run, video, model_fi
     assert list(catstream.find(model_files, tmp_path / "b.mp4", skip_damaged=True))
 
 
+def test_a_name_that_is_not_utf_8_stays_in_the_tables_and_the_report(run, video, tmp_path):
+    path = tmp_path / os.fsdecode(b"caf\xe9.mp4")
+    shutil.copy(video, path)
+    code, output = run(path)
+    assert code == 0, output
+    for name in ("sightings.csv", "report.html"):
+        assert b"caf\xe9.mp4" in (tmp_path / "found" / name).read_bytes()
+
+
 @pytest.mark.parametrize("sizes", ["2,1", "0,1", "1", "a,b", "1,nan"])
 def test_sizes_are_two_positive_numbers_in_order(run, video, sizes):
     code, output = run(video, "--sizes", sizes)
