@@ -32,8 +32,9 @@ class File:
     @property
     def signature(self) -> list[int]:
         """Number of files, their total size, and the newest time of modification: it differs if the file changed."""
-        states = [path.stat() for path in self.paths()]
-        return [len(states), sum(state.st_size for state in states), max(state.st_mtime_ns for state in states)]
+        states = [path.stat() for path in self.paths() if path.exists()]  # a dead link is a damaged image
+        newest = max((state.st_mtime_ns for state in states), default=0)
+        return [len(states), sum(state.st_size for state in states), newest]
 
     def frames(
         self,

@@ -57,6 +57,15 @@ def test_an_unreadable_image_is_reported_and_the_others_are_read(tree):
     assert "9.png" in problems[0]
 
 
+def test_a_link_to_an_image_that_is_gone_is_reported_and_the_others_are_read(tree):
+    (tree / "photos" / "8.png").symlink_to("gone.png")
+    file = File(tree / "photos", "images")
+    assert file.signature[0] == 3
+    found, problems = frames(file)
+    assert (len(found), len(problems)) == (3, 1)
+    assert "8.png" in problems[0]
+
+
 def test_a_single_image_is_one_frame(tree):
     (file,) = find_files([tree / "photos" / "10.png"])
     assert frames(file)[0] == [(0, "", (30, 30, 3))]
