@@ -252,7 +252,7 @@ def image_files(path: Path) -> list[Path]:
         If there are no images.
     """
     if path.is_dir():
-        files = [file for file in path.iterdir() if file.suffix.lower() in IMAGES]
+        files = _visible(path, IMAGES)
     elif number := re.search(r"%0?(\d*)d", path.name):
         digits = rf"\d{{{number[1]},}}" if number[1] else r"\d+"
         name = re.escape(path.name[: number.start()]) + digits + re.escape(path.name[number.end() :])
@@ -266,6 +266,11 @@ def image_files(path: Path) -> list[Path]:
     return sorted(files, key=natural_order)
 
 
+def _visible(folder: Path, kinds: set[str]) -> list[Path]:
+    """Return the files in a folder that have one of these suffixes and are not hidden."""
+    return [file for file in folder.iterdir() if file.suffix.lower() in kinds and not file.name.startswith(".")]
+
+
 def natural_order(path: Path) -> list[tuple[int, str]]:
     """Sort key by which 10 comes after 2."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
@@ -274,9 +279,9 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
 def _open_folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
     name = path.resolve().name
     for folder in (*(path / inner for inner in _FOLDERS), path):
-        if folder.is_dir() and any(file.suffix.lower() in IMAGES for file in folder.iterdir()):
+        if folder.is_dir() and _visible(folder, IMAGES):
             return images(name, image_files(folder))
-    videos = sorted(file for file in path.iterdir() if file.suffix.lower() in VIDEOS)
+    videos = _visible(path, VIDEOS)
     if len(videos) == 1:
         return video(videos[0])
     content = f"{len(videos)} videos" if videos else "neither images nor a video"

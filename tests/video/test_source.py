@@ -312,6 +312,13 @@ def test_a_folder_of_images_has_the_rate_that_is_given(images):
         assert [frame.time for frame in source] == [0.0, 0.1, 0.2]
 
 
+def test_hidden_files_do_not_hide_the_only_video(video, tmp_path):
+    video("a.avi", frames=2)
+    for name in ("._a.avi", "._cover.jpg"):  # as macOS writes them
+        (tmp_path / name).write_bytes(b"no video")
+    assert numbers(open_source(tmp_path)) == [0, 1]
+
+
 def test_a_file_address_names_a_file_of_this_machine(images):
     folder = images("a walk", ["0.png", "1.png"])
     assert numbers(open_source(folder.as_uri())) == [0, 1]
