@@ -273,7 +273,7 @@ def _visible(folder: Path, kinds: set[str]) -> list[Path]:
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
     """Sort key by which 10 comes after 2."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _open_folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:

@@ -319,6 +319,10 @@ def test_hidden_files_do_not_hide_the_only_video(video, tmp_path):
     assert numbers(open_source(tmp_path)) == [0, 1]
 
 
+def test_a_digit_that_is_no_decimal_one_is_a_letter(images):
+    assert numbers(open_source(images("walk", ["²2.png", "²10.png"]))) == [0, 1]
+
+
 def test_a_file_address_names_a_file_of_this_machine(images):
     folder = images("a walk", ["0.png", "1.png"])
     assert numbers(open_source(folder.as_uri())) == [0, 1]
