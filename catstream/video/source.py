@@ -320,6 +320,8 @@ def read_image(path: Path) -> np.ndarray | None:
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         return cv2.imread(str(path), cv2.IMREAD_COLOR)
+    except cv2.error:  # it states more pixels than OpenCV reads
+        return None
     finally:
         cv2.utils.logging.setLogLevel(level)
 

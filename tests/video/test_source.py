@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -321,6 +322,13 @@ def test_hidden_files_do_not_hide_the_only_video(video, tmp_path):
 
 def test_a_digit_that_is_no_decimal_one_is_a_letter(images):
     assert numbers(open_source(images("walk", ["²2.png", "²10.png"]))) == [0, 1]
+
+
+def test_an_image_of_more_pixels_than_opencv_reads_is_an_error(tmp_path):
+    blank = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
+    (tmp_path / "0.bmp").write_bytes(blank)
+    with pytest.raises(VideoError, match=r"cannot read the image .*0\.bmp"):
+        open_source(tmp_path)
 
 
 def test_a_file_address_names_a_file_of_this_machine(images):
