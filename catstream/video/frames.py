@@ -8,14 +8,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 if TYPE_CHECKING:
     from av import AudioStream, FFmpegError, VideoFrame, VideoStream
+    from av.container import InputContainer
 
-__all__ = ["RATE", "Frame", "Source", "UprightConverter", "ffmpeg_reason", "without_password"]
+__all__ = ["RATE", "Frame", "Source", "UprightConverter", "ffmpeg_reason", "video_stream", "without_password"]
 
 #: Frames per second of a source without time stamps, if none is given.
 RATE = 25.0
@@ -94,6 +95,11 @@ class UprightConverter:
     def __call__(self, frame: VideoFrame) -> np.ndarray:
         image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
         return np.ascontiguousarray(np.rot90(image, frame.rotation // 90))
+
+
+def video_stream(container: InputContainer) -> Any:
+    """Return the stream of the video, not that of a cover picture beside it; None if there is no video."""
+    return container.streams.best("video")
 
 
 def time_base(stream: VideoStream | AudioStream) -> Fraction:

@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from catstream.video.frames import ffmpeg_reason, time_base
+from catstream.video.frames import ffmpeg_reason, time_base, video_stream
 
 if TYPE_CHECKING:
     from av import AudioStream, Packet
@@ -47,7 +47,7 @@ class Sound:
             _log.warning("the sound of %s is left out: %s", path, error)
             source.close()
             return
-        picture = source.streams.video[0]
+        picture = video_stream(source)
         self._zero = float((picture.start_time or 0) * time_base(picture))
         self._source, self._container = source, container
         self._packets = source.demux(self._stream)

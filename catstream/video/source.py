@@ -37,7 +37,7 @@ import cv2
 import numpy as np
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, time_base
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, time_base, video_stream
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame, VideoStream
@@ -338,12 +338,11 @@ def _open_video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> S
         container = av.open(str(path.absolute()))
     except (av.FFmpegError, OSError) as error:
         raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_EXPECTED}") from None
+    stream = video_stream(container)
     # FFmpeg opens any text file as a video of its text (format "tty").
-    streams = container.streams.video
-    if not streams or streams[0].codec_context is None or container.format.name == "tty":
+    if stream is None or stream.codec_context is None or container.format.name == "tty":
         container.close()
         raise VideoError(f"there is no video in {str(path)!r}: {_EXPECTED}")
-    stream = streams[0]
     rate = float(stream.average_rate or stream.guessed_rate or RATE)
     stated, damage = stream.frames, _Damage(path, skip_damaged)
     images = _read_video(path, container, rate, range(sys.maxsize)[part], start, damage)
@@ -357,7 +356,7 @@ def _count_frames(path: Path, rate: float) -> int | None:
     import av
 
     with av.open(str(path.absolute())) as container:
-        stream = container.streams.video[0]
+        stream = video_stream(container)
         if path.stat().st_size > _MAX_COUNTED_BYTES:
             return round(_stated_duration(container, stream) * rate) or None
         count = 0
@@ -369,7 +368,7 @@ def _count_frames(path: Path, rate: float) -> int | None:
 def _read_video(
     path: Path, container: InputContainer, rate: float, wanted: range, start: int, damage: _Damage
 ) -> Generator[Frame]:
-    stream = container.streams.video[0]
+    stream = video_stream(container)
     stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
     number, time, zero, shape, upright = 0, 0.0, None, None, UprightConverter()
     with container:

@@ -14,6 +14,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.stream import Disposition
 
 from catstream.errors import VideoError
 from catstream.video.frames import Source
@@ -329,6 +330,24 @@ def test_an_image_of_more_pixels_than_opencv_reads_is_an_error(tmp_path):
     (tmp_path / "0.bmp").write_bytes(blank)
     with pytest.raises(VideoError, match=r"cannot read the image .*0\.bmp"):
         open_source(tmp_path)
+
+
+def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as container:
+        stream, cover = container.add_stream("mpeg4", rate=25), container.add_stream("mjpeg", rate=25)
+        cover.disposition = Disposition.attached_pic
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        cover.width, cover.height, cover.pix_fmt = 160, 120, "yuvj420p"
+        for each, number in ((stream, 7), (cover, 99)):
+            container.mux(each.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+        container.mux([*stream.encode(None), *cover.encode(None)])
+    data = path.read_bytes()
+    track, tags = data.index(b"trak") - 4, data.index(b"udta") - 4
+    path.write_bytes(data[:track] + data[tags:] + data[track:tags])
+    with open_source(path) as source:
+        assert source.frames == 1
+        assert numbers(source) == [7]
 
 
 def test_a_file_address_names_a_file_of_this_machine(images):
