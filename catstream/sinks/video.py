@@ -8,7 +8,7 @@ from pathlib import Path
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.video.annotate import draw, drawn_size
-from catstream.video.frames import RATE, Frame
+from catstream.video.frames import RATE, Frame, without_password
 from catstream.video.palette import Colours
 from catstream.video.source import is_live, open_source
 from catstream.video.writer import VideoWriter
@@ -35,7 +35,8 @@ class VideoSink:
     def __init__(self, path: Path, source: str, part: slice, image_rate: float = RATE) -> None:
         if is_live(source):
             raise VideoError(
-                f"a video needs to read its frames again, but {source} is live: record it, and give the file"
+                f"a video needs to read its frames again, but {without_password(source)} is live: "
+                "record it, and give the file"
             )
         # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
         self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True, resize=True)

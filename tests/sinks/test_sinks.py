@@ -207,7 +207,7 @@ def test_an_existing_file_is_not_overwritten(tmp_path, suffix):
         ("none/tracks.csv", None, "a folder that exists and that you may write to"),
         ("none/tracks.sqlite", None, "a folder that exists and that you may write to"),
         ("walk.mp4", None, "give their source"),
-        ("walk.mp4", "rtsp://127.0.0.1/cam", "is live"),
+        ("walk.mp4", "rtsp://me:secret@127.0.0.1/cam", r"again, but rtsp://127.0.0.1/cam is live"),
     ],
 )
 def test_an_output_that_cannot_be_written_is_rejected_before_any_work(tmp_path, name, source, words):

@@ -12,7 +12,7 @@ from typing import Literal
 from catstream.errors import VideoError
 from catstream.settings import RunSettings
 from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame
+from catstream.video.frames import Frame, without_password
 from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
 
 __all__ = ["File", "find_files"]
@@ -91,7 +91,9 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
     found: dict[File, None] = {}
     for path in paths:
         if is_live(str(path)):
-            raise VideoError(f"{path} is a live source: record it to a video first, and give the video")
+            raise VideoError(
+                f"{without_password(str(path))} is a live source: record it to a video first, and give the video"
+            )
         found |= dict.fromkeys(_files(Path(path)))
     return list(found)
 

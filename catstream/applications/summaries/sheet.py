@@ -17,6 +17,7 @@ from catstream.applications.summaries.taught import TaughtFrame
 from catstream.errors import VideoError
 from catstream.messages.storage import write_atomically, writing
 from catstream.video.annotate import thumbnail
+from catstream.video.frames import without_password
 from catstream.video.source import is_live, open_source
 
 __all__ = ["WIDTH", "Sheet", "json_beside", "pictures_of", "sheet_of_frames", "sheet_of_images"]
@@ -126,7 +127,7 @@ def pictures_of(frames: list[TaughtFrame], source: str, image_rate: float) -> di
         If the source is live, cannot be read, or has no frame at one of these times.
     """
     if is_live(source):
-        raise VideoError(f"{source!r} is a live source, and its frames were not kept")
+        raise VideoError(f"{without_password(source)!r} is a live source, and its frames were not kept")
     found: dict[int, bytes] = {}
     waiting = sorted(frames, key=lambda frame: -frame.time)
     with open_source(source, image_rate=image_rate, skip_damaged=True, resize=True) as images:

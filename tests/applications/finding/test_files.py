@@ -81,7 +81,12 @@ def test_a_changed_file_has_another_signature(tree):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("none.mp4", "no file or folder"), ("empty", "neither images nor videos"), ("0", "live"), ("rtsp://a/b", "live")],
+    [
+        ("none.mp4", "no file or folder"),
+        ("empty", "neither images nor videos"),
+        ("0", "live"),
+        ("rtsp://a:b@c/d", "rtsp://c/d is a live"),
+    ],
 )
 def test_what_cannot_be_searched_is_an_error(tmp_path, name, message, monkeypatch):
     (tmp_path / "empty").mkdir()

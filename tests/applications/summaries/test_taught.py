@@ -10,9 +10,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from catstream.applications.summaries.sheet import pictures_of
 from catstream.applications.summaries.taught import Novelty, TaughtFrame, most_taught, taught_frames
 from catstream.compression.tree import REDUCTIONS
-from catstream.errors import SettingsError
+from catstream.errors import SettingsError, VideoError
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
 from catstream.settings import CoresetSettings
@@ -87,3 +88,8 @@ def test_k_frames_are_selected_and_spread_over_the_run(novelties, k):
     assert len(chosen) == k
     assert all(later - earlier >= max(len(frames) // (2 * k), 1) for earlier, later in pairwise(chosen))
     assert int(np.argmax(novelties)) in chosen
+
+
+def test_the_error_of_a_live_source_has_no_password():
+    with pytest.raises(VideoError, match=r"^'rtsp://c/d' is a live source"):
+        pictures_of([], "rtsp://a:b@c/d", 25.0)
