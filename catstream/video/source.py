@@ -409,7 +409,7 @@ class _Damage:
         """
         if not self._skip:
             raise VideoError(
-                f"{str(self._path)!r} is damaged at frame {good} ({problem}): the frames before it are good; "
+                f"{str(self._path)!r} is damaged at frame {good} ({problem}): "
                 "--skip-damaged (run.skip_damaged=true) continues after the damage"
             )
 
