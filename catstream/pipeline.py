@@ -117,7 +117,7 @@ class Pipeline:
         resume contains no run or a damaged one.
     ServiceError
         At the start, if the endpoint or the state folder is in use, or if the pipeline has run already. While
-        iterating, if a process fails repeatedly.
+        iterating, if a process fails repeatedly, or another thread or task closes the pipeline.
     VideoError
         While iterating, if the source fails, after its last valid frame.
     """

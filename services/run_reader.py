@@ -21,7 +21,7 @@ from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import HEALTH, RESULTS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
-from catstream.wire.readable import Wait
+from catstream.wire.readable import Turns, Wait
 
 __all__ = ["RunReader"]
 
@@ -57,6 +57,7 @@ class RunReader:
         self._found = boxes | start.objects  # where each object was last
         self._rest: deque[Track] = deque()  # tracks of a frame that `next_track` has not returned yet
         self._checked = 0.0
+        self._turns = Turns("pipeline")
         self._processes = ExitStack()
         with ExitStack() as stack:
             window = job.settings.run.unstored_frames
@@ -95,6 +96,9 @@ class RunReader:
         VideoError
             At the end, if the source failed.
         """
+        return (yield from self._turns.run(self._next_frame(seconds)))
+
+    def _next_frame(self, seconds: float) -> Generator[Wait, None, dict[str, Track] | None]:
         deadline = monotonic() + seconds
         while self.end is None:
             tracks = self._receive()
@@ -106,7 +110,7 @@ class RunReader:
             if now >= deadline:
                 return {}
             if not self._incoming.pending():
-                yield Wait([self._incoming], min(TURN_SECONDS, deadline - now))
+                yield Wait([self._incoming.fileno()], min(TURN_SECONDS, deadline - now))
         yield from self._exit()
         if self.end.failed:
             raise VideoError(self.end.reason)
@@ -122,6 +126,7 @@ class RunReader:
 
     def stop(self) -> None:
         """End the processes in order, and receive what they still send, so that none waits for that."""
+        self._turns.close()
         with self._processes:
             self.receive_health()
 

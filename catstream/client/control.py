@@ -35,6 +35,8 @@ __all__ = ["Control", "control"]
 class Control:
     """Sends commands to one running pipeline; close it, or use it in a `with`. Several clients may connect at once.
 
+    A client is used by one thread at a time.
+
     Attributes
     ----------
     endpoint : str

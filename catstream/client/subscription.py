@@ -27,7 +27,7 @@ from catstream.messages.names import check_name
 from catstream.wire.channels import CHANNELS, TRACKS
 from catstream.wire.endpoint import Endpoint, find
 from catstream.wire.newest import GapCounter, Subscriber
-from catstream.wire.readable import Wait, finish, finish_async
+from catstream.wire.readable import Turns, Wait, finish, finish_async
 from catstream.wire.timing import CHECK_SECONDS, DRAIN_SECONDS, REPORT_SECONDS
 
 __all__ = ["AnyMessage", "Subscription", "subscribe", "wait_until_running"]
@@ -94,7 +94,7 @@ class Subscription(Generic[Message]):
     SilenceError
         During iteration, if no message arrived within `timeout`. Iteration may continue afterwards.
     ServiceError
-        During iteration, if the pipeline rejects the keys.
+        During iteration, if the pipeline rejects the keys, or the subscription is closed.
     """
 
     def __init__(
@@ -123,6 +123,7 @@ class Subscription(Generic[Message]):
         self._rejected = 0  # by the connections before this one
         self._connection: _Connection | None = None
         self._has_run = False  # whether the pipeline was there before
+        self._turns = Turns("subscription")
         self._stream = follow(endpoint, keys)
         if self._stream is not None:
             self._follow()
@@ -166,7 +167,8 @@ class Subscription(Generic[Message]):
         return self._rejected + (self._connection.messages.rejected if self._connection is not None else 0)
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect. A loop of another thread or task ends with a ServiceError."""
+        self._turns.close()
         self._disconnect()
         if self._stream is not None:
             self._stream.close()
@@ -181,7 +183,7 @@ class Subscription(Generic[Message]):
         return self
 
     def __next__(self) -> Message:
-        if (message := finish(self._next())) is None:
+        if (message := finish(self._turns.run(self._next()))) is None:
             raise StopIteration
         return message
 
@@ -189,7 +191,7 @@ class Subscription(Generic[Message]):
         return self
 
     async def __anext__(self) -> Message:
-        if (message := await finish_async(self._next())) is None:
+        if (message := await finish_async(self._turns.run(self._next()))) is None:
             raise StopAsyncIteration
         return message
 
@@ -209,10 +211,12 @@ class Subscription(Generic[Message]):
         self._has_run = True
         return message
 
-    def _sockets(self) -> list[Subscriber[Any] | FollowedStream]:
+    def _sockets(self) -> list[int]:
         """The sockets that are polled for messages."""
         sockets: list[Subscriber[Any] | FollowedStream] = [] if self._stream is None else [self._stream]
-        return sockets if self._connection is None else [*sockets, self._connection.messages, self._connection.ends]
+        if self._connection is not None:
+            sockets += [self._connection.messages, self._connection.ends]
+        return [socket.fileno() for socket in sockets]
 
     def _receive(self) -> Message | None:
         """Return the next message if one has arrived, without waiting."""

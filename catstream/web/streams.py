@@ -216,5 +216,5 @@ async def _newest_preview(endpoint: Endpoint) -> Preview | None:
 async def _next(previews: Subscriber[Preview], seconds: float) -> Preview | None:
     deadline = monotonic() + seconds
     while (preview := previews.receive(0)) is None and monotonic() < deadline:
-        await readable([previews], deadline - monotonic())
+        await readable([previews.fileno()], deadline - monotonic())
     return preview

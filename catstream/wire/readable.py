@@ -8,23 +8,63 @@ from __future__ import annotations
 
 import asyncio
 import select
+import threading
 from collections.abc import Generator, Sequence
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
-__all__ = ["Wait", "finish", "finish_async", "readable"]
+from catstream.errors import ServiceError
+
+__all__ = ["Turns", "Wait", "finish", "finish_async", "readable"]
 
 Result = TypeVar("Result")
 
 
-class _HasFileno(Protocol):
-    def fileno(self) -> int: ...
-
-
 class Wait(NamedTuple):
-    """A wait until something may have arrived at one of the sockets, or for so many seconds."""
+    """A wait until something may have arrived at one of the sockets (their descriptors), or for so many seconds."""
 
-    sockets: Sequence[_HasFileno]
+    sockets: Sequence[int]
     seconds: float
+
+
+class Turns:
+    """The turns of the loops that read the same sockets: one at a time, as ZeroMQ requires, and none once closed.
+
+    So any thread, task or signal handler may close the sockets while another one waits for them.
+
+    Parameters
+    ----------
+    owner : what has the sockets, for the error
+    """
+
+    def __init__(self, owner: str) -> None:
+        self._owner = owner
+        self._lock = threading.RLock()  # a signal handler may close in the middle of a turn
+        self._closed = False
+
+    def run(self, steps: Generator[Wait, None, Result]) -> Generator[Wait, None, Result]:
+        """The same steps, until they are closed.
+
+        Raises
+        ------
+        ServiceError
+            Once they are closed.
+        """
+        while True:
+            with self._lock:
+                if self._closed:
+                    raise ServiceError(
+                        f"the {self._owner} was closed, perhaps by another thread or task: make another one to go on"
+                    )
+                try:
+                    wait = next(steps)
+                except StopIteration as stop:
+                    return stop.value  # type: ignore[no-any-return]
+            yield wait
+
+    def close(self) -> None:
+        """Wait until a turn of another thread is over, and allow no further ones: the sockets can then be closed."""
+        with self._lock:
+            self._closed = True
 
 
 def finish(steps: Generator[Wait, None, Result]) -> Result:
@@ -34,7 +74,7 @@ def finish(steps: Generator[Wait, None, Result]) -> Result:
             sockets, seconds = next(steps)
             poller = select.poll()
             for socket in sockets:
-                poller.register(socket.fileno(), select.POLLIN)
+                poller.register(socket, select.POLLIN)
             poller.poll(seconds * 1000)
     except StopIteration as stop:
         return stop.value  # type: ignore[no-any-return]
@@ -49,17 +89,16 @@ async def finish_async(steps: Generator[Wait, None, Result]) -> Result:
         return stop.value  # type: ignore[no-any-return]
 
 
-async def readable(sockets: Sequence[_HasFileno], seconds: float) -> None:
+async def readable(sockets: Sequence[int], seconds: float) -> None:
     """Return once something may have arrived at one of the sockets, or after so many seconds."""
     loop, arrived = asyncio.get_running_loop(), asyncio.Event()
-    handles = [socket.fileno() for socket in sockets]
-    for handle in handles:
-        loop.add_reader(handle, arrived.set)
     try:
+        for socket in sockets:
+            loop.add_reader(socket, arrived.set)
         async with asyncio.timeout(seconds):
             await arrived.wait()
-    except TimeoutError:
+    except OSError:  # the time is over, or another thread has closed a socket
         pass
     finally:
-        for handle in handles:
-            loop.remove_reader(handle)
+        for socket in sockets:
+            loop.remove_reader(socket)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -155,6 +156,26 @@ def test_a_task_that_is_cancelled_ends_the_run_in_order(video, alive):
     asyncio.run(run())
     assert len(pids) == 3
     assert not any(map(alive, pids))
+
+
+@pytest.mark.parametrize("task", [False, True], ids=["thread", "task"])
+def test_a_loop_ends_with_an_error_if_another_thread_or_task_closes_the_pipeline(video, until, task):
+    def follow():
+        if task:
+            asyncio.run(follow_in_a_task())
+        else:
+            list(waiting)
+
+    async def follow_in_a_task():
+        async for _ in waiting:
+            raise AssertionError
+
+    with ThreadPoolExecutor() as pool, Pipeline(video[0], settings=SETTINGS) as waiting:  # without a box no track comes
+        loop = pool.submit(follow)
+        until(lambda: waiting.health)  # the loop has received it
+        waiting.close()
+        with pytest.raises(ServiceError, match="the pipeline was closed, perhaps by another thread or task"):
+            loop.result()
 
 
 def prints_well_and_is_ready_for_json(track):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,16 @@ def test_tracks_arrive_in_order_until_the_end(endpoint, tracks):
         assert subscription.end.totals == {"sent": 49}
         assert subscription.missed == 0
         assert list(subscription) == [], "it stays ended"
+
+
+def test_a_subscription_that_was_closed_is_read_no_more_also_by_another_thread(endpoint, tracks):
+    with attached(endpoint, tracks) as subscription, ThreadPoolExecutor() as pool:
+        loop = pool.submit(list, subscription)
+        subscription.close()
+        with pytest.raises(ServiceError, match="the subscription was closed"):
+            loop.result()
+        with pytest.raises(ServiceError, match="the subscription was closed"):
+            next(subscription)
 
 
 @pytest.mark.parametrize(
