@@ -87,3 +87,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'catstream' has no attribute {name!r}")
     return getattr(import_module(f"catstream.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """The public names too, for `help` and for completion, before their first use."""
+    return sorted({*globals(), *__all__})

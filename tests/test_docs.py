@@ -270,6 +270,10 @@ def test_the_version_is_the_same_everywhere():
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
 
 
+def test_every_name_of_the_library_is_completed_and_in_its_help_before_its_first_use():
+    assert set(dir(catstream)) >= {*catstream.__all__, "__doc__"}
+
+
 def test_every_name_of_the_library_is_in_the_reference_of_the_api():
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^::: catstream\.(\w+)", page, re.MULTILINE))
