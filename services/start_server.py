@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import atexit
 import errno
+import fcntl
 import gc
 import hashlib
 import json
@@ -282,8 +283,13 @@ def _imports() -> tuple[list[str], dict[str, str]]:
 
 def _start(requests: socket.socket, program: int, log: int | None, first: str = "") -> subprocess.Popen[bytes]:
     """Start the process of a server, which runs the statement `first` before anything else."""
-    main = f"{first}from catstream.services.start_server import main; main({requests.fileno()}, {program})"
-    return _run(python_command(main), requests.fileno(), log, "/", _MALLOC | environment())
+    # In a program that has closed its standard output, the socket may have its number: the server opens another there.
+    passed = fcntl.fcntl(requests, fcntl.F_DUPFD_CLOEXEC, 3)
+    try:
+        main = f"{first}from catstream.services.start_server import main; main({passed}, {program})"
+        return _run(python_command(main), passed, log, "/", _MALLOC | environment())
+    finally:
+        os.close(passed)
 
 
 def _run(

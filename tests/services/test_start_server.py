@@ -245,6 +245,24 @@ def test_nothing_outlives_a_program_that_is_killed(until):
     until(lambda: not server.is_running() or server.status() == psutil.STATUS_ZOMBIE)
 
 
+def test_a_program_that_has_closed_its_standard_streams_has_a_server_that_runs(tmp_path, folder):
+    job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"
+    program = f"""
+import os
+os.closerange(0, 3)
+from catstream.services.start_server import StartRequest, start_server
+from catstream.services.watchdog import Watchdog
+server = start_server()
+with open({str(log)!r}, "w+b") as log:
+    request = StartRequest.here("trainer", {str(job)!r}, restarted=False)
+    process = server.start(request, log.fileno(), Watchdog().handle)
+    pid = process.pid
+    process.close()
+os._exit(0 if pid else 1)
+"""
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
 def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own(server):
     reading, writing = os.pipe()
     if not (pid := os.fork()):
