@@ -146,7 +146,8 @@ class Pipeline:
             )
         start_server()  # it imports while this process opens the source
         self._resumed_job = Job.load(Path(resume)) if resume is not None else None
-        self._state = Path(state or resume or "") if state or resume else None
+        # Paths are absolute from the start: the program may change its current folder during the run.
+        self._state = Path(state or resume or "").absolute() if state or resume else None
         boxes = {} if box is None else boxes_by_name(box)
         models = {name: file.absolute() for name, file in files_by_name(model).items()}
         job = self._resumed_job or Job(started=time.time())
@@ -159,11 +160,11 @@ class Pipeline:
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
             results=job.results if results is None else results.after(job.results),
         )
-        saved_models = files_by_name(save_model)
+        saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
         for file in saved_models.values():
             if reason := why_not_writable(file):
                 raise ServiceError(reason)
-        self._record = Path(record) if record is not None else None
+        self._record = Path(record).absolute() if record is not None else None
         _check(job, self._record, is_new=self._resumed_job is None)
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
         image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
@@ -240,7 +241,7 @@ class Pipeline:
             endpoint=endpoint,
             owned=True,
             record=self._record,
-            state=self._state and self._state.absolute(),
+            state=self._state,
             resume=self._resumed_job is not None,
             since=time.monotonic() - max(0.0, time.time() - self._job.started),
         )

@@ -76,6 +76,21 @@ def test_a_file_address_is_stored_as_a_path_from_which_a_run_can_resume(video):
     assert Pipeline(Path(path).as_uri(), str(boxes[0])).source == str(path)
 
 
+def test_a_program_may_change_its_folder_during_a_run(video, tmp_path, monkeypatch):
+    path, boxes = video
+    begin, later = tmp_path / "begin", tmp_path / "later"
+    begin.mkdir()
+    later.mkdir()
+    monkeypatch.chdir(begin)
+    files = {"state": "state", "record": "run.mcap", "save_model": "m.safetensors"}
+    with Pipeline(path, boxes[0], SETTINGS, part=PART, **files) as pipeline:
+        monkeypatch.chdir(later)
+        assert len(list(pipeline)) == 20
+    assert pipeline.saved_models == [begin / "m.safetensors"]
+    assert {file.name for file in begin.iterdir()} == set(files.values())
+    assert not list(later.iterdir())
+
+
 def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
     assert (pipeline.pids, pipeline.restarts, pipeline.health) == ({}, 0, {})
     with pytest.raises(ServiceError, match="no endpoint before it has started"):
