@@ -267,8 +267,9 @@ class Pipeline:
 
     def __del__(self) -> None:
         if getattr(self, "_stack", None) not in (None, _CLOSED):
-            warnings.warn(f"{self!r} was not closed: use it in a `with`", ResourceWarning, source=self, stacklevel=1)
+            text = f"{self!r} was not closed: use it in a `with`"
             self.close()
+            warnings.warn(text, ResourceWarning, source=self, stacklevel=1)  # last: it may be an error
 
     def __repr__(self) -> str:
         life = "new" if self._stack is None else "closed" if self._stack is _CLOSED else f"at {self._endpoint}"

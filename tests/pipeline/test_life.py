@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -119,6 +121,18 @@ def test_a_pipeline_that_is_never_closed_causes_a_warning_and_ends(video, alive)
     with pytest.warns(ResourceWarning, match="was not closed"):
         forgotten = None
     assert forgotten is None
+    assert not any(map(alive, pids))
+
+
+def test_a_pipeline_that_is_never_closed_ends_also_if_a_warning_is_an_error(video, alive, monkeypatch):
+    path, boxes = video
+    forgotten = Pipeline(path, boxes[0], SETTINGS, part=PART).__enter__()
+    pids, errors = list(forgotten.pids.values()), []
+    monkeypatch.setattr(sys, "unraisablehook", lambda raised: errors.append(raised.exc_type))
+    with warnings.catch_warnings(action="error"):
+        forgotten = None
+    assert forgotten is None
+    assert errors == [ResourceWarning]
     assert not any(map(alive, pids))
 
 
