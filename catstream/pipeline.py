@@ -382,11 +382,6 @@ class Pipeline:
         return self.health.get("detector", {}).get("lost_seconds", 0.0)
 
     @property
-    def complete(self) -> bool:
-        """Whether the run to resume has already tracked all frames; valid before the start."""
-        return self._resumed_job is not None and self.frames is not None and self._start.seq >= self.frames
-
-    @property
     def holding(self) -> str:
         """Reason for which no frames are tracked: "paused", or "waiting" for a box; empty if they are tracked."""
         counters = self.health.get("detector") or self._held_at_start

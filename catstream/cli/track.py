@@ -230,9 +230,6 @@ def track(**options: Any) -> None:
         console.print(line)
     if request.resume is not None:
         pipeline = pipeline.starting_after(files.position())
-        if pipeline.complete:
-            console.print(_completed(request, pipeline, files))
-            return
     _Run(request, pipeline, files, console).execute()
 
 
@@ -265,18 +262,6 @@ def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
     yield from doubtful(request.boxes, *pipeline.size)
 
 
-def _completed(request: _Request, pipeline: Pipeline, files: RunFiles) -> str:
-    """Complete the files of a run to resume whose frames were all tracked; return the message about it."""
-    if not files.complete:
-        with files.opened(resume=True):  # creates new files, and those that are made at the end
-            pass
-    results = f", its results are in {files.output}" if files.output is not None else ""
-    return (
-        f"the run in {request.resume} is complete, all {pipeline.frames} frames were tracked{results}; "
-        "to track the source again, start a new run in another folder (--state DIR)"
-    )
-
-
 class _Run:
     """Runs the pipeline, writes its tracks to the files, and prints the progress and the results."""
 
@@ -294,7 +279,10 @@ class _Run:
                 self._print_summary()
         request, folder = self._request, self._request.folder
         if request.resume is not None and not self._progress.frames and not interrupted:
-            self._console.print(f"no frames were left to track: the run in {request.resume} is complete")
+            self._console.print(
+                f"no frames were left to track, the run in {request.resume} is complete: to track the source again, "
+                "start a new run in another folder (--state DIR)"
+            )
         saved = self._pipeline.saved_models
         for file in saved:
             self._console.print(f"saved model: {file}")

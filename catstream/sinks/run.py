@@ -102,14 +102,6 @@ class RunFiles:
             with writing(self.output, VideoError):
                 self.output.mkdir(parents=True, exist_ok=True)
 
-    @property
-    def complete(self) -> bool:
-        """Whether all files exist and are complete."""
-        files = [file for file in self.files if file != STDOUT]
-        if self.output is not None:
-            files += [self.output / file for file in results.result_files(self.name, self.names())]
-        return all(file.exists() for file in [*files, *([self._video_file()] if self.video else [])])
-
     def position(self) -> Position | None:
         """Return the position of the last frame that the files hold; None if no file holds all tracks."""
         if not self._logs():

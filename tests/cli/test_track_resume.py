@@ -178,13 +178,13 @@ def test_several_objects_have_a_row_each_in_each_frame_also_of_a_resumed_run_who
     assert ids == {(str(frame + 1), number) for frame in range(16) for number in ("1", "2")}
 
 
-def test_a_complete_run_is_not_resumed_and_that_is_reported(video, succeed, tmp_path):
+def test_a_complete_run_gets_no_further_rows_but_files_that_it_lacks_and_that_is_reported(video, succeed, tmp_path):
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
     succeed("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
     before = (out / "demo.csv").read_bytes()
     output, errors = succeed("track", "--resume", kept)
     assert not output
-    assert f"the run in {kept} is complete, all 6 frames were tracked, its results are in {out}" in errors
+    assert f"no frames were left to track, the run in {kept} is complete: to track the source again" in errors
     (out / "demo.txt").unlink()
     succeed("track", "--resume", kept, "--start", 0, "--end", 6)  # the same frames
     assert (out / "demo.csv").read_bytes() == before
