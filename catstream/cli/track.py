@@ -341,6 +341,8 @@ class _Run:
                 with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                     write(tracks, moment - before)
                     self._progress.show(progress, tracks)
+            if write is None and self._request.resume is not None:  # no frames were left, but a file may be new
+                stack.enter_context(self._files.opened(resume=True))
 
     def _print_summary(self) -> None:
         folder = [self._files.output] if self._files.output is not None else []
