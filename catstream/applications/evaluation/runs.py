@@ -28,7 +28,7 @@ from catstream.applications.evaluation.metrics import Score, score
 from catstream.applications.evaluation.peers import OPENCV
 from catstream.applications.evaluation.starts import Start
 from catstream.errors import CatstreamError, SettingsError, VideoError
-from catstream.messages.storage import writing
+from catstream.messages.storage import write_atomically, writing
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
@@ -102,7 +102,7 @@ def prepare_folder(output: Path, settings: Settings) -> None:
                 )
         else:
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+            write_atomically(file, (json.dumps(values, indent=1) + "\n").encode())
 
 
 def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
