@@ -108,7 +108,8 @@ def find_sequences(path: str | Path) -> list[Sequence]:
 
 
 def _sequences(folder: Path) -> list[Sequence]:
-    name = folder.resolve().name
+    target = folder.resolve()
+    name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
     rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
     # One of the two files of an OTB sequence with two objects is empty.
     rects = [file for file in rects if file.stat().st_size] or rects
@@ -118,7 +119,7 @@ def _sequences(folder: Path) -> list[Sequence]:
     for file, reader in (
         (folder / "gt.txt", _corners),
         (folder / "groundtruth.txt", _polygons),
-        (folder / f"{name}.txt", _rectangles),
+        (folder / f"{target.name}.txt", _rectangles),
     ):
         if file.is_file():
             return [_sequence(name, folder, file, reader)]

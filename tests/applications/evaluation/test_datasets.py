@@ -115,6 +115,15 @@ def test_a_folder_of_sequences_in_natural_order(tmp_path):
     assert [sequence.name for sequence in find_sequences(tmp_path)] == ["9_dog", "10_car", "img"]
 
 
+def test_folders_of_one_name_are_told_apart_by_the_names_of_their_links(tmp_path, monkeypatch):
+    for link in ("one", "two"):
+        place = folder(tmp_path / "data" / link / "walk", "walk.txt", "rgb", lines(TRUTH))
+        (tmp_path / link).symlink_to(place)
+        check(tmp_path / link, link)
+    monkeypatch.chdir(tmp_path / "one" / "rgb")
+    check(Path(".."))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
