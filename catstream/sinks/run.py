@@ -78,8 +78,10 @@ class RunFiles:
                 "or of another of that name: replace them all with --overwrite, or give another folder"
             )
         self.check_source_kept([*with_logs(self.files), *([self._video_file()] if self.video else [])])
-        if twice := [file for count, file in enumerate(self.files) if file in self.files[:count]]:
-            raise VideoError(f"{twice[0]} is named twice: give each file once")
+        own = [file for file in self._results() if self.video or file != self._video_file()]
+        places = [file.parent.resolve() / file.name for file in [*own, *self.files]]
+        if twice := [file for file in self.files if places.count(file.parent.resolve() / file.name) > 1]:
+            raise VideoError(f"{twice[0]} is named twice, or is a file of the results: give each file once")
         for file in with_logs(self.files):
             check_writable(file, may_exist=True, made=self.output)
             if exists(file) and not overwrite and file not in with_logs(known):

@@ -168,6 +168,7 @@ def test_existing_results_are_rejected_or_if_requested_replaced_together(files, 
         (["t.xls"], False, "ends with .ndjson"),
         (["none/t.csv"], False, "a folder that exists"),
         (["t.csv", "t.csv"], False, "named twice"),
+        (["t.csv", "../run/t.csv"], False, "named twice"),
         (["t.txt", "t.mp4"], True, "does not hold all tracks"),
         ([f"{'t' * 244}.csv"], False, "too long"),
     ],
@@ -175,6 +176,22 @@ def test_existing_results_are_rejected_or_if_requested_replaced_together(files, 
 def test_results_that_cannot_be_written_are_rejected_before_the_run(files, names, resumable, words):
     with pytest.raises(VideoError, match=words):
         files("run", names, output=False).check_writable(overwrite=False, resumable=resumable)
+
+
+@pytest.mark.parametrize("name", ["demo.txt", "demo.csv", "demo.mp4"])
+def test_a_file_of_the_results_is_given_to_no_other_format(files, name):
+    run = files("run", [f"out/../out/{name}"])
+    run.output.mkdir()
+    with pytest.raises(VideoError, match=f"{name} is named twice, or is a file of the results"):
+        run.check_writable(overwrite=True, resumable=False)
+
+
+def test_the_video_may_be_written_beside_results_that_have_none(files):
+    run = replace(files("run", ["out/demo.mp4"]), video=False)
+    run.check_writable(overwrite=True, resumable=False)
+    run.make_folder()
+    fill(run, 0, 3)
+    assert run.files[0].exists()
 
 
 def test_names_of_results_that_are_too_long_for_a_file_are_rejected_before_the_run(files, tmp_path):
