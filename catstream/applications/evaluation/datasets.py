@@ -112,7 +112,7 @@ def _sequences(folder: Path) -> list[Sequence]:
     name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
     rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
     # One of the two files of an OTB sequence with two objects is empty.
-    rects = [file for file in rects if file.stat().st_size] or rects
+    rects = [file for file in rects if not file.exists() or file.stat().st_size] or rects
     if rects:
         ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
         return [_sequence(name + end, folder, file, _rectangles) for file, end in zip(rects, ends, strict=True)]

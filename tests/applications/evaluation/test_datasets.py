@@ -148,6 +148,14 @@ def test_a_ground_truth_that_is_no_text_is_an_error(tmp_path):
         find_sequences(place)
 
 
+def test_a_ground_truth_that_is_a_link_to_nothing_is_an_error_of_one_line(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "")
+    (place / "groundtruth_rect.txt").unlink()
+    (place / "groundtruth_rect.txt").symlink_to("not-fetched")
+    with pytest.raises(VideoError, match=r"groundtruth_rect.txt' cannot be read .* No such file"):
+        find_sequences(tmp_path)
+
+
 def test_a_folder_without_sequences_is_an_error_with_the_layouts(tmp_path):
     for place in (tmp_path, tmp_path / "missing"):
         with pytest.raises(VideoError, match="groundtruth_rect"):
