@@ -250,8 +250,8 @@ def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None
     files.check_source_kept(request.saved.values())
     for file in request.saved.values():
         check_file(file, overwrite=request.overwrite, made=files.output)
-        if [*request.saved.values()].count(file) > 1:
-            raise ServiceError(f"{file} is named twice: give each object its own file")
+        if [*request.saved.values(), *request.write, request.record].count(file) > 1:
+            raise ServiceError(f"{file} is named twice: give each file once")
 
 
 def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:

@@ -184,6 +184,8 @@ REJECTED = {
     ),
     "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "give one of them"),
     "models of two objects in one file": (["--save-model", "a=m", "--save-model", "b=m"], "named twice"),
+    "a model and a recording in one file": (["--save-model", "m", "--record", "m"], "named twice"),
+    "a model and tracks in one file": (["--save-model", "m.csv", "--write", "m.csv"], "named twice"),
     "a model of several objects": (["--box", "a=1,2,30,40", "--box", "b=1,2,30,40", "--save-model", "m"], "NAME=FILE"),
     "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
     "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
