@@ -259,7 +259,7 @@ class TeachingSettings(_Group):
         ),
     ] = 0.9
     near_misses: Annotated[
-        int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0)
+        int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0, le=256)
     ] = 6
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
@@ -581,7 +581,7 @@ def _checked(name: str, value: object) -> object:
         value = value.item()
     try:
         checked = msgspec.convert(value, _kinds()[name])
-    except msgspec.ValidationError:
+    except (UnicodeEncodeError, msgspec.ValidationError):  # a byte of the command line that is not UTF-8
         raise _misfit(name, value) from None
     if isinstance(checked, float) and not math.isfinite(checked):
         raise _misfit(name, value)

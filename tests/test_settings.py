@@ -60,6 +60,8 @@ WAYS = {
         ("belief.trusted_score", float("inf"), "float"),
         ("run.lockstep", 7, "bool"),
         ("teaching.classifier", "wrong", "joint | least-squares | one-class"),
+        ("teaching.classifier", "\udcff", "joint | least-squares | one-class"),
+        ("teaching.near_misses", 257, "int >= 0, <= 256"),
     ],
 )
 def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(way, name, value, takes):
