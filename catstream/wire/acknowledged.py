@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 
 import zmq
 
+from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Position, Stored
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
@@ -70,9 +71,17 @@ class Sender(ChannelSocket[Message]):
         ------
         ValueError
             If the window is full.
+        ServiceError
+            If the message is larger than the channel takes: it would never arrive.
         """
         self.poll(0)
-        self.window.push(message.seq, self._encode(message))
+        data = self._encode(message)
+        if len(data) > self.channel.limit:
+            raise ServiceError(
+                f"a message of {self.channel.name} takes {len(data) >> 20} MiB, more than {self.channel.megabytes}: "
+                "follow fewer objects, or give a smaller coreset.size"
+            )
+        self.window.push(message.seq, data)
         self._transmit()
 
     def poll(self, seconds: float) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,12 @@ def test_a_full_window_accepts_no_more_messages(endpoint, until):
         receiver.acknowledge(Position(1))
         until(lambda: sender.window.stored == 1, lambda: sender.poll(0.05))
         sender.send(tracks(WINDOW + 1))
+
+
+def test_a_message_that_is_too_large_to_arrive_is_an_error_that_says_what_to_give(endpoint):
+    small = replace(RESULTS, megabytes=0)
+    with Sender(small, endpoint, WINDOW) as sender, pytest.raises(ServiceError, match=r"smaller coreset\.size"):
+        sender.send(tracks(1))
 
 
 def test_a_restarted_receiver_gets_all_that_was_not_stored(endpoint, until):
