@@ -231,9 +231,12 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
     Raises
     ------
     ServiceError
-        If another pipeline uses the folder, or other users may write to it.
+        If another pipeline uses the folder, or other users may write to it, or a file of the keys is damaged.
     """
     endpoint = Endpoint.parse(text or str(default), keys)
+    if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
+        endpoint.keys.listening()
+        endpoint.keys.client(endpoint.keys.public.decode())
     if endpoint.folder is None:  # the kernel gives a port to one process only
         with _noted(endpoint, default, source, fleet):
             yield endpoint

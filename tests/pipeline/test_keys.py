@@ -44,6 +44,16 @@ def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video,
     assert named <= set(NAMES)
 
 
+def test_a_pipeline_does_not_start_while_the_key_of_a_client_cannot_be_read(video, keys):
+    path, boxes = video
+    (keys / "clients" / "phone").write_bytes(b"")
+    with (
+        pytest.raises(ServiceError, match=r"clients/phone gives the role None"),
+        Pipeline(path, boxes[0], {"run.keys": str(keys)}),
+    ):
+        pass
+
+
 def received(subscription):
     """The next message, None if none arrives in time."""
     with suppress(SilenceError):
