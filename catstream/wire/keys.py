@@ -25,7 +25,7 @@ from typing import get_args
 import zmq
 
 from catstream.errors import ServiceError
-from catstream.messages.storage import create_atomically, write_atomically
+from catstream.messages.storage import create_atomically, write_atomically, writing
 from catstream.wire.channels import Role
 
 __all__ = [
@@ -180,14 +180,16 @@ def revoke(folder: Path, name: str) -> None:
     Raises
     ------
     ServiceError
-        If there is no client of that name, or it is the pipeline, which could not start any more.
+        If there is no client of that name, or it is the pipeline, which could not start any more, or its file cannot be
+        removed. That it is damaged is no obstacle.
     """
-    known = clients(folder)
+    known = [path.name for path in _listed(folder)]
     if name not in known:
         raise ServiceError(f"there is no client {name!r}: there are {', '.join(known)}")
     if name == _OWN:
         raise ServiceError(f"{name!r} is the key of the pipeline itself: to replace it, make keys in another folder")
-    (folder / _CLIENTS / name).unlink(missing_ok=True)
+    with writing(folder / _CLIENTS):
+        (folder / _CLIENTS / name).unlink(missing_ok=True)
 
 
 def allowed(folder: Path) -> dict[str, Client]:

@@ -255,6 +255,19 @@ def test_the_key_of_the_pipeline_itself_cannot_be_revoked(keys):
     assert clients(keys) == before
 
 
+@pytest.mark.parametrize("text", [b"", b"\xff"])
+def test_a_client_whose_file_is_damaged_can_be_revoked(keys, text):
+    (keys / "clients" / "helm").write_bytes(text)
+    revoke(keys, "helm")
+    assert "helm" not in clients(keys)
+
+
+def test_a_client_whose_file_cannot_be_removed_is_reported(keys):
+    (keys / "clients" / "other").mkdir()
+    with pytest.raises(ServiceError, match="cannot write"):
+        revoke(keys, "other")
+
+
 def test_a_revoked_client_receives_until_its_connection_ends_and_cannot_reconnect(keys, place, until):
     heard = []
     with Subscriber(TRACKS, place("watcher")) as reader:
