@@ -55,6 +55,7 @@ WAYS = {
         ("coreset.size", 1, "int >= 2, <= 4096"),
         ("coreset.size", 2.5, "int >= 2, <= 4096"),
         ("extent.size_count", -3, "int >= 1, <= 15"),
+        ("run.image_rate", 5e-324, "float >= 1e-09, <= 1000"),
         ("run.checkpoint_seconds", 0, "float > 0, <= 3600"),
         ("run.checkpoint_seconds", float("nan"), "float > 0, <= 3600"),
         ("belief.trusted_score", float("inf"), "float"),
