@@ -190,7 +190,7 @@ class CoresetTree:
             pending = arrays["pending"]
             tree._check(pending)
             tree._leaf, tree._filled = tree._checked(pending), len(pending)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"not the state of a coreset tree ({error!r}): use an older copy of the file") from None
         return tree
 

@@ -202,6 +202,12 @@ def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
     assert bits(tree) == before
 
 
+def test_a_state_whose_rows_are_no_table_is_rejected():
+    arrays, metadata = grown(np.ones((9, 6)), size=4).state()
+    with pytest.raises(ProtocolError, match="not the state of a coreset tree"):
+        CoresetTree.from_state(arrays | {"rows.0": arrays["rows.0"].reshape(-1)}, metadata)
+
+
 def test_trees_of_other_sizes_or_rows_are_rejected():
     tree = grown(np.ones((9, 6)), size=4)
     with pytest.raises(ProtocolError, match=r"size 4 .* size 5"):
