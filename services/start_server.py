@@ -283,7 +283,7 @@ def _imports() -> tuple[list[str], dict[str, str]]:
 
 def _start(requests: socket.socket, program: int, log: int | None, first: str = "") -> subprocess.Popen[bytes]:
     """Start the process of a server, which runs the statement `first` before anything else."""
-    # In a program that has closed its standard output, the socket may have its number: the server opens another there.
+    # If the program has closed its standard output, the socket may have its number, where the server opens a file.
     passed = fcntl.fcntl(requests, fcntl.F_DUPFD_CLOEXEC, 3)
     try:
         main = f"{first}from catstream.services.start_server import main; main({passed}, {program})"

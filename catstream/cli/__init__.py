@@ -90,6 +90,8 @@ def main() -> None:
         complain(error)
         sys.exit(1)
     except PermissionError as error:
+        if error.filename is None:  # it is about no file
+            raise
         complain(f"cannot use {error.filename!r} ({error.strerror}): change its permissions, or give another path")
         sys.exit(1)
     except OSError as error:

@@ -181,7 +181,7 @@ def revoke(folder: Path, name: str) -> None:
     ------
     ServiceError
         If there is no client of that name, or it is the pipeline, which could not start any more, or its file cannot be
-        removed. That it is damaged is no obstacle.
+        removed. A damaged file can be.
     """
     known = [path.name for path in _listed(folder)]
     if name not in known:

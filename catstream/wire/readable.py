@@ -33,7 +33,7 @@ class Turns:
 
     Parameters
     ----------
-    owner : what has the sockets, for the error
+    owner : what the sockets belong to, named in the error: "pipeline"
     """
 
     def __init__(self, owner: str) -> None:
@@ -42,12 +42,12 @@ class Turns:
         self._closed = False
 
     def run(self, steps: Generator[Wait, None, Result]) -> Generator[Wait, None, Result]:
-        """The same steps, until they are closed.
+        """Run the steps, one turn of the lock for each; yields their waits, and returns their result.
 
         Raises
         ------
         ServiceError
-            Once they are closed.
+            Once `close` was called.
         """
         while True:
             with self._lock:

@@ -29,7 +29,7 @@ from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejects
 
 WINDOW = 4
-CLIENTS = {"watcher": "watch", "helm": "control", "host": "pipeline"}  # name and role of some
+CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # name and role of some
 WATCHED = [name for name, channel in CHANNELS.items() if channel.role == "watch"]
 
 #: Of each channel, who has no place there.
@@ -135,8 +135,8 @@ def test_keys_are_not_written_over(keys):
         create(keys)
     with pytest.raises(ServiceError, match="not written over"):
         allow(keys, "other", "watch", output=keys.parent / "watcher")
-    with pytest.raises(ServiceError, match="a client helm already"):
-        allow(keys, "helm", "control", output=keys.parent / "other")
+    with pytest.raises(ServiceError, match="a client operator already"):
+        allow(keys, "operator", "control", output=keys.parent / "other")
     assert before == {path: path.read_bytes() for path in keys.parent.glob("**/*") if path.is_file()}
 
 
@@ -187,13 +187,13 @@ def test_a_client_that_may_watch_receives_messages(name, place, listener, until)
 
 
 def test_a_client_that_may_send_commands_receives_answers(place, until):
-    with Responder(CONTROL, place()) as detector, Requester(CONTROL, place("helm")) as helm:
+    with Responder(CONTROL, place()) as detector, Requester(CONTROL, place("operator")) as operator:
         answers = []
 
         def turn():
             for command in detector.receive_all():
                 detector.answer(Answer(command.id, True, "", 1))
-            answers.append(helm.ask(Command("1", "pause"), 0.2))
+            answers.append(operator.ask(Command("1", "pause"), 0.2))
 
         turn()
         until(lambda: answers[-1] is not None, turn)
@@ -257,9 +257,9 @@ def test_the_key_of_the_pipeline_itself_cannot_be_revoked(keys):
 
 @pytest.mark.parametrize("text", [b"", b"\xff"])
 def test_a_client_whose_file_is_damaged_can_be_revoked(keys, text):
-    (keys / "clients" / "helm").write_bytes(text)
-    revoke(keys, "helm")
-    assert "helm" not in clients(keys)
+    (keys / "clients" / "operator").write_bytes(text)
+    revoke(keys, "operator")
+    assert "operator" not in clients(keys)
 
 
 def test_a_client_whose_file_cannot_be_removed_is_reported(keys):
@@ -300,8 +300,8 @@ def test_a_client_that_is_allowed_later_needs_no_restart(keys, place, until):
 
 def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_afterwards(keys, place, until):
     heard, before = [], rejected("unreadable")
-    good = (keys / "clients" / "helm").read_bytes()
-    (keys / "clients" / "helm").write_bytes(b"role = ")
+    good = (keys / "clients" / "operator").read_bytes()
+    (keys / "clients" / "operator").write_bytes(b"role = ")
     with Publisher(TRACKS, place()) as tracks, Subscriber(TRACKS, place("watcher")) as reader:
 
         def turn():
@@ -310,7 +310,7 @@ def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_after
 
         until(lambda: rejected("unreadable") > before, turn)
         assert not heard
-        (keys / "clients" / "helm").write_bytes(good)
+        (keys / "clients" / "operator").write_bytes(good)
         until(lambda: heard, turn)
 
 

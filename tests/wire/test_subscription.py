@@ -75,7 +75,7 @@ def test_tracks_arrive_in_order_until_the_end(endpoint, tracks):
         assert list(subscription) == [], "it stays ended"
 
 
-def test_a_subscription_that_was_closed_is_read_no_more_also_by_another_thread(endpoint, tracks):
+def test_a_closed_subscription_ends_its_loops_with_an_error_in_other_threads_too(endpoint, tracks):
     with attached(endpoint, tracks) as subscription, ThreadPoolExecutor() as pool:
         loop = pool.submit(list, subscription)
         subscription.close()
