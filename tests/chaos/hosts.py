@@ -70,11 +70,15 @@ class Hosts:
 
     def _plug_in(self, name: str) -> None:
         host, port = self._named(name), ["-n", self._named("switch"), "link"]
-        self._ip(*port, "add", name, "type", "veth", "peer", "name", "eth0", "netns", host)
+        self._ip(*port, "add", name, "type", "veth", "peer", "name", "eth0", "address", self._mac(name), "netns", host)
         self._ip(*port, "set", name, "master", "bridge", "up")
         self._ip("-n", host, "address", "add", f"{self.addresses[name]}/24", "dev", "eth0")
         for device in ("eth0", "lo"):
             self._ip("-n", host, "link", "set", device, "up")
+
+    def _mac(self, name: str) -> str:
+        """A host keeps it when it restarts, as real ones do: others would send to the old one for a minute or two."""
+        return f"02:00:00:00:00:{list(self.addresses).index(name):02x}"
 
     def _namespace(self, stack: ExitStack, name: str) -> None:
         self._ip("netns", "add", self._named(name))

@@ -22,6 +22,19 @@ pytestmark = pytest.mark.system
 CUT_SECONDS = 2.0
 
 
+@pytest.fixture(scope="session")
+def video(demo_video):
+    """As in the other tests, but longer: it must not be over before a host is disturbed."""
+    path, boxes = demo_video(400)
+    return str(path), boxes
+
+
+@pytest.fixture(scope="session")
+def calm(video):
+    path, boxes = video
+    return chaos.undisturbed(path, {chaos.FIRST: boxes[0]})
+
+
 @pytest.fixture
 def hosts():
     """One for each process, and one of somebody who watches."""
@@ -45,6 +58,8 @@ def start(video, hosts, tmp_path):
         f"run.endpoint={endpoint}",
         "--set",
         "run.lockstep=true",
+        "--set",
+        "run.checkpoint_seconds=0.1",
         "--set",
         f"run.keys={tmp_path / 'keys'}",
     ]
