@@ -35,7 +35,7 @@ def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before t
     started = []
 
     def trainer(job=None):
-        file = job or Job(endpoint=str(folder)).save(tmp_path)
+        file = job or saved_job(folder, tmp_path, len(started))
         log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog()
         request = StartRequest.here("trainer", file, restarted=False)
         process = start_server().start(request, log.fileno(), watchdog.handle)
@@ -47,6 +47,22 @@ def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before t
         process.close()
         watchdog.close()
         log.close()
+
+
+@pytest.fixture
+def node():
+    """A process that a shared server ends with."""
+    process = subprocess.Popen(["sleep", "600"])
+    yield process
+    process.kill()
+    process.wait()
+
+
+def saved_job(folder, tmp_path, number):
+    """The file of a job with an endpoint of its own: a second trainer at the same one would end."""
+    (folder / str(number)).mkdir()
+    (tmp_path / str(number)).mkdir()
+    return Job(endpoint=str(folder / str(number))).save(tmp_path / str(number))
 
 
 def opened(pid):
@@ -146,22 +162,18 @@ def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_start_right_after_a_server_was_killed_does_not_reach_that_server(server, start, monkeypatch, shared):
+def test_a_start_right_after_a_server_was_killed_does_not_reach_that_server(server, start, node, monkeypatch, shared):
     """Its sockets are open until the kernel has closed them all."""
-    with subprocess.Popen(["sleep", "600"]) as node:
-        try:
-            if shared:
-                server.close()
-                monkeypatch.setattr(module, "_shared_with", node.pid)
-            for _ in range(3):
-                process, killed = start()[0], start_server().pid
-                assert process.pid
-                os.kill(killed, signal.SIGKILL)
-                assert process.wait(60)
-                assert start()[0].pid
-                assert start_server().pid != killed
-        finally:
-            node.kill()
+    if shared:
+        server.close()
+        monkeypatch.setattr(module, "_shared_with", node.pid)
+    for _ in range(3):
+        process, killed = start()[0], start_server().pid
+        assert process.pid
+        os.kill(killed, signal.SIGKILL)
+        assert process.wait(60)
+        assert start()[0].pid
+        assert start_server().pid != killed
 
 
 def test_a_process_that_nobody_waits_for_any_more_is_killed(start, until):
@@ -296,11 +308,10 @@ time.sleep(600)
 @pytest.fixture
 def sharing(folder, tmp_path):
     """Starts a program that shares a server with others, and a process of it; both of them."""
-    file = Job(endpoint=str(folder)).save(tmp_path)
     programs = []
 
     def start(program):
-        words = [sys.executable, "-c", SHARING, str(program), str(file)]
+        words = [sys.executable, "-c", SHARING, str(program), str(saved_job(folder, tmp_path, len(programs)))]
         variables = dict(sorted(os.environ.items(), reverse=bool(len(programs) % 2)))  # their order does not matter
         programs.append(subprocess.Popen(words, env=variables, stdout=subprocess.PIPE, text=True))
         return programs[-1], psutil.Process(int(programs[-1].stdout.readline()))
@@ -315,40 +326,35 @@ def has_ended(process):
     return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
-def test_programs_share_a_server_that_ends_with_the_process_that_they_name(sharing, until):
-    with subprocess.Popen(["sleep", "600"]) as node:
-        first, one = sharing(node.pid)
-        second, other = sharing(node.pid)
-        server = one.parent()
-        assert other.ppid() == server.pid
-        assert server.ppid() not in (first.pid, second.pid), "it outlives each of them"
-        first.kill()
-        until(lambda: has_ended(one))
-        assert not has_ended(other)
-        third, another = sharing(node.pid)
-        assert another.ppid() == server.pid
-        node.kill()
-        until(lambda: has_ended(server) and has_ended(other) and has_ended(another))
-        assert (second.poll(), third.poll()) == (None, None)
+def test_programs_share_a_server_that_ends_with_the_process_that_they_name(sharing, node, until):
+    first, one = sharing(node.pid)
+    second, other = sharing(node.pid)
+    server = one.parent()
+    assert other.ppid() == server.pid
+    assert server.ppid() not in (first.pid, second.pid), "it outlives each of them"
+    first.kill()
+    until(lambda: has_ended(one))
+    assert not has_ended(other)
+    third, another = sharing(node.pid)
+    assert another.ppid() == server.pid
+    node.kill()
+    until(lambda: has_ended(server) and has_ended(other) and has_ended(another))
+    assert (second.poll(), third.poll()) == (None, None)
 
 
 def test_a_shared_server_that_a_signal_has_stopped_is_killed_if_a_process_waits_for_its_start(
-    server, start, monkeypatch, until
+    server, start, node, monkeypatch, until
 ):
     server.close()
-    with subprocess.Popen(["sleep", "600"]) as node:
-        try:
-            monkeypatch.setattr(module, "_shared_with", node.pid)
-            shared = psutil.Process(start()[0].pid).parent()
-            assert shared.pid == start_server().pid != node.pid
-            shared.suspend()
-            process, _, _ = start()
-            assert process.pid == 0
-            assert process.poll() == -signal.SIGKILL
-            until(lambda: has_ended(shared))
-            assert psutil.Process(start()[0].pid).ppid() == start_server().pid != shared.pid
-        finally:
-            node.kill()
+    monkeypatch.setattr(module, "_shared_with", node.pid)
+    shared = psutil.Process(start()[0].pid).parent()
+    assert shared.pid == start_server().pid != node.pid
+    shared.suspend()
+    process, _, _ = start()
+    assert process.pid == 0
+    assert process.poll() == -signal.SIGKILL
+    until(lambda: has_ended(shared))
+    assert psutil.Process(start()[0].pid).ppid() == start_server().pid != shared.pid
 
 
 def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
@@ -360,30 +366,27 @@ def test_a_shared_server_whose_process_has_ended_before_it_started_ends_too():
     assert server.wait(60) == 0
 
 
-def test_a_start_server_of_another_user_is_not_used(monkeypatch):
+def test_a_start_server_of_another_user_is_not_used(node, monkeypatch):
     """This process takes itself for one of another user than the server that it reaches."""
     monkeypatch.setattr(module, "_servers", [])
     monkeypatch.setattr(module.os, "getuid", lambda: 12345)
-    with subprocess.Popen(["sleep", "600"]) as node:
-        monkeypatch.setattr(module, "_shared_with", node.pid)
-        with pytest.raises(PermissionError, match="of another user"):
-            module._connected(node.pid)
-        own = start_server()
-        assert psutil.Process(own.pid).ppid() == os.getpid()
-        own.close()
-        node.kill()
+    monkeypatch.setattr(module, "_shared_with", node.pid)
+    with pytest.raises(PermissionError, match="of another user"):
+        module._connected(node.pid)
+    own = start_server()
+    assert psutil.Process(own.pid).ppid() == os.getpid()
+    own.close()
 
 
-def test_a_shared_server_counts_as_ending_before_its_sockets_close(server, monkeypatch):
+def test_a_shared_server_counts_as_ending_before_its_sockets_close(server, node, monkeypatch):
     """Otherwise the second attempt of a start reaches the same server as the first one."""
     server.close()
-    with subprocess.Popen(["sleep", "600"]) as node:
-        monkeypatch.setattr(module, "_shared_with", node.pid)
-        shared = start_server()
-        node.kill()
-        shared._requests.settimeout(60)
-        assert shared._requests.recv(1) == b""
-        assert not shared.is_usable
+    monkeypatch.setattr(module, "_shared_with", node.pid)
+    shared = start_server()
+    node.kill()
+    shared._requests.settimeout(60)
+    assert shared._requests.recv(1) == b""
+    assert not shared.is_usable
 
 
 @pytest.mark.parametrize("reaped", [True, False])
