@@ -84,6 +84,8 @@ def group() -> None:
 def main() -> None:
     """Run the command line. The exit code is 1 after an error, which is one line, and `INTERRUPTED` after Ctrl-C."""
     INTERRUPTS.install()
+    if sys.stdout is None:  # it was closed before the start (>&-): what is printed is dropped
+        sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     try:
         group(prog_name="catstream")
     except CatstreamError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -67,3 +68,9 @@ def test_output_for_which_the_disk_has_no_room_is_one_line_of_error(catstream, w
         process = catstream(*words, stdout=full)
         assert process.communicate(timeout=60)[1] == "catstream: cannot write any more: No space left on device\n"
     assert process.returncode == 1
+
+
+def test_what_is_printed_to_an_output_that_was_closed_is_dropped(program):
+    closed = ["sh", "-c", 'exec "$@" >&-', "sh", *program, "settings"]
+    process = subprocess.run(closed, stderr=subprocess.PIPE, text=True, check=False)
+    assert (process.returncode, process.stderr) == (0, "")
