@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
@@ -16,6 +17,8 @@ from catstream.video.frames import Frame, without_password
 from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
 
 __all__ = ["File", "find_files"]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +120,9 @@ def _files_below(folder: Path) -> Iterator[File]:
         yield File(folder, "images")
     for entry in entries:
         if entry.is_dir() and not entry.is_symlink():
-            yield from _files_below(entry)
+            try:
+                yield from _files_below(entry)
+            except PermissionError as error:
+                _log.warning("%s is left out (%s)", error.filename, error.strerror)
         elif entry.suffix.lower() in VIDEOS and entry.is_file():
             yield File(entry, "video")

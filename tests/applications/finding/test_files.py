@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 
 import cv2
@@ -41,6 +42,19 @@ def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
     found = find_files([tree, tree / "clips" / "a.mp4"])
     kinds = [(str(file.path.relative_to(tree)), file.kind) for file in found]
     assert kinds == [("clips/a.mp4", "video"), ("clips/deep/b.MP4", "video"), ("photos", "images")]
+
+
+def test_a_subfolder_that_may_not_be_read_is_reported_and_the_others_are_searched(tree, monkeypatch, caplog):
+    listed = type(tree).iterdir
+
+    def iterdir(folder):
+        if folder.name == "deep":
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(type(tree), "iterdir", iterdir)
+    assert [file.path.name for file in find_files([tree])] == ["a.mp4", "photos"]
+    assert caplog.messages == [f"{tree / 'clips' / 'deep'} is left out (Permission denied)"]
 
 
 def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
