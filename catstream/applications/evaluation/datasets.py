@@ -16,6 +16,7 @@ which start at 1, are not shifted.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ __all__ = ["Sequence", "find_sequences"]
 #: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
 #: boxes.
 _FIRST_FRAMES = {("david", 471): 299}
+_RECT = re.compile(r"groundtruth_rect(\.\d+)?")  # others beside it, such as groundtruth_rect_old, are of no sequence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +112,7 @@ def find_sequences(path: str | Path) -> list[Sequence]:
 def _sequences(folder: Path) -> list[Sequence]:
     target = folder.resolve()
     name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
-    rects = sorted(folder.glob("groundtruth_rect*.txt"), key=natural_order)
+    rects = [file for file in sorted(folder.glob("*.txt"), key=natural_order) if _RECT.fullmatch(file.stem)]
     # One of the two files of an OTB sequence with two objects is empty.
     rects = [file for file in rects if not file.exists() or file.stat().st_size] or rects
     if rects:

@@ -62,6 +62,12 @@ def test_an_otb_object_without_ground_truth_is_no_sequence(tmp_path):
     check(place)
 
 
+def test_a_file_that_is_only_named_like_a_ground_truth_is_of_no_sequence(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH))
+    (place / "groundtruth_rect_old.txt").write_text(lines(TRUTH + 1))
+    check(place)
+
+
 def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
     boxes = np.tile(TRUTH[:1], (471, 1))
     (tmp_path / "David").mkdir()
