@@ -159,18 +159,22 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
 
 def _of_job(job: Job, count: int, name: str | None, console: Console) -> Sheet:
     with tempfile.TemporaryDirectory(prefix="catstream-summary-") as folder:
-        return _of_recording(_tracked(job, Path(folder), console), count, name, job.source, console)
+        return _of_recording(_tracked(job, name, Path(folder), console), count, name, job.source, console)
 
 
-def _tracked(job: Job, folder: Path, console: Console) -> Recording:
+def _tracked(job: Job, name: str | None, folder: Path, console: Console) -> Recording:
     """Track the source of a job, and record it."""
     from catstream.pipeline import Pipeline
     from catstream.video.source import is_live
 
     if is_live(job.source):
         raise VideoError("a live source cannot be tracked again: record it with `catstream track --record`")
-    if not job.boxes and not job.models:
-        raise SettingsError("the objects of this run were given by commands: record it with `catstream track --record`")
+    given = [*job.boxes, *job.models]
+    if not given or name not in (None, *given):
+        raise SettingsError(
+            f"the objects at the start of this run are: {listed(given)}; "
+            "for one that was added by a command, record the run with `catstream track --record`"
+        )
     file = folder / f"run{_RECORDING}"
     with (
         Pipeline(job.source, job.boxes, job.settings, model=job.models, part=job.part, record=file) as pipeline,

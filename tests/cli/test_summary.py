@@ -117,9 +117,12 @@ def test_an_object_that_is_not_in_the_run_is_an_error(whole_run, fail, tmp_path)
     assert "the objects of this run are: the object without a name; give one of them with --object NAME" in error
 
 
-def test_a_run_whose_objects_were_given_by_commands_is_not_tracked_again(video, fail, tmp_path):
-    Job(video[0]).save(tmp_path)
-    assert "record it with `catstream track --record`" in fail("summary", tmp_path, cwd=tmp_path)
+@pytest.mark.parametrize(("boxes", "began"), [({}, "none"), ({"anna": "1,2,30,40"}, "anna")])
+def test_an_object_that_was_given_by_a_command_is_not_tracked_again(boxes, began, video, fail, tmp_path):
+    Job(video[0], boxes_by_name(boxes)).save(tmp_path)
+    error = fail("summary", tmp_path, *(["--object", "ben"] if boxes else []), cwd=tmp_path)
+    assert f"the objects at the start of this run are: {began}; " in error
+    assert "record the run with `catstream track --record`" in error
 
 
 def test_an_interrupt_leaves_no_file(folder, said, tmp_path, monkeypatch):
