@@ -299,7 +299,8 @@ class _Run:
     def _run(self) -> bool:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
         try:
-            with self._pipeline, ExitStack() as stack:
+            # The files are closed after the processes, which would track on meanwhile, for none of them.
+            with ExitStack() as files, self._pipeline, ExitStack() as stack:
                 self._files.make_folder()
                 if self._request.view is not None:
                     self._serve(self._request.view, stack)
@@ -308,7 +309,7 @@ class _Run:
                 elif self._pipeline.holding:
                     place = f"--endpoint {self._pipeline.endpoint}"
                     self._console.print(f"paused, as it was before: to continue, catstream resume {place}")
-                self._write_tracks()
+                self._write_tracks(files)
         except KeyboardInterrupt:
             return True
         return False
@@ -329,9 +330,9 @@ class _Run:
         page = "the page" if self._request.view is not None else f"the page of catstream view {place}"
         return f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
 
-    def _write_tracks(self) -> None:
-        """Write every track to all files, and show the progress."""
-        with self._progress.progress(self._console) as progress, ExitStack() as stack:
+    def _write_tracks(self, stack: ExitStack) -> None:
+        """Write every track to all files, which the stack closes, and show the progress."""
+        with self._progress.progress(self._console) as progress:
             write: Callable[[Mapping[str, Track], float], None] | None = None
             moment = time.perf_counter()
             for tracks in self._pipeline.by_frame():

@@ -16,9 +16,11 @@ import psutil
 import pytest
 from pyarrow import parquet
 
+from catstream.cli.progress import RunProgress
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
+from catstream.sinks.lines import LineFile
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.txt", "demo_confidence.value", "demo_time.txt"]
@@ -291,6 +293,20 @@ def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video,
     assert "saved model:" not in errors
     assert "nothing was learned" in errors
     assert errors.endswith(f"stopped: the results so far are kept; not saved: {tmp_path / 'model'}\n")
+
+
+def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, said, monkeypatch, tmp_path):
+    tracking, close = [], LineFile.close
+
+    def closed(sink):
+        tracking.extend(each for each in psutil.Process().children(recursive=True) if each.name() == "detector")
+        close(sink)
+
+    monkeypatch.setattr(RunProgress, "show", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(LineFile, "close", closed)
+    source, box = video
+    code, _, errors = said("track", source, "--box", box, "--write", tmp_path / "t.ndjson")
+    assert (code, tracking) == (130, []), errors
 
 
 def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_after_it(
