@@ -210,7 +210,10 @@ class DetectorLoop:
                 resize=settings.run.resize,
             )
         )
-        return self._source if self._source.live else stack.enter_context(closing(read_ahead(self._source)))
+        if not self._source.live:
+            return stack.enter_context(closing(read_ahead(self._source)))
+        self._source.size = job.size or self._source.size  # a camera may have another one than when the run began
+        return self._source
 
     def _idle(self) -> bool:
         """One turn while a live source provides no frame; returns whether to stop waiting."""
