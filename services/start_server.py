@@ -591,4 +591,6 @@ def run_started(name: str, job: str, restarted: bool, parent: int, watchdog: int
     limit_process()  # before anything imports numpy
     from catstream.services.loop import run
 
-    sys.exit(run(name, Path(job), parent, watchdog, restarted=restarted))
+    code = run(name, Path(job), parent, watchdog, restarted=restarted)
+    atexit._run_exitfuncs()
+    os._exit(code)  # without the end of the interpreter, after which the thread of a source that hangs would crash

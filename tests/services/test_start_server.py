@@ -397,3 +397,20 @@ def test_a_program_whose_partner_has_ended_has_a_server_of_its_own(reaped, shari
             node.wait()
         program, process = sharing(node.pid)
         assert process.parent().ppid() == program.pid
+
+
+ENDS = """
+import atexit, ctypes, os
+from catstream.services import loop, start_server
+
+loop.run = lambda *_, **__: 3
+atexit.register(print, "the rest is transmitted", flush=True)
+late = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_void_p)(lambda *_: None)
+ctypes.CDLL(None).on_exit(late, None)
+start_server.run_started("detector", "job", False, os.getppid(), 0)
+"""
+
+
+def test_a_process_ends_normally_although_c_code_calls_python_after_the_end_as_the_thread_of_a_hanging_source_does():
+    ended = subprocess.run([sys.executable, "-P", "-c", ENDS], capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout) == (3, "the rest is transmitted\n")
