@@ -165,7 +165,7 @@ def _format(summary: dict[str, Any]) -> str:
 
     history = (f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
     lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "available"
-    source = f"source     {lost}, {shown('skipped')} frames skipped"
+    source = f"source     {lost}, {counted(summary['skipped'] or 0, 'frame')} skipped"
     if summary["reopened"] is not None:  # a demo is never lost
         source += f", reopened {counted(summary['reopened'], 'time')}"
     size = (summary["bytes"] or 0) / 1e6
