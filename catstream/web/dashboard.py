@@ -12,7 +12,7 @@ from catstream.messages.kinds import End, Features, FleetStatus, Health, Model, 
 from catstream.web.objects import Objects
 from catstream.web.recent import Recent
 from catstream.web.surprising import SurprisingFrames
-from catstream.web.timing import POINT_SECONDS, RATE_SECONDS, SILENCE_SECONDS
+from catstream.web.timing import POINT_SECONDS, RATE_SECONDS
 
 __all__ = ["RUNNING", "Dashboard", "FleetDashboard", "Parts"]
 
@@ -83,7 +83,7 @@ class Dashboard(Parts):
 
     endpoint, source : endpoint of the pipeline, and its source of frames
     health : last health report of each process
-    last_reports : arrival time of the last health report of each process that is not silent
+    last_reports : arrival time of the last health report of each process
     objects : the objects that are tracked
     """
 
@@ -160,11 +160,6 @@ class Dashboard(Parts):
                 self.phase, self.reason = "ended", message.reason
                 self._mark_changed("status")
 
-    def mark_silent(self, reason: str, now: float) -> None:
-        """Record that the pipeline is silent or does not exist."""
-        super().mark_silent(reason, now)
-        self.last_reports.clear()
-
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
         recent = takewhile(lambda moment: now - moment <= RATE_SECONDS, reversed(self._arrivals.values()))
@@ -196,8 +191,7 @@ class Dashboard(Parts):
 
     def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
-        times = self.last_reports | {health.process: now}
-        self.last_reports = {name: last for name, last in times.items() if now - last <= SILENCE_SECONDS}
+        self.last_reports[health.process] = now
         self.source = health.source or self.source
         if health.process == "detector":
             self._add_objects(health)

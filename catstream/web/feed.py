@@ -122,7 +122,8 @@ class PipelineFeed(Feed):
 
     @property
     def problem(self) -> str:
-        silent = [name for name in CHANNELS["health"].senders if name not in self.dashboard.last_reports]
+        since, last = monotonic() - SILENCE_SECONDS, self.dashboard.last_reports
+        silent = [name for name in CHANNELS["health"].senders if name not in last or last[name] < since]
         return f"no health report from: {', '.join(silent)}" if silent else ""
 
     def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one

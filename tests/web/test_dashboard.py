@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from time import monotonic
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
@@ -10,6 +12,8 @@ from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Health
 from catstream.video.palette import PALETTE
 from catstream.web.dashboard import Dashboard
+from catstream.web.feed import PipelineFeed
+from catstream.web.timing import SILENCE_SECONDS
 
 
 @pytest.fixture
@@ -75,19 +79,17 @@ def test_the_number_of_skipped_frames_is_shown_after_the_end(dashboard):
     assert dashboard.updates({})["status"]["skipped"] == 40.0
 
 
-def test_a_silent_process_is_not_listed(dashboard):
-    names = {"compressor", "detector", "trainer"}
-    for name in names:
-        dashboard.take(Health(name, 1.0, {"sent": 1.0}), 0.0)
-    assert set(dashboard.last_reports) == names
-    for moment in (1.0, 2.0, 3.0, 4.0, 5.0):
-        for name in names - {"trainer"}:
-            dashboard.take(Health(name, 1.0, {}), moment)
-    assert set(dashboard.last_reports) == names - {"trainer"}
-    dashboard.take(Health("trainer", 1.0, {}), 6.0)
-    assert set(dashboard.last_reports) == names
-    dashboard.mark_silent("nothing came", 10.0)
-    assert not dashboard.last_reports
+def test_a_process_is_silent_some_seconds_after_its_last_report_also_if_none_of_another_one_arrives():
+    feed, everyone = PipelineFeed("run"), "no health report from: detector, compressor, trainer"
+    assert feed.problem == everyone
+    for ago, names, problem in (
+        (SILENCE_SECONDS + 1.0, ("detector", "compressor", "trainer"), everyone),
+        (0.0, ("compressor", "trainer"), "no health report from: detector"),
+        (0.0, ("detector",), ""),
+    ):
+        for name in names:
+            feed.dashboard.take(Health(name, 1.0, {"sent": 1.0}), monotonic() - ago)
+        assert feed.problem == problem
 
 
 def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, facts):

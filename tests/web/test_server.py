@@ -123,7 +123,7 @@ def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline
 
 
 def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
-    monkeypatch.setattr("catstream.web.dashboard.SILENCE_SECONDS", 0.5)
+    monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 0.5)
 
     def answer(*heard):
         for name in heard:
