@@ -211,11 +211,14 @@ class Pipeline:
 
     def starting_after(self, position: Position | None) -> Self:
         """A copy of a pipeline that has not started yet, with another `after`."""
-        if self._stack is not None:
-            raise ServiceError("the pipeline has started: call starting_after before that")
         other = copy(self)
         other._after = position
         return other
+
+    def __getstate__(self) -> object:
+        if self._stack is not None:
+            raise ServiceError("a pipeline that has started cannot be copied, as its run is one: copy it before that")
+        return super().__getstate__()
 
     def __enter__(self) -> Self:
         if self._stack is not None:

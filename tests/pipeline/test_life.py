@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import gc
 import json
+import pickle
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -99,9 +101,13 @@ def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
         _ = pipeline.endpoint
 
 
-def test_the_first_frame_is_set_before_the_start(pipeline):
-    with pipeline, pytest.raises(ServiceError, match="before that"):
-        pipeline.starting_after(None)
+@pytest.mark.parametrize("made", [lambda it: it.starting_after(None), copy.copy, copy.deepcopy, pickle.dumps])
+def test_a_pipeline_is_copied_before_its_start_only(pipeline, made):
+    made(pipeline)
+    with pipeline:
+        with pytest.raises(ServiceError, match="before that"):
+            made(pipeline)
+        assert len(list(pipeline)) == 20
 
 
 @pytest.mark.timeout(60)
