@@ -190,7 +190,9 @@ def files_by_name(files: Models | None) -> dict[str, Path]:
 
 def _plain(value: object) -> object:
     """A value in the types of JSON, if it is of a type that `msgspec` does not know."""
-    return [value.start, value.stop, value.step] if isinstance(value, slice) else str(value)
+    if isinstance(value, slice):
+        return [None if each is None else int(each) for each in (value.start, value.stop, value.step)]
+    return str(value)
 
 
 def _typed(kind: type, value: Any) -> object:
