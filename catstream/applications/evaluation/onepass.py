@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator
 from contextlib import closing
 from pathlib import Path
@@ -76,9 +77,9 @@ def evaluate(
     settings: Settings,
     *,
     starts: Starts = one_pass,
-    peer_models: Path | None = None,
+    peer_models: str | os.PathLike[str] | None = None,
     jobs: int = 1,
-    output: Path | None = None,
+    output: str | os.PathLike[str] | None = None,
     begin: Callable[[int], None] = lambda _: None,
     done: Callable[[EvaluationRun], None] = lambda _: None,
     failed: Callable[[CatstreamError], None] | None = None,
@@ -108,9 +109,10 @@ def evaluate(
         If a tracker is unknown, two sequences have the same name, or `output` has runs with other settings.
     """
     trackers = list(dict.fromkeys(trackers))
-    _validate_names(sequences, trackers, peer_models)
-    if output is not None:
-        prepare_folder(output, settings)
+    folder, models = (None if path is None else Path(path) for path in (output, peer_models))
+    _validate_names(sequences, trackers, models)
+    if folder is not None:
+        prepare_folder(folder, settings)
     runs: dict[tuple[str, str], EvaluationRun] = {}
 
     def add(run: EvaluationRun) -> None:
@@ -118,7 +120,7 @@ def evaluate(
         done(run)
 
     tasks = [
-        _Task(tracker, settings, sequence, start, peer_models)
+        _Task(tracker, settings, sequence, start, models)
         for sequence in sequences
         for tracker in trackers
         for start in starts(sequence)
@@ -126,12 +128,12 @@ def evaluate(
     begin(sum(task.frames for task in tasks))
     missing = []
     for task in tasks:
-        run = None if output is None else load(output, task.tracker, task.sequence, task.start)
+        run = None if folder is None else load(folder, task.tracker, task.sequence, task.start)
         if run is None:
             missing.append(task)
         else:
             add(run)
-    with closing(_run_all(missing, output, jobs)) as results:  # an error or Ctrl-C kills the workers
+    with closing(_run_all(missing, folder, jobs)) as results:  # an error or Ctrl-C kills the workers
         for result in results:
             if isinstance(result, EvaluationRun):
                 add(result)

@@ -104,7 +104,7 @@ def test_results_have_the_layouts_of_the_toolkits(tmp_path, run):
 
 
 def test_complete_runs_are_not_repeated(tmp_path, sequence, counted):
-    first = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(2), output=tmp_path)
+    first = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(2), output=str(tmp_path))
     assert len(counted) == len(first) == 4
     again = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(4), output=tmp_path)
     assert len(again) == 8

@@ -36,7 +36,7 @@ def test_a_tracker_without_its_model_files_is_an_error_that_names_them_before_th
         evaluate([sequence], ["mil", "vit"], Settings())
     (tmp_path / "nanotrack_backbone_sim.onnx").touch()
     with pytest.raises(SettingsError, match=r"has no nanotrack_head_sim.onnx: put it there"):
-        evaluate([sequence], ["nano"], Settings(), peer_models=tmp_path)
+        evaluate([sequence], ["nano"], Settings(), peer_models=str(tmp_path))
 
 
 @pytest.mark.parametrize("tracker", MODELS)
