@@ -121,18 +121,18 @@ def test_objects_that_come_and_go_do_not_affect_one_another(frames, lives):
 
 
 @pytest.mark.parametrize(
-    ("begin", "error"),
+    ("begin", "error", "why"),
     [
-        ({"ben": (250, 60, 40, 40), "cleo": (-500, 0, 10, 10)}, BoxError),
-        ({"anna": (45, 30, 40, 40), "ben": (250, 60, 0, 40)}, BoxError),
-        ({"ben": (250, 60, 40, 40), "no name": (150, 180, 40, 40)}, ObjectError),
-        ({f"object-{i}": (250, 60, 40, 40) for i in range(1000)}, ObjectError),
+        ({"ben": (250, 60, 40, 40), "cleo": (-500, 0, 10, 10)}, BoxError, "^cleo: the box -500,0,10,10"),
+        ({"anna": (45, 30, 40, 40), "ben": (250, 60, 0, 40)}, BoxError, "^ben: a box needs"),
+        ({"ben": (250, 60, 40, 40), "no name": (150, 180, 40, 40)}, ObjectError, "'no name' is not a name"),
+        ({f"object-{i}": (250, 60, 40, 40) for i in range(1000)}, ObjectError, "objects are more than 4"),
     ],
     ids=["outside", "an old one and an empty one", "a bad name", "too many"],
 )
-def test_if_one_box_of_several_is_refused_nothing_changes(frames, begin, error):
+def test_if_one_box_of_several_is_refused_it_is_named_and_nothing_changes(frames, begin, error, why):
     tracker, other = started(frames, settings={"run.objects_most": 4}), started(frames)
-    with pytest.raises(error):
+    with pytest.raises(error, match=why):
         tracker.update(frames[1], begin=begin)
     with pytest.raises(TypeError):
         tracker.update(frames[1], begin)  # it would be taken for the time

@@ -12,7 +12,7 @@ from catstream.detection.likeness import Likeness
 from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Features, Model, Track, Tracks
-from catstream.messages.names import check_count, check_name, listed
+from catstream.messages.names import check_count, check_name, errors_about, listed
 from catstream.numerics.parallel import in_parallel
 from catstream.settings import Settings
 
@@ -63,7 +63,8 @@ class Detectors:
             If the name is not valid, or there are too many objects. Nothing changes.
         """
         detector = self.detectors.get(name) or self._made(name)
-        result = detector.init(frame, self.seq + 1, time, box)
+        with errors_about(name):
+            result = detector.init(frame, self.seq + 1, time, box)
         self.detectors.pop(name, None)
         self.detectors[name] = detector  # the last one, also if another object had the name
         return result

@@ -19,6 +19,7 @@ __all__ = [
     "check_name",
     "counted",
     "doubtful",
+    "errors_about",
     "is_name",
     "listed",
     "split_name",
@@ -89,7 +90,7 @@ def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
         return {UNNAMED: Box.parse(boxes)}
     parsed = {}
     for name, box in boxes.items():
-        with _errors_about(check_name(name)):
+        with errors_about(check_name(name)):
             parsed[name] = Box.parse(box)
     return parsed
 
@@ -97,7 +98,7 @@ def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
 def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
     """Raise BoxError, with the name of the object, if tracking cannot start with one of the boxes in such a frame."""
     for name, box in boxes.items():
-        with _errors_about(name):
+        with errors_about(name):
             box.validated(width, height)
 
 
@@ -123,7 +124,7 @@ def doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
 
 
 @contextmanager
-def _errors_about(name: str) -> Iterator[None]:
+def errors_about(name: str) -> Iterator[None]:
     """Add the name of an object to a BoxError."""
     try:
         yield
