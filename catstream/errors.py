@@ -58,7 +58,7 @@ class ObjectError(CatstreamError, ValueError):
 
 
 class FrameError(CatstreamError, ValueError):
-    """An array is not a frame: its type, shape or size is wrong, or its values are outside the range of a pixel."""
+    """An array is not a frame: its type, shape, size or range of values is wrong. Or its time is not finite."""
 
 
 class VideoError(CatstreamError):

@@ -7,6 +7,7 @@ model, its training rows are added to its coreset trees, and a model is trained 
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections.abc import Callable, Mapping
@@ -73,6 +74,13 @@ def _one_at_a_time(
             return method(self, *arguments, **more)
 
     return called
+
+
+def _seconds(time: float) -> float:
+    """The time of a frame as a number of Python, which a saved tracker can contain."""
+    if not math.isfinite(time):
+        raise FrameError(f"the time of a frame is a finite number of seconds, got {time}: give another, or none")
+    return float(time)
 
 
 class MultiTracker:
@@ -143,11 +151,11 @@ class MultiTracker:
         BoxError
             For a box that is not in the frame, has no area, or is not a number.
         FrameError
-            For an array that is not a frame.
+            For an array that is not a frame, or a time that is not finite.
         ObjectError
             For a name that is not valid, no object, or too many objects.
         """
-        image, boxes = as_bgr(frame), boxes_by_name(boxes)
+        image, boxes, time = as_bgr(frame), boxes_by_name(boxes), _seconds(time)
         if not boxes:
             raise ObjectError("there is no object to follow: give a box for at least one name")
         check_count(len(boxes), self.settings.run.objects_most)
@@ -191,14 +199,15 @@ class MultiTracker:
         BoxError
             Before `init`, or for a box as there.
         FrameError
-            For an array that is not a frame, or is of another size than those before.
+            For an array that is not a frame, or is of another size than those before, or a time that is not finite.
         ObjectError
             For a name as in `init`, or one that has both a box and a saved model.
         SettingsError
             If the settings do not suit a saved model.
         """
         _ = self.tracks
-        image, boxes, models = as_bgr(frame), boxes_by_name(begin or {}), search or {}
+        image, boxes, time = as_bgr(frame), boxes_by_name(begin or {}), _seconds(time)
+        models = search or {}
         compressors = self._continued(models, boxes)
         if image.shape[:2] != self._size:
             (height, width), (first_height, first_width) = image.shape[:2], self._size

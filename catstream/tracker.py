@@ -83,7 +83,7 @@ class Tracker:
         BoxError
             For a box that is not in the frame, has no area, or is not a number.
         FrameError
-            For an array that is not a frame.
+            For an array that is not a frame, or a time that is not finite.
         """
         self._objects.init(frame, {UNNAMED: box}, time)
 
@@ -102,7 +102,7 @@ class Tracker:
         BoxError
             Before `init`.
         FrameError
-            For an array that is not a frame, or is of another size than those before.
+            For an array that is not a frame, or is of another size than those before, or a time that is not finite.
         """
         track = self._objects.update(frame, time=time)[UNNAMED]
         return track.box is not None, track.box

@@ -1,6 +1,7 @@
 """The three stages in one process."""
 
 import copy
+import math
 import os
 import pickle
 import subprocess
@@ -158,6 +159,17 @@ def test_a_saved_tracker_continues_bit_for_bit(video, tmp_path, settings, after)
     loaded = Tracker.load(tmp_path / "kept")
     assert (loaded.track, loaded.settings) == (tracker.track, tracker.settings)
     assert results(loaded, frames[after:]) == results(tracker, frames[after:])
+
+
+def test_times_of_numpy_are_saved_and_one_that_is_not_finite_is_rejected(video, tmp_path):
+    tracker = started(video)
+    for frame, time in zip(video[0][1:], (np.float32(0.5), np.int64(1)), strict=False):
+        tracker.update(frame, time)
+    for invalid in (math.nan, math.inf):
+        with pytest.raises(FrameError, match="finite number of seconds"):
+            tracker.update(video[0][3], invalid)
+    tracker.save(tmp_path / "kept")
+    assert Tracker.load(tmp_path / "kept").track.time == 1
 
 
 def test_a_tracker_saved_while_the_object_is_absent_finds_it_as_the_other_does(video, tmp_path):
