@@ -175,7 +175,7 @@ class MultiTracker:
         *,
         time: float = 0.0,
         begin: Boxes | None = None,
-        search: Mapping[str, Learned] | None = None,
+        search: Mapping[str, Learned | str | os.PathLike[str]] | None = None,
     ) -> dict[str, Track]:
         """Find the objects in the next frame, and learn from it.
 
@@ -186,7 +186,7 @@ class MultiTracker:
         begin : mapping of str to boxes
             The boxes of objects that begin in this frame. An object of the same name is forgotten. If one box is
             refused, no object begins, and the frame counts as not seen.
-        search : mapping of str to Learned
+        search : mapping of str to Learned or path
             Saved models of objects that are searched for from this frame on, by name. Each is absent until it is found,
             and learning continues from its saved model. An object of the same name is forgotten.
 
@@ -204,10 +204,14 @@ class MultiTracker:
             For a name as in `init`, or one that has both a box and a saved model.
         SettingsError
             If the settings do not suit a saved model.
+        ServiceError, ProtocolError
+            If the file of a saved model cannot be read, or is not one.
         """
         _ = self.tracks
-        image, boxes, time = as_bgr(frame), boxes_by_name(begin or {}), _seconds(time)
-        models = search or {}
+        image, boxes, time = as_bgr(frame), boxes_by_name({} if begin is None else begin), _seconds(time)
+        models = {
+            name: each if isinstance(each, Learned) else Learned.load(each) for name, each in (search or {}).items()
+        }
         compressors = self._continued(models, boxes)
         if image.shape[:2] != self._size:
             (height, width), (first_height, first_width) = image.shape[:2], self._size

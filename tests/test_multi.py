@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from catstream.box import Box
-from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, SettingsError
+from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.multi import MultiTracker
 from catstream.numerics import parallel
@@ -139,6 +139,11 @@ def test_if_one_box_of_several_is_refused_it_is_named_and_nothing_changes(frames
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 
+def test_the_box_of_an_object_without_a_name_may_be_an_array(frames):
+    tracker = started(frames)
+    assert tracker.update(frames[1], begin=np.array(box_of("ben", 1)))[""].box == box_of("ben", 1)
+
+
 def test_an_invalid_init_keeps_the_objects_before(frames):
     tracker = started(frames)
     for boxes, error in (({}, ObjectError), ({"ben": (1, 1, 0, 0)}, BoxError), ({"anna": "x"}, BoxError)):
@@ -173,9 +178,10 @@ def cleo(frames):
 
 
 def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not_affect(frames, cleo, tmp_path):
+    cleo.save(tmp_path / "cleo")
     tracker, other = (started(frames, settings={"coreset.size": 8}) for _ in range(2))
     for number, frame in enumerate(frames[1:], start=1):
-        tracks = tracker.update(frame, search={"cleo": cleo} if number == 2 else None)
+        tracks = tracker.update(frame, search={"cleo": tmp_path / "cleo"} if number == 2 else None)
         assert without_version(tracks["anna"]) == without_version(other.update(frame)["anna"])
         if number == 3:  # not found yet
             assert tracks["cleo"].state == "absent"
@@ -193,6 +199,7 @@ def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
         ({"no name": cleo}, ObjectError, "is not a name"),
         ({3: cleo}, ObjectError, "3 is not a name: expected text"),
         ({"cleo": replace(cleo, settings=Settings())}, SettingsError, "learned with coreset.size=64"),
+        ({"cleo": "no file"}, ServiceError, "there is no saved model 'no file'"),
     ]:
         with pytest.raises(error, match=why):
             tracker.update(frames[1], search=search)
