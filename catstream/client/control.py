@@ -25,7 +25,7 @@ from catstream.messages.names import UNNAMED, check_name
 from catstream.run.learned import Learned
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Endpoint, find, is_deserted, source_at
+from catstream.wire.endpoint import Place, find, is_deserted, source_at
 from catstream.wire.newest import Subscriber
 from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
 
@@ -56,7 +56,7 @@ class Control:
     """
 
     def __init__(
-        self, endpoint: str | Endpoint = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = ""
+        self, endpoint: Place = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = ""
     ) -> None:
         self._stream = follow(endpoint, keys)
         self._place = self._stream.endpoint if self._stream is not None else find(endpoint, keys, source)
@@ -233,12 +233,12 @@ class Control:
             self._commands = Requester[Command, Answer](CONTROL, place)
 
 
-def control(endpoint: str = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = "") -> Control:
+def control(endpoint: Place = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = "") -> Control:
     """Connect to a running pipeline to send commands.
 
     Parameters
     ----------
-    endpoint : str
+    endpoint : str or path
         Endpoint of the pipeline, in the format of the setting `run.endpoint`. Empty for the only pipeline of this user.
         The address of a stream of a fleet, as for `catstream.subscribe`: each command goes where the stream runs then.
     timeout : float

@@ -31,7 +31,7 @@ from catstream.messages.names import UNNAMED
 from catstream.messages.schema import LONGEST_LIST
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
-from catstream.wire.endpoint import Endpoint, find, fleets, meeting_place, private_folder
+from catstream.wire.endpoint import Endpoint, Place, find, fleets, meeting_place, private_folder
 from catstream.wire.keys import Keys
 from catstream.wire.timing import ANSWER_SECONDS, CONTROLLER_SECONDS, QUIET_SECONDS
 
@@ -413,7 +413,7 @@ def address_of(fleet: str, stream: str) -> str:
     return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}" if fleet else f"{_PREFIX}{stream}"
 
 
-def fleet_and_stream(endpoint: str | Endpoint) -> tuple[str, str] | None:
+def fleet_and_stream(endpoint: Place) -> tuple[str, str] | None:
     """The fleet and the stream of an address, None if it is no address of a stream of a fleet.
 
     Raises
@@ -424,18 +424,17 @@ def fleet_and_stream(endpoint: str | Endpoint) -> tuple[str, str] | None:
     >>> fleet_and_stream("fleet://head:5690/cam-7"), fleet_and_stream("fleet://cam-7"), fleet_and_stream("run")
     (('head:5690', 'cam-7'), ('', 'cam-7'), None)
     """
-    if isinstance(endpoint, Endpoint) or not endpoint.startswith(_PREFIX):
+    if not (text := str(endpoint)).startswith(_PREFIX):
         return None
-    fleet, _, stream = endpoint.removeprefix(_PREFIX).rpartition("/")
+    fleet, _, stream = text.removeprefix(_PREFIX).rpartition("/")
     if not stream or "/" in fleet or (":" in stream and not fleet):
         raise ServiceError(
-            f"the address of a stream is fleet://STREAM, fleet://FLEET/STREAM or fleet://HOST:PORT/STREAM, "
-            f"got {endpoint!r}"
+            f"the address of a stream is fleet://STREAM, fleet://FLEET/STREAM or fleet://HOST:PORT/STREAM, got {text!r}"
         )
     return fleet, stream
 
 
-def follow(endpoint: str | Endpoint, keys: str = "") -> FollowedStream | None:
+def follow(endpoint: Place, keys: str = "") -> FollowedStream | None:
     """The stream of a fleet that has this address; None if it is no address of a stream.
 
     Raises
@@ -458,7 +457,7 @@ def described(status: StreamStatus) -> str:
     return f"its state is {status.state}{': ' if status.trouble else ''}{status.trouble}"
 
 
-def locate(endpoint: str | Endpoint, keys: str = "") -> Endpoint:
+def locate(endpoint: Place, keys: str = "") -> Endpoint:
     """The endpoint of a running pipeline, as `find` returns it; for the address of a stream, that of its pipeline now.
 
     Raises

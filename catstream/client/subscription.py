@@ -25,7 +25,7 @@ from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
 from catstream.messages.names import check_name
 from catstream.wire.channels import CHANNELS, TRACKS
-from catstream.wire.endpoint import Endpoint, find
+from catstream.wire.endpoint import Endpoint, Place, find
 from catstream.wire.newest import GapCounter, Subscriber
 from catstream.wire.readable import Turns, Wait, finish, finish_async
 from catstream.wire.timing import CHECK_SECONDS, DRAIN_SECONDS, REPORT_SECONDS
@@ -99,7 +99,7 @@ class Subscription(Generic[Message]):
 
     def __init__(
         self,
-        endpoint: str | Endpoint,
+        endpoint: Place,
         channel: str,
         *,
         object: str | None = None,
@@ -298,19 +298,19 @@ class _OfObject(_Options, total=False):
 
 
 @overload
-def subscribe(endpoint: str, channel: Literal["tracks"], **options: Unpack[_OfObject]) -> Subscription[Track]: ...
+def subscribe(endpoint: Place, channel: Literal["tracks"], **options: Unpack[_OfObject]) -> Subscription[Track]: ...
 @overload
-def subscribe(endpoint: str, channel: Literal["models"], **options: Unpack[_OfObject]) -> Subscription[Model]: ...
+def subscribe(endpoint: Place, channel: Literal["models"], **options: Unpack[_OfObject]) -> Subscription[Model]: ...
 @overload
-def subscribe(endpoint: str, channel: Literal["samples"], **options: Unpack[_OfObject]) -> Subscription[Sample]: ...
+def subscribe(endpoint: Place, channel: Literal["samples"], **options: Unpack[_OfObject]) -> Subscription[Sample]: ...
 @overload
-def subscribe(endpoint: str, channel: Literal["health"], **options: Unpack[_Options]) -> Subscription[Health]: ...
+def subscribe(endpoint: Place, channel: Literal["health"], **options: Unpack[_Options]) -> Subscription[Health]: ...
 @overload
-def subscribe(endpoint: str, channel: Literal["features"], **options: Unpack[_Options]) -> Subscription[Features]: ...
+def subscribe(endpoint: Place, channel: Literal["features"], **options: Unpack[_Options]) -> Subscription[Features]: ...
 @overload
-def subscribe(endpoint: str, channel: Literal["previews"], **options: Unpack[_Options]) -> Subscription[Preview]: ...
+def subscribe(endpoint: Place, channel: Literal["previews"], **options: Unpack[_Options]) -> Subscription[Preview]: ...
 def subscribe(
-    endpoint: str,
+    endpoint: Place,
     channel: str,
     *,
     object: str | None = None,
@@ -321,7 +321,7 @@ def subscribe(
 
     Parameters
     ----------
-    endpoint : str
+    endpoint : str or path
         Endpoint of the pipeline, which may start later; the format is that of the setting `run.endpoint`. Empty for the
         only running pipeline of this user. The address of a stream of a fleet is `fleet://HOST:PORT/STREAM`, with host
         and port of its registry; `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.

@@ -28,6 +28,7 @@ from catstream.wire.keys import Keys
 __all__ = [
     "Endpoint",
     "Note",
+    "Place",
     "find",
     "fleets",
     "is_deserted",
@@ -155,6 +156,9 @@ class Endpoint:
         """Whether it is a folder without any socket: a pipeline removes all of its own at its end."""
         return self.folder is not None and not any(file.exists() for file in _files(self.folder))
 
+
+#: The endpoint of a pipeline, as a program gives it.
+Place = str | os.PathLike[str] | Endpoint
 
 #: Processes that listen, the name of `hosts`.
 _LISTENERS = {
@@ -301,7 +305,7 @@ def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, s
                     raise
 
 
-def find(text: str | Endpoint = "", keys: str = "", source: str = "") -> Endpoint:
+def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
     """The endpoint of a running pipeline: the given one, the one with this source, or the user's only one.
 
     The source of a given one is not looked for: see `source_at`.
@@ -320,7 +324,7 @@ def find(text: str | Endpoint = "", keys: str = "", source: str = "") -> Endpoin
     if isinstance(text, Endpoint):
         return text
     if text:
-        return Endpoint.parse(text, keys)
+        return Endpoint.parse(os.fspath(text), keys)
     endpoints = running()
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so

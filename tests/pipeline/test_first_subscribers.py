@@ -16,13 +16,12 @@ FRAMES = 20
 @pytest.mark.parametrize("transport", ["ipc", "tcp"])
 def test_a_subscriber_that_was_there_first_gets_every_message(video, folder, tcp, transport):
     path, boxes = video
-    place = str(folder / "run") if transport == "ipc" else tcp
+    place = folder / "run" if transport == "ipc" else tcp
     with ExitStack() as stack:
         tracks = stack.enter_context(catstream.subscribe(place, "tracks", timeout=60))
         features = stack.enter_context(catstream.subscribe(place, "features", timeout=60))
-        followed = list(
-            Pipeline(path, boxes[0], Settings(run={"endpoint": place, "unstored_frames": 16}), part=slice(0, FRAMES))
-        )
+        settings = Settings(run={"endpoint": str(place), "unstored_frames": 16})
+        followed = list(Pipeline(path, boxes[0], settings, part=slice(0, FRAMES)))
         assert list(tracks) == followed
         assert [message.frame for message in features] == list(range(FRAMES))
         assert (tracks.missed, features.missed) == (0, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -62,7 +63,7 @@ def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(v
     tracks = []
     with (
         Pipeline(video[0], objects, SETTINGS, part=slice(0, FRAMES), state=tmp_path / "kept") as pipeline,
-        control(pipeline.endpoint, timeout=60) as steering,
+        control(Path(pipeline.endpoint), timeout=60) as steering,
     ):
         frames = pipeline.by_frame()
         tracks.append(next(frames))
