@@ -54,7 +54,7 @@ def check_name(name: str) -> str:
             f"{name!r:.80} is not a name: expected text of 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
             "the first of them a letter, a digit or '_'"
         )
-    return name
+    return str(name)  # of a text of numpy, too
 
 
 def split_name(text: str) -> tuple[str, str]:

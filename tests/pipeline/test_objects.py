@@ -6,6 +6,7 @@ import os
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from catstream.client.control import control
@@ -91,7 +92,7 @@ def test_objects_are_saved_forgotten_and_begun_by_name_while_paused(video, objec
         steering.pause()
         saved = steering.save(tmp_path / "ben", "ben")
         assert saved.object == Learned.load(tmp_path / "ben").object == "ben"
-        begin = steering.set_box(objects["anna"], "dora")
+        begin = steering.set_box(objects["anna"], np.str_("dora"))
         assert begin.reason.startswith("the object dora begins at")
         with pytest.raises(CommandRejectedError, match="which object"):
             steering.forget()
