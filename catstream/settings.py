@@ -17,7 +17,6 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from numbers import Number
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_type_hints
 
@@ -576,8 +575,8 @@ def _nearest(name: str) -> list[str]:
 
 
 def _checked(name: str, value: object) -> object:
-    """The value of a setting, of its type; a number of numpy is one of Python."""
-    if isinstance(value, Number) and hasattr(value, "item"):
+    """The value of a setting, of its type; a scalar of numpy is a value of Python."""
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
         value = value.item()
     try:
         checked = msgspec.convert(value, _kinds()[name])

@@ -114,6 +114,7 @@ def test_a_program_gives_values_of_their_type(value):
 
 def test_a_number_of_any_kind_is_stored_as_one_of_python():
     settings = Settings(coreset={"size": np.int64(32)}, search={"area": np.float32(2.5), "context": 2})
+    assert Settings(run={"lockstep": np.True_}).run.lockstep is True
     numbers = settings.coreset.size, settings.search.area, settings.search.context
     assert [type(number) for number in numbers] == [int, float, float]
     assert settings == Settings(coreset={"size": 32}, search={"area": 2.5, "context": 2.0})
