@@ -17,6 +17,7 @@ from catstream.services.recorder import Recorder
 from catstream.services.saved_models import SavedModels
 from catstream.services.stored_part import StoredPart
 from catstream.services.timing import (
+    CLOSE_SECONDS,
     LOCK_SECONDS,
     MESSAGE_SECONDS,
     MODEL_SECONDS,
@@ -43,6 +44,7 @@ def main(process: Process) -> None:
     """Receive each message once, until the stream ends."""
     with ExitStack() as stack:
         loop = CompressorLoop(process, stack)
+        stack.callback(process.watchdog.allow, CLOSE_SECONDS)
         end: End | None = None
         while end is None and not loop.must_stop:
             message = loop.receive()

@@ -37,7 +37,7 @@ from catstream.services.desired import DESIRED, DesiredObject, DesiredState
 from catstream.services.loop import RECORDER, Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
-from catstream.services.timing import MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
+from catstream.services.timing import CLOSE_SECONDS, MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
 from catstream.video import source
 from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, Source, without_password
@@ -78,6 +78,7 @@ def main(process: Process) -> None:
     reason, failed = "the source has ended", False
     with ExitStack() as stack:
         loop = DetectorLoop(process, stack)
+        stack.callback(process.watchdog.allow, CLOSE_SECONDS)
         loop.wait()  # for subscribers, and for the position of an earlier detector
         frames = loop.open(stack)
         try:

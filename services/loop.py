@@ -17,7 +17,7 @@ from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.messages.kinds import Health, Run
 from catstream.run.job import Job
 from catstream.services.process_title import set_process_title
-from catstream.services.timing import CLOSE_SECONDS, HEALTH_SECONDS, STUCK_SECONDS
+from catstream.services.timing import HEALTH_SECONDS, STUCK_SECONDS
 from catstream.services.watchdog import Watchdog
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
@@ -104,8 +104,6 @@ class Process:
         counters, objects : return the counters of the process, and those of each object
         """
         self.watchdog.beat()
-        if now:  # this may be the last turn, and closing the sockets may take long
-            self.watchdog.allow(CLOSE_SECONDS)
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own = counters() | rejects()

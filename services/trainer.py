@@ -5,7 +5,7 @@ from __future__ import annotations
 from catstream.messages.kinds import End
 from catstream.numerics import ridge
 from catstream.services.loop import Process
-from catstream.services.timing import MESSAGE_SECONDS, TRAIN_SECONDS
+from catstream.services.timing import CLOSE_SECONDS, MESSAGE_SECONDS, TRAIN_SECONDS
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
@@ -30,7 +30,7 @@ def main(process: Process) -> None:
             if isinstance(message, End):
                 process.source_failed = message.failed
                 process.beat(lambda: _totals(trained), lambda: trained, now=True)
-                return
+                break
             # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
             if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
                 process.watchdog.allow(TRAIN_SECONDS)
@@ -41,6 +41,7 @@ def main(process: Process) -> None:
                     del trained[next(iter(trained))]
             models.serve_late_joiners()
             process.beat(lambda: _totals(trained), lambda: trained)
+        process.watchdog.allow(CLOSE_SECONDS)
 
 
 def _totals(trained: dict[str, dict[str, float]]) -> dict[str, float]:

@@ -64,6 +64,17 @@ def test_no_process_is_started_again_because_the_owner_is_slow(video, tmp_path, 
     assert tuple(started) == NAMES
 
 
+def test_a_detector_that_ends_with_messages_for_two_slow_subscribers_does_not_count_as_stuck(endless):
+    with (
+        Pipeline(endless, (20, 20, 60, 60), part=slice(0, 200)) as pipeline,
+        subscribe(pipeline.endpoint, "features"),
+        subscribe(pipeline.endpoint, "previews"),
+    ):
+        for _ in pipeline:
+            time.sleep(0.025)  # so that there are more pictures than fit between the two
+    assert pipeline.restarts == 0
+
+
 def test_tracks_that_have_arrived_are_returned_although_a_signal_has_ended_the_detector(video, until):
     """It does not wait for its owner any longer."""
     with Pipeline(video[0], video[1][0]) as pipeline, subscribe(pipeline.endpoint, "tracks") as published:
