@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["to_supervision"]
 
 
-def to_supervision(tracks: Track | Iterable[Track]) -> Detections:
+def to_supervision(tracks: Track | Iterable[Track] | Mapping[str, Track]) -> Detections:
     """Convert a track, or the tracks of a frame, to `supervision.Detections`: a detection for each object present.
 
     A detection has the corners of the box, the score, clipped to 0 to 1, as its confidence, class 0, and `frame`,
@@ -33,7 +33,7 @@ def to_supervision(tracks: Track | Iterable[Track]) -> Detections:
     require_extra("supervision")
     from supervision import Detections
 
-    several = [tracks] if isinstance(tracks, Track) else tracks
+    several = [tracks] if isinstance(tracks, Track) else tracks.values() if isinstance(tracks, Mapping) else tracks
     present = [(track, track.box) for track in several if track.box is not None]
     if not present:
         return Detections.empty()

@@ -48,6 +48,7 @@ def test_the_objects_of_a_frame_are_detections_with_numbers_that_stay():
     assert len({*found.tracker_id}) == 2
     assert list(later.tracker_id) == list(found.tracker_id[::-1])
     assert len(catstream.to_supervision([])) == 0
+    assert catstream.to_supervision({track.object: track for track in tracks}) == found
 
 
 @needs_supervision
