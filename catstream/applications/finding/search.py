@@ -84,6 +84,9 @@ class Search:
     _scan: Scan = field(init=False)
 
     def __post_init__(self) -> None:
+        low, high = self.sizes
+        if not 0 < low <= high < 100:
+            raise SettingsError(f"expected two positive sizes, the smaller one first, got {low:g},{high:g}: give 0.5,2")
         self._scan = Scan(self.models.values(), self.threshold, self.sizes)
 
     @property
@@ -206,7 +209,7 @@ def find(
     ServiceError, ProtocolError
         If a model does not exist, or is damaged or of other features.
     SettingsError
-        If two models have one name.
+        If two models have one name, or the sizes are not positive, the smaller one first.
     VideoError
         If a path does not exist or has nothing to search; after all other files, for the first file that is damaged.
 

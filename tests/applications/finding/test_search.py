@@ -128,6 +128,12 @@ def test_models_without_a_file_or_with_one_name_are_errors(model_files, tmp_path
         load_models([tmp_path / "cut.model"])
 
 
+@pytest.mark.parametrize("sizes", [(2, 1), (0, 1), (1, np.nan), (1, np.inf)])
+def test_sizes_are_two_positive_numbers_in_order(model_files, appearing, sizes):
+    with pytest.raises(SettingsError, match="the smaller one first, got"):
+        catstream.find(model_files[0], appearing, sizes=sizes)
+
+
 def test_long_steps_still_make_intervals_and_bound_the_frames_that_are_kept(model_files, appearing, tmp_path):
     search = Search(load_models(model_files[:1]), every=1.2)
     with SearchLog(tmp_path / "log", search.description) as log:
