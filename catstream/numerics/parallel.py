@@ -17,10 +17,13 @@ import numpy as np
 
 from catstream.numerics.threads import one_thread
 
-__all__ = ["Scratch", "in_parallel"]
+__all__ = ["FILTERS", "Scratch", "in_parallel"]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+#: Held by a call that changes the filters of warnings: all threads of a program have the same ones.
+FILTERS = threading.Lock()
 
 
 class Scratch(threading.local):

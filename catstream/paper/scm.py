@@ -24,6 +24,7 @@ from catstream.features.compiled import kernel
 from catstream.features.pyramid import Pyramid
 from catstream.messages.storage import Arrays, Metadata
 from catstream.numerics.arrays import Float32, Float64, Int64
+from catstream.numerics.parallel import FILTERS
 
 __all__ = ["SparseCollaborativeModel", "prepare"]
 
@@ -177,7 +178,7 @@ class _Discriminative:
         labels = np.repeat([1.0, -1.0], [len(positives), len(negatives)])
         # Pixels are selected by a sparse regression of the labels ("Feature Selection").
         regression = Lasso(cls._SELECTION / len(labels), fit_intercept=False)
-        with warnings.catch_warnings():
+        with FILTERS, warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a thousand sweeps select well enough
             weights = regression.fit(templates, labels).coef_
         return cls(positives, templates, np.flatnonzero(weights) if weights.any() else np.arange(_SIDE * _SIDE))
@@ -210,7 +211,7 @@ class _Generative:
         from sklearn.exceptions import ConvergenceWarning
 
         patches = cls._patches(template[None])
-        with warnings.catch_warnings():
+        with FILTERS, warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a plain object has fewer than 50 different patches
             atoms = _unit(KMeans(cls._ATOMS, n_init=1, random_state=seed).fit(patches).cluster_centers_)
         self = cls(atoms, np.empty(0), np.empty(0))

@@ -1,6 +1,8 @@
 """The sparse collaborative model alone: its sparse codes, and what it follows."""
 
 import itertools
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -61,6 +63,14 @@ def test_a_covered_object_teaches_nothing(scene, rng):
     before = model.histogram
     model.update(rng.integers(0, 256, (32, 32), np.uint8))
     assert model.histogram is before
+
+
+def test_warnings_have_the_same_filters_after_several_threads_have_trained(rng):
+    cuts = rng.integers(0, 256, (2, 20, 32, 32), np.uint8)
+    before = list(warnings.filters)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: scm._Discriminative.trained(*cuts), range(200)))
+    assert warnings.filters == before
 
 
 def test_grey_frames_are_followed_as_those_in_colour(scene):
