@@ -219,6 +219,7 @@ class MultiTracker:
                 f"this frame is {width}x{height} pixels, those before it {first_width}x{first_height}: "
                 "resize it, or call init to start again"
             )
+        self.detectors.seq = self.forest.seq  # a frame whose update was interrupted, as by Ctrl-C, counts as not seen
         with one_thread():
             pyramid = Pyramid(image)
             given = self.detectors.begin_all(boxes, pyramid, time)
@@ -332,7 +333,6 @@ class MultiTracker:
         self = cls(Settings.from_values(metadata["settings"]))
         self.forest = Forest.from_state(arrays, metadata["forest"], self.settings)
         self.trainer, self.detectors = Trainer(self.settings), Detectors(self.settings)
-        self.detectors.seq = self.forest.seq
         for i, each in enumerate(metadata["objects"]):
             model = unpack(Model, arrays, each["model"], f"model.{i}")
             check_message(model)

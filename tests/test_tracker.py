@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
+from catstream.compression.forest import Forest
 from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.settings import PRESETS, Settings
@@ -133,6 +134,19 @@ def test_trackers_in_two_threads_give_the_same_tracks_as_alone(video, boxes_foun
         one, two = (pool.submit(follow, video, Settings(run={"seed": seed})) for seed in (0, 1))
     assert one.result()[0] == boxes_found
     assert two.result()[0] == follow(video, Settings(run={"seed": 1}))[0]
+
+
+def test_a_frame_whose_update_was_interrupted_counts_as_not_seen(video, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    tracker = started(video)
+    with monkeypatch.context() as patched:
+        patched.setattr(Forest, "take", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            tracker.update(video[0][1])
+    assert tracker.update(video[0][2])[1].overlap(Box(*video[1][2])) > 0.7
+    assert tracker.track.seq == 2
 
 
 def test_calls_of_several_threads_wait_for_one_another(video):
