@@ -47,7 +47,7 @@ test: $(TOOLS)  ## all tests but those of test-system and test-slow, with doctes
 test-system: $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, several hosts, or a whole benchmark
 	@$(BIN)/pytest -n 2 --dist worksteal -m 'system and not slow'
 
-test-slow: $(TOOLS)  ## the slow ones: long real sequences, soaks
+test-slow: $(TOOLS)  ## the slow ones: many faults, a load test (4 minutes)
 	@$(BIN)/pytest -m slow --timeout 3600 -o faulthandler_timeout=0
 
 lint: $(TOOLS)  ## style, types, and unsafe code

@@ -12,10 +12,12 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 ALONE, PAGE = BENCHMARKS / "kernels.py", BENCHMARKS / "page.py"
-SLOW = {BENCHMARKS / "fleet" / "faults.py"}  # minutes; tests/fleet/test_fleet.py kills a node, too
+SLOW = BENCHMARKS / "fleet" / "faults.py"  # minutes; tests/fleet/test_fleet.py kills a node, too
+#: Its cluster is detached: it runs on when the object is deleted that has started it.
+SLOW_MARKS = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:subprocess:ResourceWarning")]
 SCRIPTS = sorted({path for path in BENCHMARKS.rglob("*.py") if "__main__" in path.read_text()} - {ALONE, PAGE})
 CASES = [
-    pytest.param(path, id=str(path.relative_to(BENCHMARKS)), marks=[pytest.mark.slow] if path in SLOW else [])
+    pytest.param(path, id=str(path.relative_to(BENCHMARKS)), marks=SLOW_MARKS if path == SLOW else [])
     for path in SCRIPTS
 ]
 
