@@ -120,7 +120,7 @@ class Site:
         return FileResponse(_PAGE / "index.html")
 
     async def _events(self, request: Request) -> Response:
-        return StreamingResponse(self._updates(self._feed_of(request)), media_type="text/event-stream")
+        return _endless(request, self._updates(self._feed_of(request)), "text/event-stream")
 
     async def _metrics(self, request: Request) -> Response:
         text = metrics.text(self._feed_of(request))
@@ -141,7 +141,7 @@ class Site:
 
     async def _live(self, request: Request) -> Response:
         pictures = self._annotated_pictures(self._pipeline(request))
-        return StreamingResponse(pictures, media_type="multipart/x-mixed-replace; boundary=picture")
+        return _endless(request, pictures, "multipart/x-mixed-replace; boundary=picture")
 
     async def _control(self, request: Request) -> Response:
         feed = self._pipeline(request)
@@ -195,6 +195,11 @@ class Site:
                         jpeg,
                     )
                 await asyncio.sleep(UPDATE_SECONDS)
+
+
+def _endless(request: Request, parts: AsyncIterator[str] | AsyncIterator[bytes], media_type: str) -> Response:
+    """Return the response to a request, which ends only for a HEAD request: its response has no parts."""
+    return StreamingResponse(iter(()) if request.method == "HEAD" else parts, media_type=media_type)
 
 
 def _event(parts: dict[str, object]) -> str:

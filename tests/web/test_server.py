@@ -186,6 +186,12 @@ def test_the_live_picture_has_the_track_of_its_frame_drawn_in(page, pipeline, fa
     assert {picture.shape[:2] for picture in shown} == {(68, 64)}, "one size, with a track and without"
 
 
+@pytest.mark.parametrize("path", ["/events", "/live.mjpeg"])
+def test_the_response_to_head_ends_and_its_client_is_no_viewer(page, path):
+    assert page.head(path).status_code == 200
+    assert "\ncatstream_viewers 0.0\n" in page.get("/metrics").text, "on the same connection"
+
+
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1", ""])
 def test_a_request_with_a_foreign_host_name_is_rejected(page, host):
     assert page.get("/", headers={"Host": host}).status_code in (400, 421)
