@@ -13,7 +13,7 @@ const status = {
   waiting: false, lost_seconds: 0, skipped: null,
 };
 const anna = { name: "anna", colour: "#ff922b", state: "present", score: 0.93, version: 12 };
-const ben = { name: "ben", colour: "#3586ff", state: "present", score: 0.61, version: 9 };
+const ben = { name: "constructor", colour: "#3586ff", state: "present", score: 0.61, version: 9 };
 const carl = { name: "a-name-that-is-as-long-as-a-name-may-be-which-is-64-characters.64", colour: "#fedd38", state: "absent", score: 0.08, version: 4 };
 const tracks = (...objects) => ({ frame: objects.length ? 210 : null, time: 8.4, objects });
 const unnamed = (state) => tracks({ ...anna, name: "", state });
@@ -21,6 +21,7 @@ const box = [120, 90, 60, 50];
 const names = ["", anna.name, ben.name, carl.name];
 const byName = (value) => Object.fromEntries(names.map((name) => [name, value]));
 const points = [...Array(40).keys()].map((n) => [n / 4, 60 + n, byName([Math.sin(n / 6) / 2 + 0.5, 0.2, Math.floor(n / 4), n < 30])]);
+for (const [, , objects] of points.slice(0, 20)) delete objects[ben.name]; // it began later; each object of JavaScript has one of that name
 const kinds = [0, 1, 2, 3].map((place) => ({ title: `Tree ${place}`, meaning: "what it summarises" }));
 const trees = (...leaves) => ({ kinds, objects: leaves.length ? byName({ leaves, bytes: 4e6, rows: 5120 }) : {} });
 const frames = (...objects) => objects.map(({ name, colour }, place) => ({ frame: 20 + 70 * place, time: 1 + 3 * place, object: name, colour,
@@ -30,7 +31,7 @@ const all = {
   pipeline: 1, status, tracks: unnamed("present"), picture: { frame: 210, width: 320, height: 240, boxes: { "": box } }, points,
   trees: trees(13, 22, 9, 0), surprising: { measured: 90, frames: frames({ ...anna, name: "" }, { ...anna, name: "" }, { ...anna, name: "" }) },
 };
-const several = { tracks: tracks(anna, ben, carl), picture: { frame: 210, width: 320, height: 240, boxes: { anna: box, ben: [30, 4, 50, 90] } },
+const several = { tracks: tracks(anna, ben, carl), picture: { frame: 210, width: 320, height: 240, boxes: { anna: box, [ben.name]: [30, 4, 50, 90] } },
   surprising: { measured: 90, frames: frames(anna, ben, carl) } };
 const changed = (more, state = "present") => ({ status: { ...status, ...more }, tracks: unnamed(state) });
 
@@ -55,6 +56,8 @@ const STATES = {
   "two objects": { tracks: tracks(anna, carl), surprising: { measured: 60, frames: frames(anna, carl) } },
   drawing: { ...all },
   "drawing the next one while the answer comes": {},
+  "cancelled, begun and cancelled": {},
+  "cancelled during a pause": changed({ paused: true }),
   stopping: {},
   "the end": changed({ phase: "ended", reason: "the source has ended" }),
   "the end, and of the server": { closed: true },
@@ -76,14 +79,15 @@ const draw = async (page, viewport) => {
   }
   await page.waitForSelector("#follow:not([disabled])");
 };
+const paused = (page) => page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.");
 let answered = null; // what the answer to a command waits for
 const doing = {
   drawing: draw,
-  "another one chosen": (page) => page.click('.choose:has-text("ben")'),
+  "another one chosen": (page) => page.click(`.choose:has-text("${ben.name}")`),
   "drawing one more": draw,
   forgetting: async (page) => {
     await page.press("#name", "Escape");
-    await page.click('[aria-label="Forget ben"]');
+    await page.click(`[aria-label="Forget ${ben.name}"]`);
   },
   "two objects": (page) => page.click("dialog .danger"),
   "drawing the next one while the answer comes": async (page) => {
@@ -100,8 +104,20 @@ const doing = {
     await page.mouse.up();
     await page.waitForSelector("#follow:not([disabled])");
   },
+  "cancelled, begun and cancelled": async (page) => {
+    let answer;
+    answered = new Promise((resolve) => { answer = resolve; });
+    for (const key of ["Escape", "Enter"]) await page.press("#stage", key);
+    answer();
+    await paused(page);
+    await page.press("#stage", "Escape");
+  },
+  "cancelled during a pause": async (page) => {
+    await page.press("#stage", "Enter");
+    await paused(page);
+    await page.press("#stage", "Escape");
+  },
   stopping: async (page) => {
-    await page.click("#cancel");
     await page.click("#stop");
   },
   "the end": (page) => page.click("dialog button:not(.danger)"),
@@ -144,7 +160,7 @@ await withBrowser(executablePath, profile, async (browser) => {
         source: await page.locator("#source").textContent(), frame: await page.locator("#frame").textContent(),
         objects: await page.locator(".objects b").allTextContents(), chosen: await page.locator('.choose[aria-pressed="true"] b').allTextContents(),
         charts: await page.locator("#charts-title").innerText(), name: await page.locator("#name").inputValue(), sent: sent.at(-1) ?? null,
-        loud: await page.locator("#watching .main").allInnerTexts(), role: await page.locator("#role").inputValue(),
+        message: await page.locator("#message").textContent(), loud: await page.locator("#watching .main").allInnerTexts(), role: await page.locator("#role").inputValue(),
         header: await page.locator("header").innerText(), keys: await page.locator(".keys").isVisible(),
         folded: !(await page.locator(".trees").isVisible()), lines: await page.locator("polyline").evaluateAll(colours),
         frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),

@@ -30,7 +30,7 @@ def seen(script_of_browser, tmp_path):
 
 
 def test_each_state_of_the_page_is_accessible_and_correct(seen):
-    assert len(seen) == 42
+    assert len(seen) == 46
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"
     wide, phone = seen["light", "present"], seen["dark", "present"]
@@ -49,6 +49,9 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
         assert seen[scheme, "three objects"]["header"].startswith("2 of 3 present"), "the state is first"
         assert len(seen[scheme, "three objects"]["lines"]) == 1, "colours are those of objects"
         assert [seen[scheme, name]["role"] for name in ("drawing one more", "drawing")] == ["new", "new"]
+        assert seen[scheme, "cancelled, begun and cancelled"]["sent"] == {"verb": "resume"}
+        assert seen[scheme, "cancelled during a pause"]["sent"] == {"verb": "pause"}
+        assert seen[scheme, "cancelled during a pause"]["message"] == ""
         check_several(*(seen[scheme, name] for name in SEVERAL))
         check_another_pipeline(seen[scheme, "another pipeline"])
         check_end(seen[scheme, "the end"], seen[scheme, "the end, and of the server"])
@@ -56,13 +59,14 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
 
 def check_several(three, chosen, drawing, forgetting, two):
     """One of several objects is chosen, for the charts; a new one gets the next name; one is dropped once confirmed."""
-    assert (three["pill"], three["objects"][:2], three["chosen"]) == ("2 of 3 present", ["anna", "ben"], ["anna"])
+    assert (three["pill"], three["objects"][:2]) == ("2 of 3 present", ["anna", "constructor"])
+    assert three["chosen"] == ["anna"]
     assert [state["charts"] for state in (three, chosen)] == [
-        f"The last two minutes of {name}" for name in ("anna", "ben")
+        f"The last two minutes of {name}" for name in ("anna", "constructor")
     ]
     assert (drawing["name"], drawing["sent"]) == ("object-4", {"verb": "pause"})
     assert forgetting["sent"] == {"verb": "resume"}, "nothing is dropped before it is confirmed"
-    assert two["sent"] == {"verb": "forget", "object": "ben"}
+    assert two["sent"] == {"verb": "forget", "object": "constructor"}
     assert (len(two["objects"]), two["chosen"], two["frames"]) == (2, ["anna"], 2)
 
 

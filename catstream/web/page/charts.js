@@ -39,7 +39,7 @@ export class Charts {
   }
 
   draw() {
-    const points = this.rows.filter((row) => this.name in row[2]).map(([second, rate, { [this.name]: [score, ...more] }]) => [second, score, rate, ...more]);
+    const points = this.rows.filter((row) => Object.hasOwn(row[2], this.name)).map(([second, rate, { [this.name]: [score, ...more] }]) => [second, score, rate, ...more]);
     for (const chart of this.charts) this.plot(chart, points);
   }
 

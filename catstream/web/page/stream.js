@@ -93,13 +93,14 @@ export class StreamPage {
 
   /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
   async pause() {
+    await this.left; // the pause of a box that was cancelled just now
     if (this.isWaiting) return { frame: Infinity, leave: null };
     const before = this.status.paused;
     const answer = await this.send("pause");
     if (!answer) return null;
     this.showMessage("Paused for your box.", false, false);
     // A paused pipeline holds the frame after the last tracked one; the box applies to that frame.
-    return { frame: answer.frame + 1, leave: before ? null : () => this.send("resume") };
+    return { frame: answer.frame + 1, leave: () => (this.left = before ? this.showMessage("") : this.send("resume")) };
   }
 
   /** Send the box, as that of a new object or of the chosen one. */
