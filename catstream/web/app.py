@@ -151,7 +151,10 @@ class Site:
         command = decode_json(await body_of(request), Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
-        answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
+        try:
+            answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
+        except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
+            raise HTTPException(503, "the server of this page has ended\n") from None
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
         return JSONResponse({"done": True} | result)
 

@@ -8,13 +8,16 @@ import json
 import re
 import signal
 import socket
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
+import httpx
 import numpy as np
 import pytest
 
@@ -381,6 +384,21 @@ def test_a_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatc
     monkeypatch.setattr(site, "close", lambda: signal.raise_signal(signal.SIGINT))
     Server(site, port=0, token=TOKEN).run()
     assert len(stops) == 1
+
+
+def test_a_command_that_waits_for_its_answer_is_answered_at_the_end_of_the_server(folder, monkeypatch, caplog):
+    begun, answered = threading.Event(), threading.Event()
+    monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 1)
+    monkeypatch.setattr(PipelineFeed, "execute", lambda *_: begun.set() or answered.wait(30))
+    server = Server(pipeline_site(str(folder)), port=0)
+    with ThreadPoolExecutor(1) as pool:
+        with server.in_background():
+            asked = pool.submit(httpx.post, f"{server.url}control", json={"verb": "pause"}, timeout=60)
+            assert begun.wait(60)
+        answer = asked.result()
+        answered.set()
+    assert (answer.status_code, answer.text) == (503, "the server of this page has ended\n")
+    assert "Exception" not in caplog.text
 
 
 def test_a_short_token_is_an_error():
