@@ -367,7 +367,8 @@ class Controller:
             case "kill":
                 ray.kill(known.handle)
         if step.after == "absent":
-            known.seen, known.handle, known.call = Seen("absent", known.started), None, None
+            known.seen = Seen("absent", known.started, known.seen.answered)
+            known.handle = known.call = None
         elif step.after != before or step.action:
             known.seen = replace(known.seen, state=step.after, since=now, answered=now)
 

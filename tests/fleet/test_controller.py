@@ -294,6 +294,15 @@ def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed
     assert (states(site)["gate"], ray.started.count("gate")) == ("starting", 2)
 
 
+def test_the_last_state_of_a_stream_that_has_ended_ages_from_its_last_report_on(site, ray):
+    begin = time.monotonic()
+    running(site, ray, "gate", state="ended", stored_seconds=2.0)
+    for _ in range(3):
+        site._turn()
+    age = site.status().streams["gate"].stored_seconds
+    assert 2.0 <= age <= 2.0 + time.monotonic() - begin
+
+
 def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, ray):
     actor = ray.actors["site/stream/gate"]
     actor.superseded = True
