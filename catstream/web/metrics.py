@@ -70,7 +70,9 @@ def _of_pipeline(feed: PipelineFeed) -> Iterator[_Row]:
          "Seconds since a live source was lost, 0 while it is available."),
         (_GAUGE, "objects", "objects", "Objects that are tracked."),
     ):  # fmt: skip
-        yield kind, name, (), meaning, {(): dashboard.counter("detector", counter)}
+        value = dashboard.counter("detector", counter)
+        if value or counter not in ("sent", "stored"):  # which are 0 in a restarted detector until it has its position
+            yield kind, name, (), meaning, {(): value}
     yield from _of_objects(dashboard)
     yield from _of_processes(dashboard)
 

@@ -69,6 +69,17 @@ def test_a_pipeline_that_does_not_run_has_no_old_values(facts):
     assert samples(feed)["catstream_up"] == [("", 1.0)]
 
 
+def test_the_frames_of_a_run_do_not_begin_again_at_0_while_its_detector_is_restarted(facts):
+    feed = PipelineFeed()
+    for sent in (6.0, 0.0):
+        report = facts.tracking(sent, "anna")
+        report.counters.update(stored=sent, skipped=sent)
+        feed.dashboard.take(report, 0.0)
+    found = samples(feed)
+    assert found["catstream_frames_skipped_total"] == [("", 0.0)], "those of the new detector"
+    assert not {"catstream_frames_total", "catstream_features_stored_total"} & found.keys()
+
+
 @pytest.mark.parametrize("kind", ["pipeline", "fleet"])
 def test_the_page_documents_each_metric_with_its_labels(kind, request):
     page = (DOCS / "how-to" / "view.md").read_text()
