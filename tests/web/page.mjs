@@ -28,6 +28,11 @@ await withBrowser(executablePath, profile, async (browser) => {
     await page.mouse.up();
   };
   const click = (selector) => page.click(selector, patience);
+  const name = async (text) => {
+    await page.press("#name", "Control+A");
+    await page.keyboard.type(text);
+    await page.keyboard.press("Enter");
+  };
   await draw(left, top, wide, tall);
   await click("#follow:not([disabled])");
   await is("present");
@@ -38,12 +43,11 @@ await withBrowser(executablePath, profile, async (browser) => {
   await pausing();
   console.log("paused"); // until the box is set
   await draw(20, 150, 60, 60);
-  await page.fill("#name", "no name");
-  await click("#follow:not([disabled])");
+  await page.waitForSelector("#follow:not([disabled])", patience);
+  await name("no name");
   await page.waitForSelector("#message.wrong", patience);
   console.log("refused", await page.locator("#message").innerText());
-  await page.fill("#name", "object-2");
-  await click("#follow");
+  await name("object-2");
   await page.waitForSelector('.choose[aria-pressed="true"]:has-text("object-2")', patience);
   console.log("objects", (await page.locator(".objects b").allInnerTexts()).join());
   await click('[aria-label="Forget object-2"]');

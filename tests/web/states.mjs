@@ -86,7 +86,9 @@ const doing = {
   "another one chosen": (page) => page.click(`.choose:has-text("${ben.name}")`),
   "drawing one more": draw,
   forgetting: async (page) => {
-    await page.press("#name", "Escape");
+    await page.press("#name", "Control+A");
+    await page.keyboard.type("dora");
+    await page.keyboard.press("Escape");
     await page.click(`[aria-label="Forget ${ben.name}"]`);
   },
   "two objects": (page) => page.click("dialog .danger"),

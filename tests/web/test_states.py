@@ -65,6 +65,7 @@ def check_several(three, chosen, drawing, forgetting, two):
         f"The last two minutes of {name}" for name in ("anna", "constructor")
     ]
     assert (drawing["name"], drawing["sent"]) == ("object-4", {"verb": "pause"})
+    assert forgetting["name"] == "dora", "as it was typed"
     assert forgetting["sent"] == {"verb": "resume"}, "nothing is dropped before it is confirmed"
     assert two["sent"] == {"verb": "forget", "object": "constructor"}
     assert (len(two["objects"]), two["chosen"], two["frames"]) == (2, ["anna"], 2)

@@ -9,7 +9,7 @@ export class BoxForm {
     [this.form, this.role, this.name] = [$("#drawing"), $("#role"), $("#name")];
     this.role.onchange = () => this.showName();
     this.form.onsubmit = (event) => { event.preventDefault(); accept(); };
-    this.form.onkeydown = ({ key }) => key === "Escape" && cancel();
+    this.form.onkeydown = ({ key }) => { if (key === "Escape") cancel(); }; // false would prevent the typing of a name
     $("#cancel").onclick = cancel;
   }
 
