@@ -195,10 +195,10 @@ class CoresetTree:
         return tree
 
     def _push(self, node: Node) -> None:
-        self.nodes.append(node)
-        while len(self.nodes) > 1 and self._to_merge(self.nodes[-2], self.nodes[-1]):
-            newer, older = self.nodes.pop(), self.nodes.pop()
-            self.nodes.append(self._merged(older, newer))
+        nodes = [*self.nodes, node]
+        while len(nodes) > 1 and self._to_merge(nodes[-2], nodes[-1]):
+            nodes[-2:] = [self._merged(nodes[-2], nodes[-1])]
+        self.nodes = nodes  # at once: Ctrl-C during a reduction loses no node
 
     def _to_merge(self, older: Node, newer: Node) -> bool:
         """Whether two neighbouring nodes are merged into one."""

@@ -186,6 +186,19 @@ def test_rows_inserted_into_a_tree_are_not_in_its_copy(stream):
     assert bits(other) == bits(grown(stream[:3]))
 
 
+@KINDS
+def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    tree = grown(stream[: 3 * SIZE], kind=kind)
+    before = bits(tree)
+    monkeypatch.setattr(kind, "_merged", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        tree.insert(stream[:SIZE])
+    assert bits(tree) == before
+
+
 # --- what it refuses ------------------------------------------------------------------------------------
 
 
