@@ -228,7 +228,7 @@ class Pipeline:
             settings, shown = self.settings, without_password(self.source)
             endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
             if self._state is not None:
-                stack.enter_context(begun(self._state, self._resumed_job, self._job))
+                stack.enter_context(begun(self._state, self._resumed_job, self._job, self._start))
             job = self._started(str(endpoint))
             reader = stack.enter_context(RunReader(job, endpoint, self._start, folder, live=self.live))
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from catstream.compression.forest import Forest
-from catstream.errors import ProtocolError
+from catstream.errors import ProtocolError, ServiceError
 from catstream.messages.kinds import Position
 from catstream.settings import Settings
 
@@ -74,6 +75,17 @@ class CheckpointStore:
             As `load`.
         """
         return self._newest(Forest.position_in) or Position()
+
+    def go_back(self, seq: int) -> None:
+        """Remove the newest checkpoint if it is of a message after `seq`, and the one before it is not.
+
+        The stream then continues from the one before, or from its start if there is none.
+        """
+        with suppress(ProtocolError, ServiceError, OSError):  # as it is found when it is loaded
+            files = self._files()
+            *_, before, newest = 0, 0, *(Forest.position_in(file).seq for file in files)
+            if before <= seq < newest:
+                files[-1].unlink()
 
     def _newest(self, read: Callable[[Path], Read]) -> Read | None:
         """The newest checkpoint that is not damaged, as `read` returns it; None if there is none."""

@@ -160,8 +160,12 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
-    """Lock the state folder, and store the job there if it is new or has changed."""
+def begun(folder: Path, resumed: Job | None, job: Job, start: Position) -> Iterator[None]:
+    """Lock the state folder, and store the job there if it is new or has changed.
+
+    If the newest checkpoint is ahead of the start, as after Ctrl-C, the one before is used: it has the state of the
+    detectors after the same frame as the trees.
+    """
     with locked(folder):
         if resumed is None and began(folder):
             raise ServiceError(
@@ -169,6 +173,7 @@ def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
             )
         if job != resumed:
             job.save(folder)
+        CheckpointStore(folder / TREES).go_back(start.seq)
         yield
 
 

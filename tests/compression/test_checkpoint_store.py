@@ -68,6 +68,24 @@ def test_the_position_is_that_of_the_checkpoint_that_would_be_loaded(kept):
         newest(kept).write_bytes(data)
 
 
+@pytest.mark.parametrize(
+    ("kept_seqs", "seq", "used"),
+    [((40, 50), 50, 50), ((40, 50), 49, 40), ((40, 50), 40, 40), ((40, 50), 39, 50), ((50,), 50, 50), ((50,), 49, 0)],
+)
+def test_of_two_checkpoints_the_one_before_is_used_if_only_the_newest_is_ahead(grow, tmp_path, kept_seqs, seq, used):
+    store, forest = CheckpointStore(tmp_path), Forest(SETTINGS)
+    for each in kept_seqs:
+        store.save(grow(forest, each - forest.seq))
+    store.go_back(seq)
+    assert CheckpointStore(tmp_path).load(SETTINGS).seq == used
+
+
+def test_a_damaged_checkpoint_is_left_where_it_is(kept):
+    newest(kept).write_bytes(b"")
+    CheckpointStore(kept).go_back(55)
+    assert len(files(kept)) == 2
+
+
 @pytest.mark.parametrize("share", [0, 0.001, 0.5, 0.999])
 def test_an_incomplete_checkpoint_is_detected_and_the_previous_one_is_used(kept, share, caplog):
     whole = newest(kept).read_bytes()
