@@ -78,7 +78,8 @@ class Pipeline:
         source, the box, the part and the settings.
     after : Position
         With `resume`: the last track that the caller has; the run continues with the next one. If None, it continues
-        after the last checkpoint: tracks of the last second may be repeated.
+        after the last track that was received. If the program was killed, it continues after the last checkpoint:
+        tracks of the last second may be repeated, and those that it had not received yet may be missing.
     results : Results
         The files that the program writes, stored in the state folder for the program that resumes the run. A run that
         is resumed keeps those of each kind that are not given again.
@@ -159,6 +160,7 @@ class Pipeline:
             part=job.part if part == ALL_FRAMES else part,
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
             results=job.results if results is None else results.after(job.results),
+            read=None,
         )
         saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
         for file in saved_models.values():
@@ -232,6 +234,8 @@ class Pipeline:
             job = self._started(str(endpoint))
             reader = stack.enter_context(RunReader(job, endpoint, self._start, folder, live=self.live))
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
+            if self._state is not None:
+                stack.callback(_store_position, self._state, self._job, reader)
             stack.callback(reader.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._reader, self._stack = str(endpoint), reader, stack.pop_all()
             self._pid = os.getpid()  # a copy of this process that is forked later does not end the run
@@ -410,15 +414,22 @@ class Pipeline:
         """The track after which the run continues."""
         if self._resumed_job is None:
             return Position()
-        if self._after is not None and not self.live:
-            return self._after
+        after = self._after or self._resumed_job.read
+        if after is not None and not self.live:
+            return after
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
-        return max(self._learned, self._after or self._learned, key=lambda start: start.seq)
+        return max(self._learned, after or self._learned, key=lambda start: start.seq)
 
     @cached_property
     def _learned(self) -> Position:
         """The position of the checkpoint from which the run is resumed."""
         return position(self._state) if self._state is not None else Position()
+
+
+def _store_position(state: Path, job: Job, reader: RunReader) -> None:
+    """Store how far the program has read: the checkpoint may be ahead of it."""
+    with suppress(ServiceError):  # on a full disk, the run is resumed from its checkpoint
+        replace(job, read=reader.position).save(state)
 
 
 def _check(job: Job, record: Path | None, *, is_new: bool) -> None:

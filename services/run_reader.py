@@ -51,6 +51,7 @@ class RunReader:
     def __init__(self, job: Job, endpoint: Endpoint, start: Position, folder: Path, *, live: bool) -> None:
         self.end: End | None = None
         self.rows = 0
+        self._before = self._last = start  # the positions of the last two frames
         self.health: dict[str, Health] = {}
         self._live = live
         boxes = {name: ObjectPosition(box) for name, box in job.boxes.items()}
@@ -66,6 +67,11 @@ class RunReader:
             self.supervisor = Supervisor(job, folder)
             self._processes.callback(self.supervisor.stop, self._receive_rest)
             self._stack = stack.pop_all()
+
+    @property
+    def position(self) -> Position:
+        """Of the last frame of which all tracks were returned, at first that after which the run starts."""
+        return self._before if self._rest else self._last
 
     def next_track(self) -> Generator[Wait, None, Track | None]:
         """Wait for the next track, and return it; None at the end. A frame may have been read in part before.
@@ -149,7 +155,8 @@ class RunReader:
                 name: ObjectPosition(each.box) if each.box is not None else self._found.get(name, ObjectPosition())
                 for name, each in message.tracks.items()
             }
-            self._incoming.acknowledge(Position(message.seq, message.frame, self._found))
+            self._before, self._last = self._last, Position(message.seq, message.frame, self._found)
+            self._incoming.acknowledge(self._last)
             self.rows += len(message.tracks)
             return message
         if message is not None:

@@ -18,6 +18,7 @@ import msgspec
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
+from catstream.messages.kinds import Position
 from catstream.messages.names import UNNAMED, check_count, check_name, listed
 from catstream.settings import Settings
 
@@ -69,6 +70,7 @@ class Job:
     size      width and height of a frame, None if that is not known yet
     started   seconds since 1970 at which the run first started
     results   files that `catstream track` writes
+    read      the last track that the program of the run has received, None while it runs and if it was killed
 
     The others hold for one start of the run, and are not in the copy that is kept:
 
@@ -89,6 +91,7 @@ class Job:
     size: tuple[int, int] | None = None
     started: float = 0.0
     results: Results = Results()
+    read: Position | None = None
     endpoint: str = ""
     state: Path | None = None
     resume: bool = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import pytest
 
@@ -61,6 +62,39 @@ def test_a_run_that_was_paused_or_has_no_object_left_says_so_when_it_is_resumed(
     assert Pipeline(resume=state).holding == "paused"
     replace(desired, objects={}).save(state / DESIRED)
     assert Pipeline(resume=state).holding == "waiting"
+
+
+def test_a_run_whose_program_has_left_it_resumes_with_the_next_frame_without_a_difference(video, tmp_path, until):
+    path, truth = video
+    settings, whole = {"run.lockstep": True}, []
+    with Pipeline(path, truth[0], settings) as pipeline:
+        whole += pipeline
+    trained = next(n for n in range(8, len(whole)) if whole[n].model_version < whole[n + 1].model_version)
+    with Pipeline(path, truth[0], settings, state=tmp_path / "state") as pipeline:
+        before = [*islice(pipeline, trained)]
+        until(lambda: pipeline._reader._incoming.pending())
+    assert position(tmp_path / "state").seq == trained + 1, "the checkpoint is ahead"
+    with Pipeline(resume=tmp_path / "state") as pipeline:
+        assert before + list(pipeline) == whole
+
+
+def test_a_program_that_is_slower_than_the_detector_misses_no_frame_when_it_resumes(video, tmp_path, until):
+    path, truth = video
+    with Pipeline(path, truth[0], state=tmp_path / "state") as pipeline:
+        first = next(iter(pipeline))
+        until(lambda: position(tmp_path / "state").seq > 9)
+    with Pipeline(resume=tmp_path / "state") as pipeline:
+        assert [first.frame, *(track.frame for track in pipeline)] == list(range(len(truth)))
+
+
+def test_a_frame_of_which_a_program_has_not_received_all_tracks_is_repeated_when_it_resumes(video, tmp_path):
+    path, truth = video
+    with Pipeline(path, {"anna": truth[0], "ben": truth[0]}, state=tmp_path / "state") as pipeline:
+        before = [*islice(pipeline, 2 * 8 + 1)]
+    with Pipeline(resume=tmp_path / "state") as pipeline:
+        after = [(track.frame, track.object) for track in pipeline]
+    assert (before[-1].frame, before[-1].object) == after[0]
+    assert after == [(frame, name) for frame in range(8, len(truth)) for name in ("anna", "ben")]
 
 
 def test_a_model_that_could_not_be_saved_is_an_error_before_the_run(video, tmp_path):
