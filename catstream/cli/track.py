@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,6 @@ from catstream.cli.output import messages
 from catstream.cli.progress import RunProgress
 from catstream.cli.serving import PORT, Address, AddressType, with_token
 from catstream.errors import RecordingError, ServiceError, require_extra
-from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results
@@ -333,17 +332,17 @@ class _Run:
     def _write_tracks(self, stack: ExitStack) -> None:
         """Write every track to all files, which the stack closes, and show the progress."""
         with self._progress.progress(self._console) as progress:
-            write: Callable[[Mapping[str, Track], float], None] | None = None
+            resume = self._request.resume is not None
+            # A frame that arrives while the files are written again would be in none of them after Ctrl-C.
+            write = stack.enter_context(self._files.opened(resume=True)) if resume else None
             moment = time.perf_counter()
             for tracks in self._pipeline.by_frame():
-                # The files are opened with the first track: a run that cannot start does not change older results.
-                write = write or stack.enter_context(self._files.opened(resume=self._request.resume is not None))
+                # New files are opened with the first track: a run that cannot start does not change older results.
+                write = write or stack.enter_context(self._files.opened())
                 before, moment = moment, time.perf_counter()
                 with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                     write(tracks, moment - before)
                     self._progress.show(progress, tracks)
-            if write is None and self._request.resume is not None:  # no frames were left, but a file may be new
-                stack.enter_context(self._files.opened(resume=True))
 
     def _print_summary(self) -> None:
         folder = [self._files.output] if self._files.output is not None else []

@@ -198,6 +198,15 @@ def test_new_results_of_a_run_to_resume_have_all_frames_although_the_models_are_
     assert frames(killed / "new") == [*range(32)]
 
 
+def test_the_files_of_a_resumed_run_are_written_again_before_it_receives_a_frame(killed, said, monkeypatch):
+    monkeypatch.setattr(Pipeline, "by_frame", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+    table = killed / "out" / "demo.csv"
+    whole = table.read_bytes()
+    table.write_bytes(whole + b"32,1.0")
+    assert said("track", "--resume", killed / "kept")[0] == 130
+    assert table.read_bytes() == whole
+
+
 @pytest.mark.parametrize("words", [["track", "--resume"], ["save", "one", "--state"]], ids=" ".join)
 def test_a_file_is_not_the_folder_of_a_run(fail, tmp_path, words):
     (tmp_path / "walk.mp4").write_bytes(b"a video")
