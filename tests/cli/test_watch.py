@@ -153,7 +153,7 @@ def test_status_shows_all_processes(resting, said, until):
 def test_status_has_a_json_form(resting, succeed, until):
     def at_rest():
         output, _ = succeed("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
-        return (found := json.loads(output))["frames_per_second"] == 0 and found
+        return (found := json.loads(output))["frames_per_second"] == 0 and found["leaves"] and found
 
     found = until(at_rest)  # nobody takes its tracks
     assert found["ok"]
