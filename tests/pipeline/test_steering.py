@@ -275,8 +275,8 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
 def test_a_picture_of_a_live_source_has_the_number_and_the_boxes_of_the_track_of_its_frame(video, camera):
     path, boxes = video
     with open_source(path) as source:
-        images = [frame.image for frame, _ in zip(source, range(4), strict=False)]
-    moving = camera(lambda number: images[number % 4])
+        images = [frame.image for frame, _ in zip(source, range(23), strict=False)]
+    moving = camera(lambda number: images[number % 23])  # a picture that is the same as the last one is not received
     with (
         steered(moving.url) as (pipeline, steering, _),
         subscribe(pipeline.endpoint, "previews", timeout=SECONDS) as pictures,
