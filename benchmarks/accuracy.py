@@ -24,20 +24,6 @@ from catstream.applications.evaluation.summary import rows_of
 from catstream.errors import SettingsError
 from catstream.settings import Settings
 
-__all__ = [
-    "accuracy_command",
-    "available",
-    "changed",
-    "compared",
-    "described",
-    "difference",
-    "many_sequences",
-    "means",
-    "shortened",
-    "starts_of",
-    "videos",
-]
-
 #: Headings for the values of `means`.
 MEANS = ("AUC", "success", "precision")
 

@@ -35,8 +35,6 @@ from catstream.wire.channels import CHANNELS, MODELS, RESULTS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
-__all__ = ["HOSTS", "LINKS", "Arena", "Link", "small_disk"]
-
 #: Address of each process; the consumer of the tracks has that of the detector.
 HOSTS = {"compressor": "127.0.0.1", "trainer": "127.0.0.2", "detector": "127.0.0.3"}
 

@@ -9,7 +9,5 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-__all__ = ["CHECK", "TUNED"]
-
 _NAMES = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 TUNED, CHECK = frozenset(_NAMES["tuned"]), frozenset(_NAMES["check"])

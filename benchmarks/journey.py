@@ -19,8 +19,6 @@ from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import ALL_FRAMES
 
-__all__ = ["Journey", "draw", "travel"]
-
 
 class Look(NamedTuple):
     """Resident memory in megabytes and processor time in seconds of a process at one moment."""

@@ -26,8 +26,6 @@ from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
-__all__ = ["chosen", "each", "features", "hits", "learning_command", "model_of", "tracked", "training_frames"]
-
 _LEAST, _MOST = 20, 250  # frames that a model is learned from
 Task, Result = TypeVar("Task"), TypeVar("Result")
 

@@ -16,8 +16,6 @@ from groups import CHECK, TUNED
 from sections import DOCS, Page, Record, Section, Shown, every, filled, records, select, written
 from table import Cell, Table
 
-__all__ = ["MARKED", "PAGES", "shown", "with_figures"]
-
 _NOTES = Path(__file__).parent
 _README = _NOTES.parent / "README.md"
 _MARKS = re.compile(r"(<!-- results: .*? -->\n).*?(<!-- /results -->)", re.DOTALL)

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 from table import Table, text
 
-__all__ = ["DOCS", "RECORDS", "Page", "Record", "Section", "Shown", "every", "filled", "records", "select", "written"]
-
 RECORDS = Path(__file__).parent / "results"
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -16,8 +16,6 @@ from catstream.tracker import Tracker
 from catstream.video import demo
 from catstream.video.source import open_source
 
-__all__ = ["FIRST", "named", "objects", "rendered", "scratch", "sequences", "video"]
-
 FIRST = "first"  #: name of the object of a sequence, if it is one of several
 
 _QUICK_FRAMES = 8

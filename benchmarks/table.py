@@ -21,8 +21,6 @@ from catstream.errors import CatstreamError
 from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 
-__all__ = ["Cell", "Table", "benchmark", "command", "mean_and_error", "plots", "publish", "text"]
-
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
 _PLACES = (

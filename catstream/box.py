@@ -14,8 +14,6 @@ from typing import NamedTuple, Self
 
 from catstream.errors import BoxError
 
-__all__ = ["Box", "Window"]
-
 
 class _Rectangle(NamedTuple):
     """A rectangle in pixels: top left corner, width and height."""

@@ -13,29 +13,6 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-__all__ = [
-    "EXTRAS",
-    "BoxError",
-    "CatstreamError",
-    "CommandRejectedError",
-    "FencedError",
-    "FleetError",
-    "FrameError",
-    "MissingExtraError",
-    "MissingFileError",
-    "ObjectError",
-    "ProtocolError",
-    "RecordingError",
-    "ServiceError",
-    "SettingsError",
-    "SilenceError",
-    "StoreError",
-    "StreamRewoundError",
-    "VideoError",
-    "install_command",
-    "require_extra",
-]
-
 
 class CatstreamError(Exception):
     """Base class of all errors that catstream raises on purpose."""

@@ -39,8 +39,6 @@ from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 from catstream.video.image import as_bgr
 
-__all__ = ["MultiTracker"]
-
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 

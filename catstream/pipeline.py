@@ -36,8 +36,6 @@ from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.readable import finish, finish_async
 
-__all__ = ["Pipeline"]
-
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _CLOSED = ExitStack()  # marks a pipeline that was closed
 

@@ -25,20 +25,6 @@ from msgspec import Meta
 
 from catstream.errors import SettingsError
 
-__all__ = [
-    "PRESETS",
-    "BeliefSettings",
-    "CoresetSettings",
-    "ExtentSettings",
-    "RunSettings",
-    "SearchSettings",
-    "Settings",
-    "TeachingSettings",
-    "Value",
-    "describe",
-    "flat",
-]
-
 #: The value of a setting.
 Value = str | int | float | bool
 

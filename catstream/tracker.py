@@ -16,8 +16,6 @@ from catstream.multi import MultiTracker
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 
-__all__ = ["Tracker"]
-
 
 class Tracker:
     """Follows one object, frame by frame; used like a `cv2.Tracker`.

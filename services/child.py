@@ -14,8 +14,6 @@ from catstream.services.start_server import StartedProcess, StartRequest, start_
 from catstream.services.timing import LOOK_SECONDS, STEP_SECONDS, STOPPED_SECONDS
 from catstream.services.watchdog import Watchdog
 
-__all__ = ["Child"]
-
 
 class Child:
     """One process of a job, which can be restarted.

@@ -19,8 +19,6 @@ from catstream.services.actions import Action, Conclude, SetBox
 from catstream.services.core_state import STOPPED, Known, Phase, Request, State
 from catstream.services.desired import DesiredObject
 
-__all__ = ["begun", "carried_out", "concluded", "next_box", "rejected_boxes", "waited"]
-
 #: Commands whose effect does not depend on the frame at which they arrive.
 _AT_ANY_FRAME = ("pause", "resume", "stop")
 

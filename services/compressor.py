@@ -31,8 +31,6 @@ from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher
 
-__all__ = ["main", "prepare"]
-
 
 def prepare() -> None:
     """Import everything that a reduction and a checkpoint need."""

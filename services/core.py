@@ -36,8 +36,6 @@ from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.timing import FEATURES_END_SECONDS, RESULTS_END_SECONDS
 from catstream.wire.timing import EARLY_SECONDS
 
-__all__ = ["Event", "History", "handle"]
-
 #: For the end to be stored, once the process was asked to end.
 _END_SECONDS = {"features": FEATURES_END_SECONDS, "results": RESULTS_END_SECONDS}
 _EVENTS = 1000  # that are kept

@@ -10,8 +10,6 @@ from catstream.box import Box, Window
 from catstream.messages.kinds import Command
 from catstream.services.desired import DesiredState
 
-__all__ = ["STOPPED", "Known", "Phase", "Progress", "Request", "Rules", "Saved", "State"]
-
 #: The reason of a stream's end, if a command stopped it.
 STOPPED = "it was stopped by a command"
 

@@ -12,8 +12,6 @@ from catstream.box import Box
 from catstream.errors import ProtocolError
 from catstream.messages import storage
 
-__all__ = ["DESIRED", "DesiredObject", "DesiredState", "PastObject"]
-
 #: Name of the file, in the folder of the state.
 DESIRED = "desired_state.json"
 

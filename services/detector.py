@@ -46,8 +46,6 @@ from catstream.wire.channels import CONTROL, MODELS
 from catstream.wire.commands import Responder
 from catstream.wire.newest import Subscriber
 
-__all__ = ["main", "opening_seconds", "prepare"]
-
 _EVENTS_FILE = "detector_events.ndjson"  # in the folder of the state, after a crash
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 

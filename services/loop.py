@@ -24,16 +24,6 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.rejects import rejects
 
-__all__ = [
-    "PERMANENT_FAILURE",
-    "RECORDER",
-    "SOURCE_FAILED",
-    "Process",
-    "die_with",
-    "log_as",
-    "run",
-]
-
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
 

@@ -12,8 +12,6 @@ from catstream.messages import storage
 from catstream.run.learned import Learned
 from catstream.services.core_state import Saved
 
-__all__ = ["ModelFiles"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -19,26 +19,6 @@ from catstream.errors import ObjectError
 from catstream.messages.names import boxes_by_name, split_name
 from catstream.settings import PRESETS, Settings
 
-__all__ = [
-    "FOLDER",
-    "PATH",
-    "Command",
-    "Decorator",
-    "NumberRange",
-    "combined",
-    "with_files",
-    "with_given",
-    "with_json",
-    "with_keys",
-    "with_model",
-    "with_object",
-    "with_overwrite",
-    "with_part",
-    "with_reading",
-    "with_settings",
-    "with_skip_damaged",
-]
-
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]
 _Converter = Callable[[dict[str, str]], object]

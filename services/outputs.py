@@ -13,8 +13,6 @@ from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES, RESULTS, TRACKS, TRAINING
 from catstream.wire.newest import Publisher
 
-__all__ = ["DataSender", "Outputs"]
-
 #: Sends one of the two streams that are received without a loss.
 DataSender = Sender[Features | End] | Sender[Tracks | End]
 

@@ -14,8 +14,6 @@ from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
-__all__ = ["Previews"]
-
 _SIDE = 640  # longest side of a picture, in pixels
 
 

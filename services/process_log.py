@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from typing import BinaryIO
 
-__all__ = ["ProcessLog"]
-
 _LAST_LINE = 2000  # bytes at the end of the log in which the last line is searched for
 _STEP = 65536  # bytes of the log that are read at once
 

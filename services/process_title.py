@@ -8,8 +8,6 @@ import signal
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["is_ending", "is_suspended", "process_fields", "set_process_title"]
-
 _SET_NAME = 15  # PR_SET_NAME
 #: Fields of /proc/PID/stat: the state, the flags, the signals that wait, and the addresses of the command's arguments.
 _STATE, _FLAGS, _SIGNALS, _ARGUMENTS = 3, 9, 31, slice(48, 50)

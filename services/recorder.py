@@ -13,8 +13,6 @@ from catstream.wire.channels import HEALTH, MODELS, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
-__all__ = ["Recorder"]
-
 
 class Recorder:
     """Subscribes to a pipeline and writes each message once; a context manager.

@@ -23,9 +23,6 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 from catstream.wire.readable import Turns, Wait
 
-__all__ = ["RunReader"]
-
-
 _log = logging.getLogger(__name__)
 
 

@@ -15,8 +15,6 @@ from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
-__all__ = ["SavedModels"]
-
 
 class SavedModels(Publisher[SavedModel]):
     """Sends the trees of each object after each new sample, at most once a second; nothing without subscribers."""

@@ -20,8 +20,6 @@ from typing import Any
 
 from catstream import errors
 
-__all__ = ["SPAWN", "environment", "import_path", "python_command", "sigint_blocked"]
-
 
 def python_command(program: str, *arguments: str) -> list[str]:
     """The command that runs a program with the modules of this process; run it with the variables of `environment`.

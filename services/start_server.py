@@ -59,18 +59,6 @@ from catstream.services.process_title import is_ending, is_suspended, process_fi
 from catstream.services.start import environment, import_path, python_command
 from catstream.services.timing import KILLED_SECONDS, LOOK_SECONDS, SHARED_SECONDS, STOPPED_SECONDS
 
-__all__ = [
-    "NAMES",
-    "StartRequest",
-    "StartServer",
-    "StartedProcess",
-    "main",
-    "run_started",
-    "share_start_server",
-    "start_server",
-    "start_server_lines",
-]
-
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
 

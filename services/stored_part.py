@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 
 from catstream.messages.kinds import End, Position
 
-__all__ = ["StoredPart"]
-
 _REST = 9.0  # from one checkpoint to the next, times the duration of the last one
 
 

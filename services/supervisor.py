@@ -30,8 +30,6 @@ from catstream.video.frames import without_password
 from catstream.video.source import is_live
 from catstream.wire.endpoint import meeting_place, private_folder
 
-__all__ = ["Supervisor", "main"]
-
 _log = logging.getLogger(__name__)
 
 

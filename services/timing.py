@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from catstream.wire.timing import PATIENCE_SECONDS, REPORT_SECONDS
 
-__all__ = ["ORDER"]
-
 # Turns of loops.
 TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
 MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message

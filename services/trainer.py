@@ -10,8 +10,6 @@ from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
 
-__all__ = ["main", "prepare"]
-
 _NONE = {"version": 0.0, "trained": 0.0}
 
 

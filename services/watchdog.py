@@ -12,8 +12,6 @@ import time
 
 from catstream.services.timing import LONGEST_STUCK_SECONDS, START_SECONDS, STUCK_SECONDS
 
-__all__ = ["Watchdog"]
-
 _SIZE = 16  # two float64: turns, and patience
 _TURNS_LONG = 5.0  # patience as a multiple of the slowest recent turn
 _FADES = 0.99  # factor by which the slowest recent turn is forgotten with each turn

@@ -27,8 +27,6 @@ from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
-__all__ = ["Recipe", "follow_all"]
-
 
 @dataclass(frozen=True, slots=True)
 class Recipe:

@@ -13,8 +13,6 @@ from catstream.cli.interrupts import INTERRUPTS, stopped
 from catstream.cli.output import complain
 from catstream.errors import CatstreamError
 
-__all__ = ["COMMANDS", "load_command", "main"]
-
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
 COMMANDS = {
     "track": "Track objects in a video.",

@@ -10,8 +10,6 @@ from catstream.client.subscription import wait_until_running
 from catstream.services.options import NumberRange, combined, with_keys
 from catstream.wire.endpoint import Endpoint
 
-__all__ = ["wait_for_pipeline", "with_endpoint", "with_fleet_address", "with_wait"]
-
 
 def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
     if endpoint and (stream or fleet):

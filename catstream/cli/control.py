@@ -20,8 +20,6 @@ from catstream.run.job import Job
 from catstream.run.state import learned
 from catstream.services.options import FOLDER, PATH, NumberRange, combined, with_overwrite
 
-__all__ = ["forget", "pause", "resume", "save", "search", "set_box", "stop"]
-
 
 @dataclass(frozen=True, slots=True)
 class _Target:

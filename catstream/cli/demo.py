@@ -14,8 +14,6 @@ from catstream.cli.output import line_of, messages
 from catstream.cli.track import track
 from catstream.services.options import PATH
 
-__all__ = ["demo"]
-
 Truth = TypeVar("Truth")
 
 

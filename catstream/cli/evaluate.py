@@ -20,8 +20,6 @@ from catstream.settings import Settings
 if TYPE_CHECKING:
     from catstream.applications.evaluation.summary import Row
 
-__all__ = ["evaluate"]
-
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)

@@ -11,8 +11,6 @@ from catstream.errors import ServiceError
 from catstream.messages.storage import why_not_writable, writing
 from catstream.services.options import PATH
 
-__all__ = ["check_file", "with_json_file", "write_json"]
-
 
 def check_file(file: Path, *, overwrite: bool, made: Path | None = None) -> None:
     """Check before the work that a file can be written.

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from catstream.applications.finding.search import Search
     from catstream.applications.finding.sightings import FileResult
 
-__all__ = ["find"]
-
 _SHOWN = 12  # intervals that are printed
 
 

@@ -33,8 +33,6 @@ from catstream.services.options import PATH, with_json, with_keys, with_overwrit
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
 
-__all__ = ["fleet"]
-
 _STARTED = ("running", "waiting", "paused", "ended", "failed", "unplaced")
 
 

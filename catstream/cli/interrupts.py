@@ -10,8 +10,6 @@ from typing import NoReturn
 
 import click
 
-__all__ = ["INTERRUPTED", "INTERRUPTS", "Interrupts", "stopped"]
-
 #: Exit code of a command that was interrupted.
 INTERRUPTED = 130
 

@@ -10,8 +10,6 @@ from catstream.services.options import PATH
 from catstream.wire.channels import CHANNELS, Role
 from catstream.wire.keys import ROLES, allow, clients, create, revoke
 
-__all__ = ["keys"]
-
 _folder = click.argument("folder", metavar="DIR", type=PATH)
 _name = click.argument("name")
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from catstream.applications.loadtest.limits import Limit
     from catstream.applications.loadtest.run import Result
 
-__all__ = ["loadtest"]
-
 _FAILED = 1  # exit code if a limit was not met or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 _FIND = ("p99=0.1", "skipped=0.01")  # limits of a search if none are given

@@ -13,8 +13,6 @@ from catstream.run.learned import Learned
 from catstream.run.learned import merge as merged
 from catstream.services.options import PATH, with_overwrite
 
-__all__ = ["merge"]
-
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")

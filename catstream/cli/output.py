@@ -11,8 +11,6 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["complain", "line_of", "messages", "screen", "table"]
-
 _WIDTH = 140  # columns of a table that is not printed to a terminal
 _BAR = 24  # columns of the bar, at most
 _SHORTEST_BAR = 6

@@ -16,8 +16,6 @@ from catstream.messages.names import UNNAMED, counted
 from catstream.pipeline import Pipeline
 from catstream.sinks.sink import STDOUT
 
-__all__ = ["RunProgress"]
-
 _SHORTEST_SECONDS = 1.0  # of a run whose rate is told
 
 

@@ -20,8 +20,6 @@ from catstream.wire.channels import TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
-__all__ = ["record"]
-
 _END_SECONDS = 1.0  # at most, between the ends of the tracks and of the features
 
 

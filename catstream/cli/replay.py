@@ -18,8 +18,6 @@ from catstream.sinks.recording.learning import Prequential, Retraining, learn, p
 from catstream.sinks.recording.player import Player
 from catstream.wire.endpoint import Endpoint, meeting_place, private_folder
 
-__all__ = ["replay"]
-
 
 @click.command()
 @click.argument("recording", type=PATH)

@@ -11,8 +11,6 @@ import click
 from catstream.errors import ServiceError
 from catstream.services.options import PATH, Decorator, combined
 
-__all__ = ["PORT", "Address", "AddressType", "with_token"]
-
 #: The port of the page if none is given.
 PORT = 8000
 

@@ -12,8 +12,6 @@ from catstream.errors import SettingsError
 from catstream.services.options import with_json
 from catstream.settings import describe
 
-__all__ = ["settings"]
-
 
 @click.command()
 @click.argument("words", nargs=-1, metavar="[WORD]...")

@@ -20,8 +20,6 @@ from catstream.wire.channels import TRAINING
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
-__all__ = ["sink"]
-
 _RUN_SECONDS = 1.0  # time-out for the message with the settings of the run
 
 

@@ -20,8 +20,6 @@ from catstream.messages.names import counted
 from catstream.services.options import NumberRange, with_json
 from catstream.wire.channels import CHANNELS
 
-__all__ = ["status"]
-
 _NAMES = CHANNELS["health"].senders
 
 

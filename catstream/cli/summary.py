@@ -27,8 +27,6 @@ from catstream.sinks.recording.learning import require_features
 if TYPE_CHECKING:
     from catstream.applications.summaries.sheet import Sheet
 
-__all__ = ["summary"]
-
 _RECORDING = ".mcap"
 _SETTINGS = "--settings, --preset or --set"
 

@@ -37,8 +37,6 @@ from catstream.sinks.recording.file import Recording
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT
 
-__all__ = ["track"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Request:

@@ -13,8 +13,6 @@ from catstream.services.options import with_keys
 if TYPE_CHECKING:
     from catstream.web.app import Site
 
-__all__ = ["fleet_view", "view"]
-
 _with_listen = click.option(
     "--listen",
     default=f"127.0.0.1:{PORT}",

@@ -23,8 +23,6 @@ from catstream.client.subscription import AnyMessage, Subscription
 from catstream.messages.heads import APPEARANCE, GROUPS, TREES
 from catstream.messages.kinds import Features, Health, Model, Preview, Sample, Track
 
-__all__ = ["watch"]
-
 _RATE_SECONDS = 2.0  # interval of the mean rate
 _ROWS = 16  # number of messages that a terminal shows
 _REFRESHES = 8  # per second

@@ -29,8 +29,6 @@ from catstream.wire.endpoint import Place, find, is_deserted, source_at
 from catstream.wire.newest import Subscriber
 from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
 
-__all__ = ["Control", "control"]
-
 
 class Control:
     """Sends commands to one running pipeline; close it, or use it in a `with`. Several clients may connect at once.

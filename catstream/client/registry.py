@@ -35,18 +35,6 @@ from catstream.wire.endpoint import Endpoint, Place, find, fleets, meeting_place
 from catstream.wire.keys import Keys
 from catstream.wire.timing import ANSWER_SECONDS, CONTROLLER_SECONDS, QUIET_SECONDS
 
-__all__ = [
-    "REGISTRY_PORT",
-    "FollowedStream",
-    "Registry",
-    "RegistryServer",
-    "address_of",
-    "described",
-    "fleet_and_stream",
-    "follow",
-    "locate",
-]
-
 _log = logging.getLogger(__name__)
 
 Status = TypeVar("Status", StreamStatus, NodeStatus)

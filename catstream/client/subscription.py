@@ -30,8 +30,6 @@ from catstream.wire.newest import GapCounter, Subscriber
 from catstream.wire.readable import Turns, Wait, finish, finish_async
 from catstream.wire.timing import CHECK_SECONDS, DRAIN_SECONDS, REPORT_SECONDS
 
-__all__ = ["AnyMessage", "Subscription", "subscribe", "wait_until_running"]
-
 #: Public name -> channel. Subscribers get features from the channel of copies; `catstream.control` gets saved models.
 _SUBSCRIBABLE = {
     **{name: name for name in ("samples", "models", "tracks", "health", "previews")},

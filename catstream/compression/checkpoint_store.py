@@ -14,8 +14,6 @@ from catstream.errors import ProtocolError, ServiceError
 from catstream.messages.kinds import Position
 from catstream.settings import Settings
 
-__all__ = ["CheckpointStore"]
-
 _KEPT = 2
 _DAMAGED = "damaged"  # name of the newest damaged checkpoint, which is kept for analysis
 

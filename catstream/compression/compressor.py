@@ -21,8 +21,6 @@ from catstream.messages.storage import Arrays, Metadata
 from catstream.numerics.arrays import Bool, Float32
 from catstream.settings import Settings
 
-__all__ = ["Compressor", "sample_of"]
-
 _RIGHT = 0.5  # label of a window that is neither too large nor too small, too wide or too high
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
 

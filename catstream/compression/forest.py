@@ -14,8 +14,6 @@ from catstream.messages.kinds import Features, ObjectPosition, Position, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix
 from catstream.settings import Settings
 
-__all__ = ["Forest"]
-
 _KIND = "forest 2"  # and the version of what a checkpoint holds
 
 

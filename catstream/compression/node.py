@@ -9,8 +9,6 @@ import numpy as np
 
 from catstream.compression.reduce import energy, products, reduce
 
-__all__ = ["Node"]
-
 
 @dataclass(frozen=True, eq=False)
 class Node:

@@ -9,8 +9,6 @@ import numpy as np
 
 from catstream.numerics.arrays import Float32
 
-__all__ = ["energy", "prepare", "products", "reduce", "shrink"]
-
 _TINY = np.float32(1e-30)  # in place of an energy of 0, which nothing can be divided by
 
 

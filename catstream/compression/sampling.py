@@ -15,8 +15,6 @@ import numpy as np
 
 from catstream.compression.node import Node
 
-__all__ = ["sample", "share", "spread"]
-
 _NOTHING = np.empty((0, 0), np.float32)
 
 

@@ -20,8 +20,6 @@ from catstream.messages.kinds import Summary
 from catstream.messages.storage import Arrays, Metadata
 from catstream.numerics.arrays import Float64, is_finite
 
-__all__ = ["REDUCTIONS", "CoresetTree", "FrequentDirections", "pack_trees", "unpack_trees"]
-
 _LEVELS = 64  # no stream has 2**64 leaves
 
 

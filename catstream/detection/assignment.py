@@ -11,8 +11,6 @@ from catstream.box import Box
 from catstream.detection.search import Detection
 from catstream.messages.kinds import DetectorState
 
-__all__ = ["assigned"]
-
 _SAME_PLACE = 0.5  # above this overlap, two boxes are at the same place
 _SHARED = 0.2  # above this overlap of their first boxes, two objects may be at the same place
 

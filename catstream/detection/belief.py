@@ -24,8 +24,6 @@ from types import MappingProxyType
 from catstream.messages.kinds import DetectorState, Level
 from catstream.settings import BeliefSettings
 
-__all__ = ["Policy", "is_redetection", "level_of", "policies", "updated"]
-
 
 @dataclass(frozen=True, slots=True)
 class Policy:

@@ -27,8 +27,6 @@ from catstream.settings import Settings
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel
 
-__all__ = ["Detector", "Result", "looked", "settled", "taught"]
-
 #: The track and the features of an object in one frame.
 Result = tuple[Track, ObjectFeatures]
 

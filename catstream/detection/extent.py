@@ -15,19 +15,6 @@ import numpy as np
 from catstream.box import Window
 from catstream.settings import ExtentSettings
 
-__all__ = [
-    "ASPECT_CHANGE",
-    "SIZE_CHANGE",
-    "Trial",
-    "cost",
-    "followed",
-    "offset_cost",
-    "offset_label",
-    "size",
-    "stretch",
-    "trials",
-]
-
 _SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect ratio that is tried to the next
 #: Change of the logarithm by a step.
 SIZE_CHANGE, ASPECT_CHANGE = math.log(1 + _SIZE_STEP), math.log(1 + _ASPECT_STEP)

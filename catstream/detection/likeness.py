@@ -13,8 +13,6 @@ import numpy as np
 
 from catstream.messages.storage import Arrays
 
-__all__ = ["Likeness"]
-
 _DIRECTIONS = 12  # dimension of the subspace
 
 

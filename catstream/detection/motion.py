@@ -24,8 +24,6 @@ from catstream.messages.kinds import DetectorState, Motion
 from catstream.numerics import kalman
 from catstream.numerics.kalman import TRANSITION
 
-__all__ = ["at_rest", "expected", "measured", "observed", "predicted"]
-
 _COASTING = TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # of a lost object: 0.8 + 0.8**2 + ... = the way of 4 frames in all
 _JUMP = 6.0  # Mahalanobis distance beyond which a measured centre resets the filter
 _UNKNOWN_SPEED = 100.0  # variance of a velocity that has not been measured yet, in process variances of a frame

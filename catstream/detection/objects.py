@@ -16,8 +16,6 @@ from catstream.messages.names import check_count, check_name, errors_about, list
 from catstream.numerics.parallel import in_parallel
 from catstream.settings import Settings
 
-__all__ = ["Detectors", "prepare"]
-
 
 class Detectors:
     """Follows the objects of one stream, each with a detector of its own.

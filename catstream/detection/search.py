@@ -22,17 +22,6 @@ from catstream.messages.heads import ASPECT, EXTENT, SIZE
 from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
-__all__ = [
-    "SAME_OVERLAP",
-    "Detection",
-    "due",
-    "find",
-    "fitted",
-    "local",
-    "seek",
-    "whole",
-]
-
 _MOST_CELLS = 16_384  # limit of a search of the whole frame in one frame, over all sizes: about 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched

@@ -29,17 +29,6 @@ from catstream.messages.kinds import Model, TrainingRows
 from catstream.numerics import ridge
 from catstream.settings import Settings, TeachingSettings
 
-__all__ = [
-    "Training",
-    "affine_copies",
-    "first_training",
-    "hard_negatives",
-    "initial_model",
-    "training_at",
-    "training_beside",
-    "training_of",
-]
-
 #: Training rows by group, as in `Features`; a group without rows is left out.
 Training = dict[str, TrainingRows]
 

@@ -18,8 +18,6 @@ from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, WINDOW, r
 from catstream.features.pyramid import planes_of
 from catstream.numerics.arrays import Float32, Int64, UInt16, writable
 
-__all__ = ["Cells"]
-
 _PLACES = COLOURS.start  # features of the cells of a window, before those of its colours
 
 

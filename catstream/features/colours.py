@@ -17,8 +17,6 @@ from catstream.features.compiled import kernel
 from catstream.features.layout import CHROMA, LIGHT, SHADES, SIDE, WINDOW
 from catstream.numerics.arrays import Float32, UInt8, UInt16, writable
 
-__all__ = ["add_scores", "count", "highest_score", "shades"]
-
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _WEIGHT = 3.0  # length of a histogram as features; that of a window's HOG is about 9
 _COUNTED = WINDOW - 2  # cells along a side of the middle, whose shades are counted

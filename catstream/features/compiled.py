@@ -27,8 +27,6 @@ import numpy as np
 from catstream.features import COMPILING
 from catstream.features.machine import ENTRY, FUNCTIONS, globals_of, processor, target_machine
 
-__all__ = ["kernel"]
-
 _Function = TypeVar("_Function", bound=Callable[..., None])
 
 _METH_FASTCALL = 0x80

@@ -21,8 +21,6 @@ from numba.core.types.npytypes import Array
 
 from catstream.features.machine import ENTRY, FUNCTIONS, globals_of, target_machine
 
-__all__ = ["machine_code"]
-
 _compile = functools.partial(numba.njit, fastmath=True, error_model="numpy")
 _export = functools.partial(numba.cfunc, fastmath=True, error_model="numpy")
 _POINTER, _WORD, _INT = ir.PointerType(), ir.IntType(64), ir.IntType(32)

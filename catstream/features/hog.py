@@ -21,8 +21,6 @@ from catstream.features.layout import CELL, CHANNELS
 from catstream.numerics.arrays import Float32, UInt8
 from catstream.numerics.parallel import Scratch
 
-__all__ = ["grid"]
-
 _ORIENTATIONS = 9
 _SIGNED = 2 * _ORIENTATIONS
 _HALF = CELL // 2

@@ -11,8 +11,6 @@ import numpy as np
 from catstream.features.compiled import kernel
 from catstream.numerics.arrays import UInt8
 
-__all__ = ["converted", "of_colour"]
-
 _LINEAR_BITS, _ROOT_BITS, _SHARE_BITS = 3, 15, 12  # of the fractions of whole numbers
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["CELL", "CHANNELS", "CHROMA", "COLOURS", "LIGHT", "MARGIN", "SHADES", "SIDE", "WINDOW", "row_length"]
-
 CELL = 8  #: pixels a cell is wide and high
 WINDOW = 8  #: cells a window is wide and high
 CHANNELS = 34  #: numbers a cell: 31 HOG, 3 colour

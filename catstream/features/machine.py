@@ -9,8 +9,6 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-__all__ = ["ENTRY", "FUNCTIONS", "globals_of", "processor", "target_machine"]
-
 ENTRY = "kernel"  #: name of the function in the machine code
 #: Functions of Python's C-API that the machine code may call.
 FUNCTIONS = (

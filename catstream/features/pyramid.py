@@ -14,8 +14,6 @@ from catstream.features.layout import CELL, MARGIN, WINDOW
 from catstream.numerics.arrays import Float32, UInt8, UInt32
 from catstream.numerics.parallel import Scratch
 
-__all__ = ["Pyramid", "Region", "planes_of"]
-
 _MOST_CELLS = 62_500  # of the region around a tiny window, which bounds the cost of a large frame
 _OVERLAP = WINDOW + 2 * MARGIN  # cells that adjacent parts of a region share, at least: a window and its margin
 

@@ -12,8 +12,6 @@ from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
 from catstream.messages.kinds import Model
 
-__all__ = ["ScoreMap", "non_maximum_suppression", "vertex"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoreMap:

@@ -17,8 +17,6 @@ from catstream.errors import FleetError, require_extra
 from catstream.fleet.life import Node
 from catstream.fleet.timing import REACH_SECONDS
 
-__all__ = ["NAMESPACE", "actor_name", "actors", "connect", "disconnect", "fleets", "is_local", "nodes"]
-
 #: Namespace of the named actors of all fleets.
 NAMESPACE = "catstream"
 

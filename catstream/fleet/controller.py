@@ -41,8 +41,6 @@ from catstream.services.start_server import share_start_server, start_server
 from catstream.video.frames import without_password
 from catstream.wire.keys import Client, allowed, ensure
 
-__all__ = ["Controller", "warm"]
-
 #: Contents of saved models, by stream and object.
 Models = dict[tuple[str, str], bytes]
 

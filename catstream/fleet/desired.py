@@ -11,8 +11,6 @@ from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.run.job import changed_setting
 from catstream.settings import Settings
 
-__all__ = ["Desired", "objection", "shortage"]
-
 
 @dataclass(frozen=True, slots=True)
 class Desired:

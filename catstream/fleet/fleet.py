@@ -40,8 +40,6 @@ from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import lock
 from catstream.run.learned import Learned
 
-__all__ = ["Fleet"]
-
 
 class Fleet:
     """Connects to the controller of a fleet, which `up` starts. Use it in a `with`.

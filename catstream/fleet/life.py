@@ -12,22 +12,6 @@ from typing import Literal, NamedTuple
 
 from catstream.fleet.timing import ADOPTED_SECONDS, PAUSE_SECONDS, SILENT_SECONDS, STOPPING_SECONDS
 
-__all__ = [
-    "EVENTS",
-    "STATES",
-    "TABLE",
-    "Action",
-    "Event",
-    "Node",
-    "Order",
-    "Seen",
-    "State",
-    "Step",
-    "Wanted",
-    "diff",
-    "event",
-]
-
 State = Literal["absent", "pending", "working", "stopping"]
 Event = Literal["wanted", "reports", "interrupted", "silent", "unwanted", "superseded", "ended", "gone"]
 Action = Literal["", "start", "stop", "restart", "kill"]

@@ -36,8 +36,6 @@ from catstream.messages.storage import is_locked, lock, write_atomically
 from catstream.services import start
 from catstream.wire.endpoint import private_folder
 
-__all__ = ["LocalCluster", "main"]
-
 _ENDED = (0, 1)  # exit codes after SIGTERM: 1 if Ray has handled it
 _DIED = 3  # exit code if the cluster has ended by itself
 _STORE_BYTES = 80 << 20  # of Ray's object store: only models and states that are merged go through it

@@ -20,8 +20,6 @@ from catstream.run import state
 from catstream.run.job import Job
 from catstream.run.learned import Learned, merge
 
-__all__ = ["Merged", "Part", "disjoint", "joined", "merge_in_pairs", "merge_streams", "saved_part"]
-
 Model = TypeVar("Model")
 
 #: The last merged model, among the names of the streams.

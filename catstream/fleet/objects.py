@@ -21,8 +21,6 @@ from catstream.errors import FleetError, StoreError, require_extra
 from catstream.fleet.timing import CONNECT_SECONDS, STORE_SECONDS
 from catstream.messages import storage
 
-__all__ = ["Objects"]
-
 _PROBE = "created-exclusively"
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _CODE = re.compile(r"<Code>(\w{1,64})</Code>")  # in an answer of S3

@@ -44,8 +44,6 @@ from catstream.run.job import Job
 from catstream.settings import Settings, flat
 from catstream.video.source import is_live
 
-__all__ = ["FleetSpec", "StreamSpec", "check_fleet_name", "from_json", "to_json"]
-
 _T = TypeVar("_T")
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")

@@ -48,8 +48,6 @@ from catstream.fleet.spec import check_fleet_name
 from catstream.messages import storage
 from catstream.messages.names import UNNAMED, check_name
 
-__all__ = ["Claim", "Generation", "Listing", "States", "Store"]
-
 _CLAIM, _REMOVED = "claim", "removed"
 _DIGITS = 8  # of a token and of the number of a state in their names
 _KEPT = 2  # newest states

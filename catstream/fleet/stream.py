@@ -54,8 +54,6 @@ from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
 
-__all__ = ["Place", "Report", "Stream", "given_model"]
-
 _LATE = 3.0  # a state that is older than so many intervals is a trouble
 _SKIPPED_SHARE = 0.1  # of the frames of a live source, from which its node counts as too slow
 _LOG_LINES = 1000

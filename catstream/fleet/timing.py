@@ -6,8 +6,6 @@ from catstream.messages.storage import ABANDONED_SECONDS
 from catstream.services.timing import SHUTDOWN_SECONDS
 from catstream.wire.timing import RETRY_SECONDS
 
-__all__ = ["ORDER"]
-
 # The controller.
 TURN_SECONDS = 0.5  #: between two looks at the actors
 REPORT_SECONDS = 0.1  #: longest wait of a look for the reports of all streams

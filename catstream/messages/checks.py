@@ -29,8 +29,6 @@ from catstream.messages.schema import (
 )
 from catstream.numerics.arrays import is_finite
 
-__all__ = ["check_message"]
-
 #: The length that each letter of a shape stands for, in one message.
 _Lengths = dict[str, int]
 #: Raises ProtocolError unless a value keeps its limits.

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["APPEARANCE", "ASPECT", "BETWEEN_RIDGE", "EXTENT", "GROUPS", "HEADS", "SIZE", "TREES", "Head", "Tree"]
-
 #: Training rows of windows at and around the object: label 1 the object, 0 background, between them a near miss.
 APPEARANCE = "appearance"
 #: Training rows of windows of the right and of wrong sizes and aspects at the object: label 1 the right one, towards 0.

@@ -23,39 +23,6 @@ from catstream.box import Box, Window
 from catstream.messages.heads import GROUPS, HEADS, TREES
 from catstream.messages.schema import Array, ByObject, Bytes, Name, Named, OnlyWith, Whole
 
-__all__ = [
-    "Answer",
-    "Command",
-    "DetectorState",
-    "End",
-    "Features",
-    "FleetStatus",
-    "Health",
-    "Level",
-    "Listing",
-    "Model",
-    "Motion",
-    "NodeState",
-    "NodeStatus",
-    "ObjectFeatures",
-    "ObjectPosition",
-    "Position",
-    "Preview",
-    "Question",
-    "Run",
-    "Sample",
-    "SavedModel",
-    "State",
-    "Stored",
-    "StreamState",
-    "StreamStatus",
-    "Summary",
-    "Track",
-    "Tracks",
-    "TrainingRows",
-    "Verb",
-]
-
 State = Literal["bootstrapping", "present", "absent"]
 
 Level = Literal["lost", "redetected", "weak", "confident"]

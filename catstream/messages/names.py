@@ -10,21 +10,6 @@ from itertools import combinations
 from catstream.box import Box
 from catstream.errors import BoxError, ObjectError
 
-__all__ = [
-    "UNNAMED",
-    "Boxes",
-    "boxes_by_name",
-    "check_boxes",
-    "check_count",
-    "check_name",
-    "counted",
-    "doubtful",
-    "errors_about",
-    "is_name",
-    "listed",
-    "split_name",
-]
-
 #: The name of an object that has none.
 UNNAMED = ""
 

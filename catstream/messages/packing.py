@@ -11,8 +11,6 @@ from catstream.box import Box, Window
 from catstream.messages.schema import Array, Field, fields
 from catstream.messages.storage import Arrays, Metadata
 
-__all__ = ["pack", "unpack"]
-
 Message = TypeVar("Message")
 
 

@@ -17,21 +17,6 @@ from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-__all__ = [
-    "LARGEST_INTEGER",
-    "LONGEST_LIST",
-    "LONGEST_TEXT",
-    "Array",
-    "ByObject",
-    "Bytes",
-    "Field",
-    "Name",
-    "Named",
-    "OnlyWith",
-    "Whole",
-    "fields",
-]
-
 Limit = TypeVar("Limit")
 
 LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly

@@ -19,27 +19,6 @@ import numpy as np
 
 from catstream.errors import CatstreamError, ProtocolError, ServiceError
 
-__all__ = [
-    "ABANDONED_SECONDS",
-    "Arrays",
-    "Metadata",
-    "create_atomically",
-    "decode",
-    "encode",
-    "is_locked",
-    "is_writable",
-    "lock",
-    "name_fits",
-    "nearest",
-    "read",
-    "read_metadata",
-    "remove_parts",
-    "why_not_writable",
-    "write",
-    "write_atomically",
-    "writing",
-]
-
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
 #: JSON metadata by name. Code that reads a file checks the entries that it uses.

@@ -7,8 +7,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Bool", "Float32", "Float64", "Int64", "UInt8", "UInt16", "UInt32", "is_finite", "writable"]
-
 Bool = npt.NDArray[np.bool_]
 UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]

@@ -19,8 +19,6 @@ import numpy as np
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
 
-__all__ = ["OBSERVED", "TRANSITION", "constant_velocity", "predicted", "updated"]
-
 TRANSITION = np.eye(4) + np.eye(4, k=2)  #: each position moves on by its velocity
 OBSERVED = np.eye(2, 4)  #: of the state, x and y are measured
 

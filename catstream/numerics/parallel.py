@@ -17,8 +17,6 @@ import numpy as np
 
 from catstream.numerics.threads import one_thread
 
-__all__ = ["FILTERS", "Scratch", "in_parallel"]
-
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 

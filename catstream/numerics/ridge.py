@@ -10,8 +10,6 @@ from functools import partial
 
 import numpy as np
 
-__all__ = ["Regression", "between", "prepare"]
-
 
 def prepare() -> None:
     """Import scipy before the first call, which would otherwise take a quarter of a second longer."""

@@ -11,8 +11,6 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 
-__all__ = ["one_class"]
-
 
 def one_class(rows: np.ndarray, origin: np.ndarray, nu: float = 0.5) -> np.ndarray:
     """Find the direction that holds the rows farthest from an origin.

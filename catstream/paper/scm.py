@@ -26,8 +26,6 @@ from catstream.messages.storage import Arrays, Metadata
 from catstream.numerics.arrays import Float32, Float64, Int64
 from catstream.numerics.parallel import FILTERS
 
-__all__ = ["SparseCollaborativeModel", "prepare"]
-
 _SIDE = 32  # of a template, in pixels
 _PENALTY = 0.01  # lambda of all sparse codes
 _SPREAD = np.array([0.2, 0.2, 0.015, 0.005, 0.01])  # of particles: shares of the size, logarithms, radians

@@ -22,8 +22,6 @@ from catstream.messages.kinds import Position
 from catstream.messages.names import UNNAMED, check_count, check_name, listed
 from catstream.settings import Settings
 
-__all__ = ["Job", "Models", "Results", "files_by_name"]
-
 #: Files of saved models: of one object without a name, or by name.
 Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 

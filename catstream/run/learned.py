@@ -34,8 +34,6 @@ from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
-__all__ = ["Learned", "begun", "check_files", "check_sizes", "merge"]
-
 _KIND = "learned 3"  # and the version of what the file holds
 
 #: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.

@@ -28,8 +28,6 @@ from catstream.run.job import Job
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 
-__all__ = ["SEARCHED", "TREES", "began", "begun", "files", "learned", "locked", "position", "restore", "saved", "skip"]
-
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
 #: Folder of the saved models that objects are searched for by, in that of the state.

@@ -15,8 +15,6 @@ from catstream.messages.names import UNNAMED
 if TYPE_CHECKING:
     from supervision import Detections
 
-__all__ = ["to_supervision"]
-
 
 def to_supervision(tracks: Track | Iterable[Track] | Mapping[str, Track]) -> Detections:
     """Convert a track, or the tracks of a frame, to `supervision.Detections`: a detection for each object present.

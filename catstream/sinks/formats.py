@@ -16,8 +16,6 @@ from catstream.messages.kinds import State, Track
 from catstream.messages.names import check_name
 from catstream.sinks.lines import LineSink
 
-__all__ = ["CsvSink", "MotSink", "NdjsonSink", "StdoutSink", "format_box"]
-
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
 
 

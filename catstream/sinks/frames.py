@@ -13,8 +13,6 @@ from itertools import groupby
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED
 
-__all__ = ["FIRST", "in_order", "objects_of", "whole_frames"]
-
 #: Stands for the objects of the frame before the first one: an object without a name is written last.
 FIRST = frozenset({UNNAMED})
 

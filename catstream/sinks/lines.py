@@ -12,8 +12,6 @@ from typing import IO
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 
-__all__ = ["LineFile", "LineSink"]
-
 
 class LineFile:
     """A text file that grows by whole lines. What was added remains, however this process ends.

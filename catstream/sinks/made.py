@@ -17,8 +17,6 @@ from typing import Any
 from catstream.errors import VideoError
 from catstream.sinks.formats import NdjsonSink
 
-__all__ = ["MADE", "make"]
-
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
 #: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.
 _COLUMNS = {

@@ -28,8 +28,6 @@ from catstream.messages.storage import name_fits, writing
 from catstream.sinks.formats import CsvSink, format_box
 from catstream.sinks.lines import LineFile
 
-__all__ = ["ResultsWriter", "object_files", "objects_of", "read_seconds", "result_files", "table_file"]
-
 _log = logging.getLogger(__name__)
 _File = TypeVar("_File", bound=LineFile)
 

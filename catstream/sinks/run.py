@@ -20,8 +20,6 @@ from catstream.sinks.results import ResultsWriter
 from catstream.sinks.sink import STDOUT, Sink, check_writable, discard, exists, open_files, reader, with_logs
 from catstream.video.frames import RATE
 
-__all__ = ["RunFiles"]
-
 
 @dataclass(frozen=True, slots=True)
 class RunFiles:

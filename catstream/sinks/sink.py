@@ -24,8 +24,6 @@ from catstream.sinks.video import VideoSink
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
-__all__ = ["STDOUT", "SUFFIXES", "Sink", "check_writable", "discard", "exists", "open_files", "reader", "with_logs"]
-
 #: Stands for standard output in place of a file.
 STDOUT = Path("-")
 

@@ -13,8 +13,6 @@ from catstream.video.palette import Colours
 from catstream.video.source import is_live, open_source
 from catstream.video.writer import VideoWriter
 
-__all__ = ["VideoSink"]
-
 
 class VideoSink:
     """An MP4 of the frames that have a track, with the tracks drawn in; it gets its name when it is closed.

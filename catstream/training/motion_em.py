@@ -12,8 +12,6 @@ from catstream.messages.kinds import Motion
 from catstream.numerics.arrays import Bool, Float64
 from catstream.numerics.kalman import OBSERVED, TRANSITION, constant_velocity
 
-__all__ = ["FEWEST", "OBSERVATION_FLOOR", "PROCESS_FLOOR", "learn_motion"]
-
 FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels

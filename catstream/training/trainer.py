@@ -23,8 +23,6 @@ from catstream.paper.one_class import one_class
 from catstream.settings import Settings
 from catstream.training.motion_em import learn_motion
 
-__all__ = ["Trainer"]
-
 
 class Trainer:
     """Trains a linear model of the object; the same sample gives the same model, bit for bit."""

@@ -7,8 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 from catstream.video.frames import Frame, Source
 
-__all__ = ["read_ahead"]
-
 
 def read_ahead(source: Source) -> Generator[Frame]:
     """Yield the frames of a source, and read the next one in a thread meanwhile: FFmpeg decodes without the GIL.

@@ -15,8 +15,6 @@ from catstream.messages.names import UNNAMED
 from catstream.video.image import jpeg
 from catstream.video.palette import Colours, rgb
 
-__all__ = ["draw", "draw_boxes", "draw_preview", "drawn_size", "thumbnail"]
-
 #: Blue, green, red.
 _Point = tuple[float, float]
 _Colour = tuple[int, int, int]

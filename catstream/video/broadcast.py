@@ -23,8 +23,6 @@ from io import BufferedIOBase
 from time import monotonic
 from typing import Any, Self
 
-__all__ = ["Broadcast", "Schedule"]
-
 _TICKS_PER_SECOND = 1_000_000  # time base of the stream
 _STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
 

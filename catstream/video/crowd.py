@@ -18,8 +18,6 @@ from catstream.box import Box
 from catstream.video.sprite import SIZE, VISIBLE, Lake, Sprite, cut_out_dahlia, load_photograph, resized
 from catstream.video.writer import VideoWriter
 
-__all__ = ["FRAMES", "NAMES", "RATE", "SIZE", "render", "write"]
-
 #: Number of frames, and frames per second.
 FRAMES, RATE = 300, 25.0
 

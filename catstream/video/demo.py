@@ -20,8 +20,6 @@ from catstream.messages.names import UNNAMED
 from catstream.video.sprite import SIZE, VISIBLE, Lake, cut_out_dahlia, load_photograph, resized
 from catstream.video.writer import VideoWriter
 
-__all__ = ["FRAMES", "RATE", "SIZE", "Demo", "render", "write"]
-
 #: Number of different frames, and frames per second.
 FRAMES, RATE = 600, 30.0
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from av import AudioStream, FFmpegError, VideoFrame, VideoStream
     from av.container import InputContainer
 
-__all__ = ["RATE", "Frame", "Source", "UprightConverter", "ffmpeg_reason", "video_stream", "without_password"]
-
 #: Frames per second of a source without time stamps, if none is given.
 RATE = 25.0
 

@@ -8,8 +8,6 @@ import numpy as np
 from catstream.errors import FrameError
 from catstream.numerics.arrays import is_finite
 
-__all__ = ["as_bgr", "jpeg"]
-
 _CHANNELS = (1, 3, 4)
 _HALF_STEP = 0.5 / 255  # interpolation may exceed the range from 0 to 1 by this much
 _EXPECTED = "a frame is a numpy array (h, w, 3), blue green red, or (h, w) grey, of uint8, uint16 or float from 0 to 1"

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
 
-__all__ = ["LiveSource"]
-
 #: Time-outs for opening a source and its first frame, and between two frames.
 _OPEN_SECONDS, _SILENT_SECONDS = 10.0, 5.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 8.0

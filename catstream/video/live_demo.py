@@ -29,8 +29,6 @@ from catstream.errors import VideoError
 from catstream.video import demo
 from catstream.video.frames import RATE, Frame, Source
 
-__all__ = ["PREFIX", "LiveDemo", "first_box"]
-
 #: Sources that begin with this are live demos.
 PREFIX = "demo:"
 

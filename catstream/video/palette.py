@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-__all__ = ["PALETTE", "Colours", "rgb"]
-
 #: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture,
 #: draw each beside a dark line, so that it is visible on a light ground too.
 PALETTE = (

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from av import AudioStream, Packet
     from av.container import InputContainer, OutputContainer
 
-__all__ = ["Sound"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -44,18 +44,6 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.stream import Stream
 
-__all__ = [
-    "ALL_FRAMES",
-    "IMAGES",
-    "VIDEOS",
-    "image_files",
-    "is_live",
-    "natural_order",
-    "open_source",
-    "read_image",
-    "source_text",
-]
-
 #: All frames of a source.
 ALL_FRAMES = slice(None)
 

@@ -15,8 +15,6 @@ import numpy as np
 
 from catstream.box import Box
 
-__all__ = ["SIZE", "VISIBLE", "Lake", "Sprite", "cut_out_dahlia", "load_photograph", "resized"]
-
 #: Full size (width, height) of the rendered images in pixels.
 SIZE = (640, 480)
 

@@ -14,8 +14,6 @@ import numpy as np
 from catstream.errors import VideoError
 from catstream.video.sound import Sound
 
-__all__ = ["VideoWriter"]
-
 #: Steps of the video's time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100
 

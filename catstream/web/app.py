@@ -50,8 +50,6 @@ from catstream.web.streams import FleetFeed
 from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
 from catstream.wire.codec import decode_json
 
-__all__ = ["Site", "fleet_site", "pipeline_site"]
-
 _PAGE = Path(__file__).with_name("page")
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.

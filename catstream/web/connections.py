@@ -18,8 +18,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from catstream.errors import ProtocolError
 from catstream.web.timing import ANSWER_SECONDS, REQUEST_SECONDS
 
-__all__ = ["MAX_CONNECTIONS", "Connections", "body_of"]
-
 #: Maximum number of open connections.
 MAX_CONNECTIONS = 256
 

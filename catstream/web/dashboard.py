@@ -14,8 +14,6 @@ from catstream.web.recent import Recent
 from catstream.web.surprising import SurprisingFrames
 from catstream.web.timing import POINT_SECONDS, RATE_SECONDS
 
-__all__ = ["RUNNING", "Dashboard", "FleetDashboard", "Parts"]
-
 #: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
 

@@ -20,8 +20,6 @@ from catstream.web.timing import DRAIN_SECONDS, PAUSE_SECONDS, SILENCE_SECONDS
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
-__all__ = ["Feed", "PipelineFeed"]
-
 _log = logging.getLogger(__name__)
 
 #: Channels that are always read, and those that are read only while a page is open, because they cost the pipeline

@@ -14,8 +14,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from catstream.errors import ServiceError
 
-__all__ = ["Guard", "is_loopback"]
-
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
 

@@ -17,8 +17,6 @@ from catstream.web.feed import Feed, PipelineFeed
 from catstream.web.streams import FleetFeed
 from catstream.wire.channels import CHANNELS
 
-__all__ = ["text"]
-
 _COUNTER, _GAUGE = CounterMetricFamily, GaugeMetricFamily
 
 #: The samples of a metric: value by the values of its labels, a tuple of texts.

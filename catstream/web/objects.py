@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from catstream.messages.kinds import Health, Model, State, Track
 from catstream.video.palette import Colours
 
-__all__ = ["Objects", "ShownObject"]
-
 
 @dataclass(slots=True)
 class ShownObject:

@@ -21,8 +21,6 @@ from catstream.web.connections import MAX_CONNECTIONS, Connections
 from catstream.web.guard import Guard, is_loopback
 from catstream.web.timing import SHUTDOWN_SECONDS
 
-__all__ = ["Server"]
-
 _ALL_ADDRESSES = ("0.0.0.0", "::")  # bind addresses that include all interfaces
 _GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
 

@@ -30,8 +30,6 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 from catstream.wire.readable import readable
 
-__all__ = ["FleetFeed", "StreamFeeds", "TokenBucket"]
-
 _MAX_FEEDS = 32
 
 _WIDTH = 320  # pixels of a small picture

@@ -13,8 +13,6 @@ from catstream.messages.kinds import Features, Model, Preview, TrainingRows
 from catstream.web.recent import Recent
 from catstream.web.timing import APART_SECONDS
 
-__all__ = ["SurprisingFrame", "SurprisingFrames", "surprise"]
-
 _FRAMES = 12
 _PENDING = 64  # number of frames whose picture may still arrive
 

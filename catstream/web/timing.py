@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from catstream.wire import timing as wire
 
-__all__ = ["ORDER"]
-
 # Connections of browsers.
 REQUEST_SECONDS = 5.0  #: limit for a client to send a request, and again for its body
 ANSWER_SECONDS = 20.0  #: without reading its response, after which a client is disconnected

@@ -24,8 +24,6 @@ from catstream.wire.monitor import Event
 from catstream.wire.socket import ChannelSocket
 from catstream.wire.timing import LINGER_SECONDS, PATIENCE_SECONDS
 
-__all__ = ["Receiver", "Sender"]
-
 _REPLIES: tuple[type[Stored | Position], ...] = (Stored, Position)
 
 

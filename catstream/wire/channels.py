@@ -44,24 +44,6 @@ from catstream.messages.kinds import (
     Tracks,
 )
 
-__all__ = [
-    "CHANNELS",
-    "CONTROL",
-    "FEATURES",
-    "HEALTH",
-    "MODELS",
-    "PORT",
-    "PREVIEWS",
-    "REGISTRY",
-    "RESULTS",
-    "SAMPLES",
-    "SAVED_MODELS",
-    "TRACKS",
-    "TRAINING",
-    "Channel",
-    "Role",
-]
-
 #: The permissions of a client: each role includes those before it.
 Role = Literal["watch", "control", "pipeline"]
 

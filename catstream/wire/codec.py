@@ -33,18 +33,6 @@ from catstream.messages.kinds import Position, Stored
 from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT
 from catstream.wire.channels import CHANNELS, REGISTRY
 
-__all__ = [
-    "KINDS",
-    "VERSION",
-    "decode",
-    "decode_json",
-    "decode_with_run",
-    "encode",
-    "encode_json",
-    "opening",
-    "topic_of",
-]
-
 Message = TypeVar("Message")
 
 #: Version of the envelope and of the meaning of the fields.

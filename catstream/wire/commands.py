@@ -20,8 +20,6 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
 from catstream.wire.timing import LOOK_SECONDS, RETRY_BYTES_PER_SECOND, RETRY_SECONDS
 
-__all__ = ["Requester", "Responder"]
-
 _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
 _LONGEST_QUESTION = 1 << 20  # bytes
 _MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client

@@ -8,8 +8,6 @@ from functools import cache
 import zmq
 import zmq.utils.garbage  # with the first message that is not copied, zmq would import it
 
-__all__ = ["arrives", "context"]
-
 _POLLIN = int(zmq.POLLIN)  # an operation with a member of an enumeration would take half as long as to look
 
 

@@ -25,21 +25,6 @@ from catstream.messages.storage import is_locked, lock, writing
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 
-__all__ = [
-    "Endpoint",
-    "Note",
-    "Place",
-    "find",
-    "fleets",
-    "is_deserted",
-    "meeting_place",
-    "names_of_early_subscribers",
-    "note_early_subscriber",
-    "private_folder",
-    "running",
-    "source_at",
-]
-
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")

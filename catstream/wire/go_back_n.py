@@ -32,8 +32,6 @@ from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import Position, Stored
 from catstream.wire.timing import AGAIN_SECONDS, PATIENCE_SECONDS
 
-__all__ = ["HELLO", "Deliver", "ReceiveWindow", "Reject", "Reply", "SendWindow"]
-
 #: The frame by which a sender asks for the receiver's position.
 HELLO = b""
 

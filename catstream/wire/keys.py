@@ -28,20 +28,6 @@ from catstream.errors import ServiceError
 from catstream.messages.storage import create_atomically, write_atomically, writing
 from catstream.wire.channels import Role
 
-__all__ = [
-    "ROLES",
-    "Client",
-    "Keys",
-    "allow",
-    "allowed",
-    "clients",
-    "create",
-    "ensure",
-    "public_key",
-    "revoke",
-    "synchronise",
-]
-
 #: The permissions of a client: each role includes those before it.
 ROLES: tuple[Role, ...] = get_args(Role)
 

@@ -11,8 +11,6 @@ import zmq
 
 from catstream.wire.context import arrives
 
-__all__ = ["Event", "Monitor"]
-
 #: The first frame of a report. zmq.utils.monitor reads it, too, but imports asyncio, in 20 ms.
 _REPORT = struct.Struct("=Hi")
 

@@ -36,8 +36,6 @@ from catstream.wire.endpoint import Endpoint, Note, names_of_early_subscribers, 
 from catstream.wire.socket import ChannelSocket
 from catstream.wire.timing import REPEAT_SECONDS
 
-__all__ = ["GapCounter", "Publisher", "Subscriber"]
-
 _MOST_KEPT = 256  # newest messages that are kept, one of each object
 _MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
 _MAX_CHANGES = 1000  # subscriptions that are processed at once

@@ -14,8 +14,6 @@ from typing import NamedTuple, TypeVar
 
 from catstream.errors import ServiceError
 
-__all__ = ["Turns", "Wait", "finish", "finish_async", "readable"]
-
 Result = TypeVar("Result")
 
 

@@ -11,8 +11,6 @@ import logging
 import threading
 from collections import Counter, OrderedDict
 
-__all__ = ["count", "reject", "rejects"]
-
 _MAX_CAUSES = 1024  # causes that are remembered, the newest ones; each is logged once
 
 _log = logging.getLogger(__name__)

@@ -26,8 +26,6 @@ from catstream.wire.monitor import Event, Monitor
 from catstream.wire.rejects import count, reject
 from catstream.wire.zap import ZAP
 
-__all__ = ["ChannelSocket"]
-
 
 def _milliseconds(seconds: float) -> int:
     return round(seconds * 1000)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["ORDER"]
-
 # Connections, as libzmq and TCP keep them.
 RECONNECT_SECONDS = 0.02  #: before the first attempt to connect again; doubled each time
 RECONNECT_MOST_SECONDS = 0.5  #: between two attempts at most

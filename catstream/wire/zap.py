@@ -22,8 +22,6 @@ from catstream.wire.context import context
 from catstream.wire.keys import ROLES, Keys
 from catstream.wire.rejects import reject
 
-__all__ = ["ZAP", "ZapHandler"]
-
 _ADDRESS = "inproc://zeromq.zap.01"
 _VERSION = b"1.0"
 _ALLOWED, _TRY_LATER, _DENIED = b"200", b"300", b"400"

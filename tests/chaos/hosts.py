@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, Self
 
-__all__ = ["Hosts"]
-
 
 class Hosts:
     """Hosts on one network, 10.77.0.1 and so on, which are removed on close; needs root and Debian's iproute2.

@@ -24,8 +24,6 @@ from catstream.applications.evaluation.datasets import Sequence
 from catstream.errors import SettingsError
 from catstream.numerics.arrays import Float64
 
-__all__ = ["attributes_of", "computed_attributes", "read_attributes"]
-
 _FAST = 20  # pixels a frame
 _RATIO = 2
 _SMALL = 400  # square pixels

@@ -29,8 +29,6 @@ from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64, UInt8
 from catstream.video.source import natural_order, open_source
 
-__all__ = ["Sequence", "find_sequences"]
-
 #: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
 #: boxes.
 _FIRST_FRAMES = {("david", 471): 299}

@@ -11,8 +11,6 @@ from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.numerics.arrays import Bool
 from catstream.video.annotate import thumbnail
 
-__all__ = ["FailureStrip", "failure_strip", "worst_runs"]
-
 #: The frames shown, relative to the first frame of the failure; its last frame is shown too.
 _AROUND = (-20, -5, 0, 5, 20)
 _WIDTH = 240

@@ -24,20 +24,6 @@ import numpy as np
 
 from catstream.numerics.arrays import Bool, Float64
 
-__all__ = [
-    "OVERLAPS",
-    "PIXELS",
-    "LongTerm",
-    "Score",
-    "distances",
-    "is_lost",
-    "long_term",
-    "overlaps",
-    "precision_plot",
-    "score",
-    "success_plot",
-]
-
 #: Thresholds of the success plot (overlap) and of the precision plot (pixels).
 OVERLAPS = np.linspace(0, 1, 21)
 PIXELS = np.arange(51)

@@ -14,8 +14,6 @@ import numpy as np
 
 from catstream.box import Box
 
-__all__ = ["Boxes", "MultipleScores", "score_multiple"]
-
 #: The box of each object in one frame by name; None while it is absent.
 Boxes = Mapping[str, Box | None]
 

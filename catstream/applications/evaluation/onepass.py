@@ -22,8 +22,6 @@ from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 
-__all__ = ["TRACKERS", "evaluate", "follow"]
-
 #: The trackers that can be evaluated.
 TRACKERS = ("catstream", *PEERS)
 

@@ -18,8 +18,6 @@ import numpy as np
 from catstream.box import Box
 from catstream.errors import BoxError, SettingsError, install_command
 
-__all__ = ["MODELS", "OPENCV", "PEERS", "Peer"]
-
 OPENCV: str = cv2.__version__  #: version of OpenCV
 
 #: Name on the command line -> class in OpenCV.

@@ -22,8 +22,6 @@ from catstream import errors
 from catstream.applications.evaluation.peers import OPENCV
 from catstream.settings import Settings
 
-__all__ = ["machine", "provenance"]
-
 _ROOT = Path(errors.__file__).parents[1]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
 

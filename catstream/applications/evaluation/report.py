@@ -26,8 +26,6 @@ from catstream.applications.html.plots import SHARES, Axis, plot
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
-__all__ = ["write_report", "write_strips"]
-
 _STRIPS = 8  # film strips for the first tracker
 _OTHER_STRIPS = 2  # and for each other tracker
 _LEGEND = '<p class="about">White: ground truth. Orange: tracker.</p>'

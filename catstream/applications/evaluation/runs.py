@@ -32,8 +32,6 @@ from catstream.messages.storage import write_atomically, writing
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
-__all__ = ["EvaluationRun", "load", "prepare_folder", "run_name", "save"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluationRun:

@@ -17,19 +17,6 @@ from catstream.applications.evaluation.datasets import Sequence
 from catstream.box import Box
 from catstream.errors import BoxError, VideoError
 
-__all__ = [
-    "FIRST",
-    "SHIFTS",
-    "Start",
-    "Starts",
-    "Variation",
-    "choose_starts",
-    "jittered",
-    "one_pass",
-    "spatial",
-    "temporal",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class Variation:

@@ -11,19 +11,6 @@ from catstream.applications.evaluation.provenance import provenance
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
 
-__all__ = [
-    "FLIP",
-    "MEASURES",
-    "Row",
-    "by_attribute",
-    "cells",
-    "describe_flips",
-    "flips_of",
-    "mean_of",
-    "rows_of",
-    "to_json",
-]
-
 #: The measures of a row that are averaged, with their headings.
 MEASURES = {
     "auc": "AUC",

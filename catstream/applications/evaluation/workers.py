@@ -17,8 +17,6 @@ from catstream.errors import ServiceError
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN, sigint_blocked
 
-__all__ = ["run_tasks"]
-
 _Result = TypeVar("_Result")
 
 

@@ -16,8 +16,6 @@ from catstream.video.ahead import read_ahead
 from catstream.video.frames import Frame, without_password
 from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
 
-__all__ = ["File", "find_files"]
-
 _log = logging.getLogger(__name__)
 
 

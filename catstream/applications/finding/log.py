@@ -20,8 +20,6 @@ from catstream.errors import ServiceError
 from catstream.messages.storage import writing
 from catstream.video.image import jpeg
 
-__all__ = ["SearchLog"]
-
 _KIND = "catstream find 2"  # and the version of the lines
 _GAP_SECONDS = 1.0  # longest time between two sightings of an interval, if steps are short
 _GAP_STEPS = 2.5  # longest time between two sightings of an interval, in steps, if these are long

@@ -13,8 +13,6 @@ from catstream.applications.html.timeline import Bar, clock, legend, timeline
 from catstream.messages.names import counted
 from catstream.video.palette import Colours
 
-__all__ = ["write_report"]
-
 _PICTURES = 24  # of each object, at most
 _TIMELINES = 200  # files with the most sightings, if there are more
 

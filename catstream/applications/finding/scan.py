@@ -25,8 +25,6 @@ from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 
-__all__ = ["SIZES", "THRESHOLD", "Scan", "Seen"]
-
 #: The least score of a sighting.
 THRESHOLD = 0.5
 #: The smallest and the largest size that is searched, as multiples of the learned size.

@@ -23,8 +23,6 @@ from catstream.run.learned import Learned
 from catstream.settings import RunSettings
 from catstream.video.frames import Frame
 
-__all__ = ["EVERY", "Search", "Step", "find", "load_models"]
-
 _One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
 
 #: Seconds of a video between two frames that are searched.

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 
 from catstream.box import Box
 
-__all__ = ["FileResult", "Interval", "Sighting"]
-
 
 @dataclass(frozen=True, slots=True)
 class Sighting:

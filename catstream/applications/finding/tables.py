@@ -12,8 +12,6 @@ from typing import Any
 from catstream.applications.finding.sightings import FileResult, Interval, Sighting
 from catstream.messages import storage
 
-__all__ = ["write_tables"]
-
 _SIGHTING = ("file", "object", "frame", "seconds", "x", "y", "w", "h", "score", "image")
 _INTERVAL = ("file", "object", "begin", "end", "begin_seconds", "end_seconds", "sightings", "best_frame", "best_score")
 

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from catstream.messages.storage import write_atomically, writing
 
-__all__ = ["figure", "table", "write_page"]
-
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; }
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1060px; margin: 2.5rem auto; padding: 0 1rem; }

@@ -10,8 +10,6 @@ from typing import Self
 
 import numpy as np
 
-__all__ = ["COLOURS", "DASHES", "SHARES", "Axis", "plot"]
-
 #: Colours of the curves, in order; distinguishable for colour-blind people, on light and on dark background.
 COLOURS = ("#f25100", "#2b82d9", "#56bf9c", "#a63700", "#30b2f2", "#3f8c7f", "#1c678c")
 

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["Bar", "clock", "legend", "timeline"]
-
 
 @dataclass(frozen=True, slots=True)
 class Bar:

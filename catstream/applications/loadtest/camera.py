@@ -24,8 +24,6 @@ from catstream.video import crowd, demo
 from catstream.video.broadcast import Broadcast, Schedule
 from catstream.video.image import jpeg
 
-__all__ = ["Camera", "Video", "render"]
-
 _QUALITY = 90  # of JPEG, as network cameras use it
 
 

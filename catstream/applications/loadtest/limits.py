@@ -9,8 +9,6 @@ from catstream.applications.loadtest.measures import PERCENTILES, percentiles
 from catstream.applications.loadtest.run import Result
 from catstream.errors import SettingsError
 
-__all__ = ["KINDS", "Limit", "violations"]
-
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:

@@ -11,8 +11,6 @@ from catstream.applications.loadtest.plan import Plan
 from catstream.applications.loadtest.run import Report, Result, run
 from catstream.video import demo
 
-__all__ = ["LoadTest", "find_highest_rate", "run_load_test"]
-
 _LEAST, _MOST = 0.5, 1000.0  # frames per second
 _PRECISION = 0.05  # maximum relative error of the highest rate
 

@@ -16,8 +16,6 @@ from catstream.applications.loadtest.observer import Observations
 from catstream.numerics.arrays import Float64
 from catstream.video.broadcast import Schedule
 
-__all__ = ["PERCENTILES", "Measures", "carried_forward", "latencies_to_answer", "measure", "percentiles"]
-
 #: The percentiles of latencies that are reported, by name.
 PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 

@@ -12,8 +12,6 @@ from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health, Model, Track
 
-__all__ = ["Observations", "observed"]
-
 _POLL_SECONDS = 0.1
 
 

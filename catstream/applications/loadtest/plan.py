@@ -9,8 +9,6 @@ from catstream.messages.names import check_count, counted
 from catstream.settings import Settings
 from catstream.video import crowd, demo
 
-__all__ = ["Plan"]
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:

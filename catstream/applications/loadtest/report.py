@@ -22,8 +22,6 @@ from catstream.applications.loadtest.usage import REST, summary
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64
 
-__all__ = ["Table", "milliseconds", "tables", "to_json", "write_report"]
-
 _STREAMS = 6  # maximum number of curves in a plot
 _SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
 _POINTS = 200  # maximum number of points of a curve over time

@@ -22,8 +22,6 @@ from catstream.errors import ServiceError
 from catstream.numerics.arrays import Float64
 from catstream.video.broadcast import Schedule
 
-__all__ = ["Report", "Result", "run"]
-
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame

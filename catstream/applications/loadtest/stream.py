@@ -11,8 +11,6 @@ from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 
-__all__ = ["Stream"]
-
 _STOP_SECONDS = 30.0  # time-out for a pipeline to start, to answer `stop`, and to end after it
 
 

@@ -16,8 +16,6 @@ from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import GapCounter, Subscriber
 
-__all__ = ["Subscribers"]
-
 _PER_PROCESS = 20  # subscribers in one process, because most machines cannot run a process for each
 #: Maximum number of messages that a subscriber reads at once, and seconds between two reads.
 _QUICK, _SLOW = (64, 0.05), (1, 0.5)

@@ -8,8 +8,6 @@ from typing import NamedTuple
 
 import psutil
 
-__all__ = ["REST", "Usage", "UsageReading", "summary"]
-
 #: Name of the load by other processes of this machine. If it is high, the figures of a load test are unreliable.
 REST = "everything else"
 

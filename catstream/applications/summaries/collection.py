@@ -12,8 +12,6 @@ from catstream.applications.finding.files import find_files
 from catstream.errors import VideoError
 from catstream.video.source import IMAGES, open_source, read_image
 
-__all__ = ["Collection", "Origin"]
-
 
 @dataclass(frozen=True, slots=True)
 class Origin:

@@ -21,8 +21,6 @@ from catstream.numerics.threads import one_thread
 from catstream.video.image import as_bgr
 from catstream.video.source import read_image
 
-__all__ = ["describe", "summarize"]
-
 _SIDE = WINDOW * CELL
 
 

@@ -18,8 +18,6 @@ from catstream.compression.tree import FrequentDirections
 from catstream.errors import SettingsError
 from catstream.numerics.arrays import Float32, Float64
 
-__all__ = ["RowSelection", "Selection", "choose", "exchange"]
-
 _Key = TypeVar("_Key")
 
 _LEAST_SIZE = 128  # rows of the sketch, if k is small

@@ -20,8 +20,6 @@ from catstream.video.annotate import thumbnail
 from catstream.video.frames import without_password
 from catstream.video.source import is_live, open_source
 
-__all__ = ["WIDTH", "Sheet", "json_beside", "pictures_of", "sheet_of_frames", "sheet_of_images"]
-
 #: Width of a picture in pixels.
 WIDTH = 420
 

@@ -21,8 +21,6 @@ from catstream.messages.kinds import Features
 from catstream.numerics.arrays import Bool, Float32
 from catstream.settings import CoresetSettings
 
-__all__ = ["Novelty", "TaughtFrame", "most_taught", "taught_frames"]
-
 _WEAK = 1e-3  # length of a direction, as a share of the longest one, below which it is left out of the span
 
 

@@ -18,8 +18,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO, BinaryIO, cast
 
-__all__ = ["INDEX_SIZE", "MAGIC", "Container", "Entry", "Topic", "end_of_data", "entries", "entry_at"]
-
 #: The first and the last bytes of a file.
 MAGIC = b"\x89MCAP0\r\n"
 #: Bytes of the message index behind a chunk of one message: opcode and length, channel, length, and one time and place.

@@ -41,8 +41,6 @@ from catstream.sinks.recording.container import (
 )
 from catstream.wire.codec import decode, decode_json, encode, encode_json
 
-__all__ = ["TOPICS", "Recorded", "Recording", "RecordingWriter"]
-
 #: The kinds of message in a recording.
 Recorded = Run | Features | Model | Track | Health | End
 _Kind = TypeVar("_Kind", bound=Recorded)

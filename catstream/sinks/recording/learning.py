@@ -20,8 +20,6 @@ from catstream.sinks.recording.file import Recording
 from catstream.training.trainer import Trainer
 from catstream.wire.codec import encode
 
-__all__ = ["Prequential", "Retraining", "learn", "prequential_of_recorded", "require_features"]
-
 
 @dataclass(slots=True)
 class Prequential:

@@ -15,8 +15,6 @@ from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
-__all__ = ["Player"]
-
 _TURN_SECONDS = 0.05  # between two checks for new subscribers
 _CHANNEL = {Features: "training", Model: "models", Track: "tracks"}
 
