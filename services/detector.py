@@ -34,7 +34,7 @@ from catstream.services.actions import Action
 from catstream.services.core import Event, History
 from catstream.services.core_state import Known, Phase, Progress, Request, Rules, State
 from catstream.services.desired import DESIRED, DesiredObject, DesiredState
-from catstream.services.loop import RECORDER, Process
+from catstream.services.loop import Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
 from catstream.services.timing import CLOSE_SECONDS, MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
@@ -237,8 +237,7 @@ class DetectorLoop:
     # What the core is told
 
     def _tell_subscribed(self) -> None:
-        missing, seconds = self._outputs.awaited, time.monotonic() - self._began
-        self.tell(core.Subscribed(RECORDER not in missing, not missing - {RECORDER}, seconds))
+        self.tell(core.Subscribed(True, True, time.monotonic() - self._began))
 
     def _request(self, command: Command) -> Request:
         """A command without the saved model, which is kept here."""

@@ -7,7 +7,6 @@ from typing import Self
 
 from catstream.errors import RecordingError
 from catstream.messages.kinds import End, Health, Model, Track
-from catstream.services.loop import RECORDER
 from catstream.sinks.recording.file import Recorded, RecordingWriter
 from catstream.wire.channels import HEALTH, MODELS, TRACKS
 from catstream.wire.endpoint import Endpoint
@@ -39,9 +38,9 @@ class Recorder:
         self._writer = writer
         with ExitStack() as stack:
             self._subscribers: list[Subscriber[Track | End] | Subscriber[Model] | Subscriber[Health]] = [
-                stack.enter_context(tracks or Subscriber(TRACKS, endpoint, name=RECORDER)),
-                stack.enter_context(Subscriber(MODELS, endpoint, every=True)),
-                stack.enter_context(Subscriber(HEALTH, endpoint, every=True)),
+                stack.enter_context(tracks or Subscriber(TRACKS, endpoint)),
+                stack.enter_context(Subscriber(MODELS, endpoint)),
+                stack.enter_context(Subscriber(HEALTH, endpoint)),
             ]
             self._stack = stack.pop_all()
 

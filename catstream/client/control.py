@@ -27,7 +27,10 @@ from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import Place, find, is_deserted, source_at
 from catstream.wire.newest import Subscriber
-from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
+
+ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
+DESERTED_SECONDS = 1.0  #: for an answer from a folder in which no pipeline seems to run; its detector may be restarted
+REGISTRY_SECONDS = 1.0  #: for the registry before each command; without an answer, the stream has not moved
 
 
 class Control:

@@ -14,14 +14,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from msgspec import Meta
 
 from catstream.box import Box, Window
+from catstream.errors import ProtocolError
 from catstream.messages.heads import GROUPS, HEADS, TREES
-from catstream.messages.schema import Array, ByObject, Bytes, Name, Named, OnlyWith, Whole
+from catstream.messages.schema import (
+    LARGEST_INTEGER,
+    LONGEST_LIST,
+    Array,
+    ByObject,
+    ByText,
+    Integer,
+    Named,
+    Number,
+    ObjectName,
+    Text,
+)
 
 State = Literal["bootstrapping", "present", "absent"]
 
@@ -42,9 +54,6 @@ LARGEST_GIVEN_MODELS = 200 << 20
 StreamState = Literal["starting", "running", "waiting", "paused", "moving", "stopping", "unplaced", "failed", "ended"]
 
 NodeState = Literal["alive", "draining", "dead"]
-
-#: The name of an object.
-ObjectName = Annotated[str, Name()]
 
 _COLUMNS = {name: tree.more_columns for name, tree in TREES.items()}
 _REQUIRED = frozenset(name for name, tree in TREES.items() if tree.required)
@@ -80,13 +89,13 @@ class DetectorState:
     centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
     """
 
-    first_frame: int
+    first_frame: Integer
     level: Level
     window: Window
     confident_window: Window
-    first_window: Window | None
+    first_window: Window | None = None
     trusted: bool = True
-    sightings: int = 0
+    sightings: Integer = 0
     motion: Motion | None = None
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
 
@@ -146,7 +155,7 @@ class ObjectFeatures:
     training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
     begins: bool = False
-    model: Annotated[bytes, Bytes("a saved model", longest=LARGEST_GIVEN_MODEL, begin=b"")] = b""
+    model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +168,10 @@ class Features:
     objects  the part of each object that is tracked, by name; the trees of all other objects are dropped
     """
 
-    seq: int
-    frame: int
-    time: float
-    objects: Annotated[dict[str, ObjectFeatures], ByObject()]
+    seq: Integer
+    frame: Integer
+    time: Number
+    objects: ByObject[ObjectFeatures]
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +184,10 @@ class Stored:
     unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
-    seq: int
-    taken: int
-    versions: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
-    unsaved: int = 0
+    seq: Integer
+    taken: Integer
+    versions: ByObject[Integer] = field(default_factory=dict)
+    unsaved: Integer = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +200,7 @@ class ObjectPosition:
     """
 
     box: Box | None = None
-    version: int = 0
+    version: Integer = 0
     detector: DetectorState | None = None
 
 
@@ -205,10 +214,10 @@ class Position:
     unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
-    seq: int = 0
-    frame: int = 0
-    objects: Annotated[dict[str, ObjectPosition], ByObject()] = field(default_factory=dict)
-    unsaved: int = 0
+    seq: Integer = 0
+    frame: Integer = 0
+    objects: ByObject[ObjectPosition] = field(default_factory=dict)
+    unsaved: Integer = 0
 
     @property
     def versions(self) -> dict[str, int]:
@@ -228,8 +237,8 @@ class Summary:
 
     rows: Annotated[np.ndarray, Array("float32", ("r", "d"))]
     mean: Annotated[np.ndarray, Array("float32", ("d",))]
-    count: int
-    levels: tuple[int, ...]
+    count: Integer
+    levels: Annotated[tuple[Integer, ...], Meta(max_length=LONGEST_LIST)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,12 +253,12 @@ class Sample:
     began    number of the object's first frame
     """
 
-    version: int
-    frame: int
+    version: Integer
+    frame: Integer
     trees: Annotated[dict[str, Summary], Named(_COLUMNS, _REQUIRED)]
     centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
     object: ObjectName = ""
-    began: int = 0
+    began: Integer = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,17 +278,17 @@ class Model:
     began    number of the object's first frame: the detector uses no model of an object that had the name before
     """
 
-    version: int
-    frame: int
+    version: Integer
+    frame: Integer
     weights: Annotated[np.ndarray, Array("float32", ("d",))]
-    bias: float
+    bias: Number
     motion: Motion | None = None
     heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_NOT_IN_THE_SCORE)] = field(
         default_factory=dict
     )
     biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
     object: ObjectName = ""
-    began: int = 0
+    began: Integer = 0
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -318,16 +327,16 @@ class Track:
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
     """
 
-    seq: int
-    frame: int
-    time: float
+    seq: Integer
+    frame: Integer
+    time: Number
     state: State
     box: Box | None
-    score: float
-    model_version: int
-    pts: float | None = None
+    score: Number
+    model_version: Integer
+    pts: Number | None = None
     object: ObjectName = ""
-    began: int = 0
+    began: Integer = 0
 
     def __repr__(self) -> str:
         name = f"object={self.object!r}, " if self.object else ""
@@ -370,9 +379,9 @@ class Tracks:
     tracks  the track of each object, by name
     """
 
-    seq: int
-    frame: int
-    tracks: Annotated[dict[str, Track], ByObject()]
+    seq: Integer
+    frame: Integer
+    tracks: ByObject[Track]
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,11 +395,15 @@ class Preview:
     jpeg    the picture as a JPEG file, with the frame's aspect ratio
     """
 
-    frame: int
-    width: Annotated[int, Whole(low=1)]
-    height: Annotated[int, Whole(low=1)]
-    boxes: Annotated[dict[str, Box], ByObject()]
-    jpeg: Annotated[bytes, Bytes("a JPEG", longest=1 << 19, begin=b"\xff\xd8\xff")]
+    frame: Integer
+    width: Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
+    height: Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
+    boxes: ByObject[Box]
+    jpeg: Annotated[bytes, Meta(max_length=1 << 19)]
+
+    def __post_init__(self) -> None:
+        if not self.jpeg.startswith(b"\xff\xd8\xff"):
+            raise ProtocolError("preview: expected a picture as a JPEG file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,8 +415,8 @@ class SavedModel:
     object   name of the object
     """
 
-    version: int
-    file: Annotated[bytes, Bytes("a saved model", longest=LARGEST_MODEL, begin=b"")]
+    version: Integer
+    file: Annotated[bytes, Meta(max_length=LARGEST_MODEL)]
     object: ObjectName = ""
 
 
@@ -419,29 +432,12 @@ class Health:
     objects   counters of each object, by name
     """
 
-    process: str
-    time: float
-    counters: dict[str, float] = field(default_factory=dict)
-    trouble: str = ""
-    source: str = ""
-    objects: Annotated[dict[str, dict[str, float]], ByObject()] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """The settings of a pipeline, with which its features can be used for training again, detector -> anyone.
-
-    program   version of catstream
-    settings  all settings except `run.endpoint` and `run.keys`, by name, each as the text that `--set` takes
-    """
-
-    program: str
-    settings: dict[str, str]
-
-    @classmethod
-    def from_settings(cls, settings: dict[str, str]) -> Run:
-        """A run of this version of catstream, with what `Settings.portable` returned."""
-        return cls(version("catstream"), settings)
+    process: Text
+    time: Number
+    counters: ByText[Number] = field(default_factory=dict)
+    trouble: Text = ""
+    source: Text = ""
+    objects: ByObject[ByText[Number]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -455,10 +451,10 @@ class End:
             how often a live source was `reopened`
     """
 
-    seq: int
-    reason: str
+    seq: Integer
+    reason: Text
     failed: bool = False
-    totals: dict[str, float] = field(default_factory=dict)
+    totals: ByText[Number] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -474,12 +470,17 @@ class Command:
     model   for "search": the saved model of the object, which is searched for from the next frame on
     """
 
-    id: str
+    id: Text
     verb: Verb
-    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    box: Box | None = None
     keep: bool = False
     object: ObjectName = ""
-    model: Annotated[bytes | None, Bytes("a saved model", LARGEST_GIVEN_MODEL, b""), OnlyWith("verb", "search")] = None
+    model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] | None = None
+
+    def __post_init__(self) -> None:
+        for name, verb in (("box", "set-box"), ("model", "search")):
+            if (getattr(self, name) is not None) != (self.verb == verb):
+                raise ProtocolError(f"command: expected a {name} with {verb} and with nothing else, got {self.verb!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -495,12 +496,12 @@ class Answer:
     object   name of the object that the command was for
     """
 
-    id: str
+    id: Text
     done: bool
-    reason: str
-    frame: int = 0
+    reason: Text
+    frame: Integer = 0
     box: Box | None = None
-    version: int = 0
+    version: Integer = 0
     object: ObjectName = ""
 
 
@@ -531,24 +532,24 @@ class StreamStatus:
     trouble         description of a problem, empty if there is none
     """
 
-    name: str
+    name: Text
     state: StreamState
-    node: str = ""
-    source: str = ""
-    endpoint: str = ""
-    server: str = ""
-    token: int = 0
-    began: int = 0
-    frame: int = 0
-    rate: float = 0.0
-    skipped: int = 0
-    cores: float = 0.0
-    models: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
-    restarts: int = 0
-    lost_frames: int = 0
-    lost_seconds: float = 0.0
-    stored_seconds: float | None = None
-    trouble: str = ""
+    node: Text = ""
+    source: Text = ""
+    endpoint: Text = ""
+    server: Text = ""
+    token: Integer = 0
+    began: Integer = 0
+    frame: Integer = 0
+    rate: Number = 0.0
+    skipped: Integer = 0
+    cores: Number = 0.0
+    models: ByObject[Integer] = field(default_factory=dict)
+    restarts: Integer = 0
+    lost_frames: Integer = 0
+    lost_seconds: Number = 0.0
+    stored_seconds: Number | None = None
+    trouble: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -565,14 +566,14 @@ class NodeStatus:
     trouble  description of a problem, empty if there is none
     """
 
-    name: str
+    name: Text
     state: NodeState
-    address: str = ""
-    cores: float = 0.0
-    used: float = 0.0
-    labels: dict[str, str] = field(default_factory=dict)
-    streams: int = 0
-    trouble: str = ""
+    address: Text = ""
+    cores: Number = 0.0
+    used: Number = 0.0
+    labels: ByText[Text] = field(default_factory=dict)
+    streams: Integer = 0
+    trouble: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -600,9 +601,9 @@ class Question:
     after   only streams and nodes whose names sort after this one are listed; empty for the first part
     """
 
-    id: str
-    stream: str = ""
-    after: str = ""
+    id: Text
+    stream: Text = ""
+    after: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -617,9 +618,9 @@ class Listing:
     more     whether there are more: the next question has the last name of this listing as `after`
     """
 
-    id: str
-    fleet: str
-    time: float
-    streams: dict[str, StreamStatus] = field(default_factory=dict)
-    nodes: dict[str, NodeStatus] = field(default_factory=dict)
+    id: Text
+    fleet: Text
+    time: Number
+    streams: ByText[StreamStatus] = field(default_factory=dict)
+    nodes: ByText[NodeStatus] = field(default_factory=dict)
     more: bool = False

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 
-from catstream.box import Box, Window
-from catstream.messages.schema import Array, Field, fields
-from catstream.messages.storage import Arrays, Metadata
+from catstream.messages.storage import Arrays, Metadata, with_prefix
 
 Message = TypeVar("Message")
 
@@ -27,9 +26,9 @@ def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
     [[1.0, 0.0], [0.0, 1.0]]
     """
     arrays: Arrays = {}
-    metadata = {
+    metadata: Metadata = {
         field.name: _pack(getattr(message, field.name), f"{name}.{field.name}", arrays)
-        for field in fields(type(message))
+        for field in dataclasses.fields(message)  # type: ignore[arg-type]
     }
     return arrays, {name: entry for name, entry in metadata.items() if entry is not None}
 
@@ -37,17 +36,27 @@ def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
 def unpack(kind: type[Message], arrays: Arrays, metadata: Metadata, name: str) -> Message:
     """The message that `pack` took, bit for bit.
 
-    Its limits are not checked: `catstream.messages.checks` does that.
+    The limits of its arrays are not checked: `catstream.messages.checks` does that.
 
     Raises
     ------
-    AttributeError, KeyError, TypeError, ValueError
+    TypeError, ValueError
         If the arrays and metadata are not those of a message of this kind.
     """
-    values = {
-        field.name: _unpack(field, metadata.get(field.name), f"{name}.{field.name}", arrays) for field in fields(kind)
-    }
-    return kind(**values)
+    whole: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(metadata))  # a copy, to put the arrays into
+    for path, array in with_prefix(arrays, f"{name}.").items():
+        *groups, last = path.split(".")
+        place = whole
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = array
+    return msgspec.convert(whole, kind, dec_hook=_array)
+
+
+def _array(_: type, value: object) -> np.ndarray:
+    if not isinstance(value, np.ndarray):
+        raise ValueError("expected an array")
+    return value
 
 
 def _pack(value: object, name: str, arrays: Arrays) -> object:
@@ -62,23 +71,3 @@ def _pack(value: object, name: str, arrays: Arrays) -> object:
         arrays.update(parts)
         return metadata
     return list(value) if isinstance(value, tuple) else value
-
-
-def _unpack(field: Field, entry: Any, name: str, arrays: Arrays) -> object:
-    if field.limit(Array) is not None:
-        return arrays.get(name) if field.optional else arrays[name]
-    if entry is None and field.optional:
-        return None
-    if field.values is not None:
-        return {key: _unpack(field.values, value, f"{name}.{key}", arrays) for key, value in entry.items()}
-    if field.is_message:
-        return unpack(field.type, arrays, entry, name)
-    if field.type in (Box, Window):
-        return field.type(*map(float, entry))
-    if get_origin(field.type) is tuple:
-        return tuple(map(int, entry))
-    if get_origin(field.type) is Literal:
-        if entry not in get_args(field.type):
-            raise ValueError(f"{name} is {entry!r:.40}, not one of {', '.join(get_args(field.type))}")
-        return entry
-    return field.type(entry)

@@ -1,27 +1,39 @@
-"""The schema of messages: the allowed values of each field, as metadata of its annotation.
+"""The schema of messages: the allowed values of each field, by its annotation.
 
-`catstream.messages.kinds` states the schema. The checks of `catstream.messages.checks`, the files of
-`catstream.messages.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from it by `fields`. Without
-metadata a field has the limits that hold for all fields: a whole number is from 0 to `LARGEST_INTEGER`, a number is
-finite, a text has at most `LONGEST_TEXT` bytes, a list or map has at most `LONGEST_LIST` entries, and width and height
-of a box are above 0.
+`catstream.messages.kinds` states the schema. The types here are checked by msgspec where bytes become a message; the
+limits of arrays, which msgspec does not know, by `catstream.messages.checks`. The tables of `docs/protocol.md` and the
+fuzzers are derived from the same annotations, by `fields`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from msgspec import Meta
+
+from catstream.messages.names import PATTERN
+
 Limit = TypeVar("Limit")
+Value = TypeVar("Value")
 
 LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
 LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
-LONGEST_TEXT = 4096  # bytes
+LONGEST_TEXT = 16384  # characters: the names of 64 objects, and what is to be said about them
+
+Integer = Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)]
+Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]  # NaN is outside, too
+Text = Annotated[str, Meta(max_length=LONGEST_TEXT)]
+ObjectName = Annotated[str, Meta(pattern=rf"\A{PATTERN}\Z")]
+#: A map of something by the name of an object, and by any text.
+ByObject = Annotated[dict[ObjectName, Value], Meta(max_length=LONGEST_LIST)]
+ByText = Annotated[dict[Text, Value], Meta(max_length=LONGEST_LIST)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,30 +60,6 @@ class Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Whole:
-    """The smallest value of a whole number."""
-
-    low: int
-
-
-@dataclass(frozen=True, slots=True)
-class Bytes:
-    """Limits of bytes: how many at most, and how they begin."""
-
-    kind: str
-    longest: int
-    begin: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class OnlyWith:
-    """The field has a value if and only if another field of the message has the given one."""
-
-    field: str
-    value: str
-
-
-@dataclass(frozen=True, slots=True)
 class Named:
     """Limits of a map of arrays, or of messages with rows.
 
@@ -84,29 +72,20 @@ class Named:
 
 
 @dataclass(frozen=True, slots=True)
-class Name:
-    """The text is the name of an object: see `catstream.messages.names`."""
-
-
-@dataclass(frozen=True, slots=True)
-class ByObject:
-    """The names of the map are those of objects."""
-
-
-@dataclass(frozen=True, slots=True)
 class Field:
     """A field of a message, as its annotation states it.
 
-    type      without None, and without metadata
-    optional  whether None is allowed
-    limits    the metadata
-    values    of a map: what its values are
+    type          without None, and without metadata
+    optional      whether None is allowed
+    limits        the metadata
+    keys, values  of a map: what its names and its values are
     """
 
     name: str
     type: Any
     optional: bool
     limits: tuple[object, ...]
+    keys: Field | None = None
     values: Field | None = None
 
     @property
@@ -114,18 +93,21 @@ class Field:
         """Whether its values are messages themselves."""
         return dataclasses.is_dataclass(self.type)
 
+    @property
+    def has_arrays(self) -> bool:
+        """Whether it is an array, or holds some."""
+        if self.is_message:
+            return any(field.has_arrays for field in fields(self.type))
+        return self.limit(Array) is not None or (self.values is not None and self.values.has_arrays)
+
     def limit(self, kind: type[Limit]) -> Limit | None:
         """The metadata of a kind, None if there is none."""
         return next((limit for limit in self.limits if isinstance(limit, kind)), None)
 
 
+@cache
 def fields(kind: type) -> tuple[Field, ...]:
     """The fields of a message, in their order."""
-    return _fields(kind)
-
-
-@cache
-def _fields(kind: type) -> tuple[Field, ...]:
     hints = get_type_hints(kind, include_extras=True)
     return tuple(_field(field.name, hints[field.name]) for field in dataclasses.fields(kind))
 
@@ -142,5 +124,5 @@ def _field(name: str, hint: Any) -> Field:
             (hint,) = (part for part in get_args(hint) if part is not NoneType)
         else:
             break
-    values = _field(name, get_args(hint)[1]) if get_origin(hint) is dict else None
-    return Field(name, hint, optional, limits, values)
+    keys, values = (_field(name, each) for each in get_args(hint)) if get_origin(hint) is dict else (None, None)
+    return Field(name, hint, optional, limits, keys, values)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from catstream.wire import timing as wire
-
 # Connections of browsers.
 REQUEST_SECONDS = 5.0  #: limit for a client to send a request, and again for its body
 ANSWER_SECONDS = 20.0  #: without reading its response, after which a client is disconnected
@@ -38,11 +36,6 @@ ORDER: tuple[tuple[float, float, str], ...] = (
     (UPDATE_SECONDS, KEEP_ALIVE_SECONDS, "a page is sent comments between its updates"),
     (KEEP_ALIVE_SECONDS, ANSWER_SECONDS, "an idle page that is gone is noticed later than one that does not read"),
     (POINT_SECONDS, RATE_SECONDS, "a chart of frames per second leaves out frames"),
-    (wire.CHECK_SECONDS, SILENCE_SECONDS, "a pipeline that rejects the keys counts as silent"),
-    (wire.QUIET_SECONDS, SILENCE_SECONDS, "a stream that has moved counts as silent before the registry is asked"),
-    (wire.DRAIN_SECONDS, DRAIN_SECONDS, "the last messages are dropped before their subscriptions have ended"),
-    (wire.CONTROLLER_SECONDS, REGISTRY_SECONDS, "a fleet whose controller was started again elsewhere is silent"),
     (RETRY_SECONDS, IDLE_SECONDS, "the feed of a stream is closed while its page connects again"),
-    (wire.RECONNECT_MOST_SECONDS, FIRST_SECONDS, "there is no picture of a stream whose pipeline has just started"),
     (FIRST_SECONDS + NEXT_SECONDS, ANSWER_SECONDS, "a client is disconnected while it waits for a picture"),
 )

@@ -2,7 +2,7 @@
 
 An endpoint is a folder with one Unix socket for each channel (`FOLDER/features`), which only this user may enter; or
 `tcp://127.0.0.1:5700`, from which each channel takes the port that its row in the table says. With keys other machines
-may reach the host, and processes may have hosts of their own: `tcp://10.0.0.1,compressor=10.0.0.2,trainer=10.0.0.3:5700`.
+may reach the host.
 """
 
 from __future__ import annotations
@@ -32,15 +32,13 @@ _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
 _FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
 _ANY_BYTES = "surrogateescape"  # in notes: the name of a file need not be UTF-8
-_EARLY = f"{_PREFIX}early-"  # begins the names of the notes of subscribers that wait for a pipeline
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """The address of the sockets of a pipeline: a folder, or hosts and the first port; and the keys to connect with.
+    """The address of the sockets of a pipeline: a folder, or a host and the first port; and the keys to connect with.
 
-    host    of all processes that `hosts` does not name, as ZeroMQ takes it
-    hosts   of single processes, by name
+    host    as ZeroMQ takes it
     keys    to connect with; None if the pipeline has no keys
     source  of the pipeline's frames, without a password; empty if it is not known here, or for a fleet
     run     id of the run whose process this is; empty for a client
@@ -54,16 +52,13 @@ class Endpoint:
     folder: Path | None = None
     host: str = ""
     port: int = 0
-    hosts: dict[str, str] = field(default_factory=dict)
     keys: Keys | None = None
     source: str = field(default="", compare=False)
     run: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """As the setting `run.endpoint` says it."""
-        if self.folder is not None:
-            return str(self.folder)
-        return f"tcp://{','.join([self.host, *map('='.join, self.hosts.items())])}:{self.port}"
+        return str(self.folder) if self.folder is not None else f"tcp://{self.host}:{self.port}"
 
     @classmethod
     def parse(cls, text: str, keys: str | Keys = "") -> Endpoint:
@@ -92,31 +87,25 @@ class Endpoint:
     @classmethod
     def _tcp(cls, text: str, keys: Keys | None) -> Endpoint:
         last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
-        hosts, _, port = text.removeprefix("tcp://").rpartition(":")
-        first, *others = hosts.split(",")
-        named = dict(other.partition("=")[::2] for other in others)
-        if not all(map(_is_host, [first, *named.values()])):
-            port = ""
-        elif keys is None and not all(map(_is_loopback, map(_plain, [first, *named.values()]))):
+        host, _, port = text.removeprefix("tcp://").rpartition(":")
+        if not (_is_host(host) and port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
+        host = {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
+        address = _address(host)
+        if keys is None and (address is None or not address.is_loopback):
             raise ServiceError(
                 f"other machines can reach {text}, and without keys anybody could connect: make keys "
                 "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
-        if not (port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
-            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
-        if unknown := named.keys() - _LISTENERS:
-            raise ServiceError(f"{text!r} names {', '.join(unknown)}, there are {', '.join(sorted(_LISTENERS))}")
-        first, named = _plain(first), {name: _plain(host) for name, host in named.items()}
-        return cls(host=first, port=int(port), hosts=named, keys=keys)
+        return cls(host=host, port=int(port), keys=keys)
 
     def address(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address of a channel, as ZeroMQ takes it; of the given sender if there are several."""
         sender = sender or channel.senders[0]
         if self.folder is not None:
             return f"ipc://{self.folder / _file(channel, sender)}"
-        host = self.hosts.get(channel.receiver or sender, self.host)
-        return f"tcp://{host}:{self.port + channel.port + channel.senders.index(sender)}"
+        return f"tcp://{self.host}:{self.port + channel.port + channel.senders.index(sender)}"
 
     def listening(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address to listen on; the name of a host is resolved."""
@@ -145,27 +134,12 @@ class Endpoint:
 #: The endpoint of a pipeline, as a program gives it.
 Place = str | os.PathLike[str] | Endpoint
 
-#: Processes that listen, the name of `hosts`.
-_LISTENERS = {
-    name for channel in CHANNELS.values() for name in ([channel.receiver] if channel.receiver else channel.senders)
-}
-
-
-def _plain(host: str) -> str:
-    """A host as ZeroMQ takes it, to listen and to connect."""
-    return {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
-
 
 def _is_host(host: str) -> bool:
     """Whether a text is the name of a host, or an address; an IPv6 address is in brackets."""
     if host.startswith("["):
         return host.endswith("]") and _address(host) is not None
     return bool(_HOST.fullmatch(host))
-
-
-def _is_loopback(host: str) -> bool:
-    address = _address(host)
-    return address is not None and address.is_loopback
 
 
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -390,29 +364,6 @@ class Note:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def note_early_subscriber(name: str, channel: Channel[object], endpoint: Endpoint) -> Note | None:
-    """A note that a subscriber waits for a pipeline; None if this user may write no note anywhere."""
-    with contextlib.suppress(OSError, IndexError):
-        return Note(_homes()[0] / f"{_EARLY}{name}", f"{channel.name} {_place(endpoint)}")
-    return None
-
-
-def names_of_early_subscribers(channel: Channel[object], endpoint: Endpoint) -> set[str]:
-    """The names in the notes of this user's subscribers that wait at an endpoint; removes the notes of dead ones."""
-    names = set()
-    for path, text in _notes(_homes(), f"{_EARLY}*"):
-        if text is None:
-            path.unlink(missing_ok=True)
-        elif text == f"{channel.name} {_place(endpoint)}":
-            names.add(path.name.removeprefix(_EARLY))
-    return names
-
-
-def _place(endpoint: Endpoint) -> str:
-    """A text of the endpoint that does not depend on how its folder was written."""
-    return str(endpoint.folder.resolve() if endpoint.folder is not None else endpoint)
 
 
 def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:
