@@ -16,6 +16,7 @@ continues if the stream moves to another node.
 from __future__ import annotations
 
 import threading
+from contextlib import ExitStack
 from time import monotonic
 from typing import Any, Generic, Self, TypeVar, cast
 
@@ -26,7 +27,7 @@ from catstream.client.registry import described, follow
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Track
 from catstream.messages.names import check_name
-from catstream.wire.channels import PUBLIC
+from catstream.wire.channels import PUBLIC, TRACKS
 from catstream.wire.endpoint import Endpoint, Place, find
 from catstream.wire.newest import GapCounter, Subscriber
 
@@ -98,7 +99,9 @@ class Subscription(Generic[Message]):
         self.place: Endpoint | None = None
         self._close_time = float("inf")  # until which messages may still arrive after the end
         self._rejected = 0  # by the connections before this one
-        self._socket: Subscriber[Any] | None = None
+        # The end has a socket of its own: if this subscriber is slow, it could be among the messages that are dropped.
+        self._messages: Subscriber[Any] | None = None
+        self._ends: Subscriber[Any] | None = None
         self._has_run = False  # whether the pipeline was there before
         self._over = self._closed = False
         self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
@@ -132,12 +135,12 @@ class Subscription(Generic[Message]):
     @property
     def run(self) -> str:
         """Id of the run that the last message is from: of one start of one pipeline; empty if it is not known."""
-        return self._socket.run if self._socket is not None else ""
+        return self._messages.run if self._messages is not None else ""
 
     @property
     def rejected(self) -> int:
         """Messages that were dropped because they were not what the channel carries."""
-        return self._rejected + (self._socket.rejected if self._socket is not None else 0)
+        return self._rejected + (self._messages.rejected if self._messages is not None else 0)
 
     def close(self) -> None:
         """Disconnect. A loop of another thread or task ends with a ServiceError, soon."""
@@ -179,13 +182,14 @@ class Subscription(Generic[Message]):
         return float("inf") if self.timeout is None else monotonic() + self.timeout
 
     def _poller(self, poller: Any) -> Any:
-        """A poller of the socket, by its descriptor, which another thread may close meanwhile."""
-        if self._socket is not None:
-            poller.register(self._socket.fileno(), zmq.POLLIN)
+        """A poller of the sockets, by their descriptors, which another thread may close meanwhile."""
+        for socket in (self._messages, self._ends):
+            if socket is not None and not self._closed:
+                poller.register(socket.fileno(), zmq.POLLIN)
         return poller
 
     def _milliseconds(self, deadline: float) -> float:
-        """The time to wait for the socket."""
+        """The time to wait for the sockets."""
         until = min(deadline if self.end is None else float("inf"), self._close_time)
         return 1000 * max(0.0, min(until - monotonic(), CHECK_SECONDS))
 
@@ -210,10 +214,10 @@ class Subscription(Generic[Message]):
             return None
 
     def _receive(self) -> Message | None:
-        while self._socket is not None and (message := self._socket.receive(0)) is not None:
+        while self._messages is not None and (message := self._messages.receive(0)) is not None:
             if isinstance(message, End):
-                if self.end is None:
-                    self._pipeline_ended(message, 0.0 if self._channel.keeps == "every" else DRAIN_SECONDS)
+                if self._channel.keeps == "every":  # the last message here
+                    self._pipeline_ended(message, 0.0)
                 continue
             if self._stream is not None and not self._stream.take(message):
                 continue  # the stream was started again, and repeats a frame
@@ -221,6 +225,8 @@ class Subscription(Generic[Message]):
                 began = message.began if self._about is not None and isinstance(message, Track) else None
                 self._gaps.take(message.seq, began)
             return cast(Message, message)
+        if self._ends is not None and self.end is None and (end := self._ends.receive(0)) is not None:
+            self._pipeline_ended(end, DRAIN_SECONDS)
         return None
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
@@ -237,7 +243,7 @@ class Subscription(Generic[Message]):
         moved = self._stream.update()
         if self._stream.end is not None:
             self.end, self._close_time = self._stream.end, monotonic() + DRAIN_SECONDS
-        elif (moved or self._socket is None) and (place := self._stream.place) is not None:
+        elif (moved or self._messages is None) and (place := self._stream.place) is not None:
             self._disconnect()
             self._connect(place)
 
@@ -254,13 +260,17 @@ class Subscription(Generic[Message]):
 
     def _connect(self, place: Endpoint) -> None:
         only = None if self._about is None else self._channel.messages[0]
-        self._socket, self.place = Subscriber(self._channel, place, only, about=self._about, ends=True), place
+        with ExitStack() as stack:
+            self._messages = stack.enter_context(Subscriber(self._channel, place, only, about=self._about))
+            self._ends, self.place = Subscriber(TRACKS, place, only=End), place
+            stack.pop_all()
 
     def _disconnect(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._rejected += self._socket.rejected
-            self._socket = None
+        if self._messages is not None and self._ends is not None:
+            self._messages.close()
+            self._ends.close()
+            self._rejected += self._messages.rejected
+        self._messages = self._ends = None
 
 
 def subscribe(

@@ -3,11 +3,11 @@
 The publisher binds an XPUB socket, subscribers connect SUB sockets. They subscribe to everything (the empty topic), to
 one kind of message, or to the messages of one kind about one object (the bytes that these messages begin with, see
 `catstream.wire.codec.opening`). The publisher never waits for a subscriber: one that falls too far behind misses
-messages, but not the end, which is queued in any case.
+messages.
 
-The end, and on a channel that keeps the newest message that of each object, are sent to late joiners, and every second
-to all: a burst may have cost a subscriber the last ones. A `Subscriber` drops repeats. No more are repeated at once
-than half the queue of a subscriber holds; the others take their turn.
+If a channel keeps the newest message, it keeps that of each object. They are sent to late joiners, and every second to
+all: a burst may have cost a subscriber the last ones. A `Subscriber` drops repeats. No more are repeated at once than
+half the queue of a subscriber holds; the others take their turn.
 
 The number of topics that a peer can make either side remember is limited.
 """
@@ -21,7 +21,7 @@ from typing import TypeVar
 import zmq
 
 from catstream.messages.kinds import End, Health
-from catstream.wire.channels import TRACKS, Channel
+from catstream.wire.channels import Channel
 from catstream.wire.codec import Topic, opening, topic_of
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket, arrives
@@ -31,7 +31,6 @@ _MOST_KEPT = 256  # newest messages that are kept, one of each object
 _MOST_TOPICS = 1024  # topics that a publisher knows the subscribers of, and that a subscriber knows the last message of
 _MAX_CHANGES = 1000  # subscriptions that are processed at once
 _MAX_SUBSCRIPTION_BYTES = 4096
-_ROOM_FOR_THE_END = 8  # messages above the high-water mark
 
 _END = opening(End)
 
@@ -64,15 +63,13 @@ class Publisher(ChannelSocket[Message]):
 
     def send(self, message: Message) -> None:
         """Send to all subscribers; on a channel that keeps the newest message, later to late joiners too."""
-        ends = isinstance(message, End)
         self.serve_late_joiners()
-        if not (self._newest or ends or self._subscribed):
+        if not (self._newest or self._subscribed):
             return
         data = self._encode(message)
-        if ends:  # nothing before it counts
-            self._last.clear()
-            self._socket.set(zmq.SNDHWM, self.channel.high_water_mark + _ROOM_FOR_THE_END)
-        if self._newest or ends:
+        if self._newest:
+            if isinstance(message, End):  # nothing before it counts
+                self._last.clear()
             self._last.pop(topic := topic_of(data), None)
             self._last[topic] = data
             if len(self._last) > _MOST_KEPT:
@@ -132,7 +129,6 @@ class Subscriber(ChannelSocket[Message]):
     ----------
     only : the one kind of message to receive; None for all
     about : name of the one object whose messages of this kind are received; None for all
-    ends : whether to receive the end of the run, too: from the tracks, on a channel that keeps the newest message
     """
 
     def __init__(
@@ -142,40 +138,30 @@ class Subscriber(ChannelSocket[Message]):
         only: type | None = None,
         *,
         about: str | None = None,
-        ends: bool = False,
     ) -> None:
         self._newest = channel.keeps == "newest"
         self._passes_over = self._newest and len(channel.senders) == 1
-        self._received = (*channel.messages, End) if ends else channel.messages
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
         self._arrived: dict[Topic, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
         self._last: dict[tuple[Topic, str], object] = {}  # what the last message of each object or process is known by
-        also_to_tracks = ends and self._newest
-        if only is None and not also_to_tracks:
-            self._socket.subscribe(b"")
-        else:
-            kinds = [only] if only is not None else channel.messages
-            for topic in {*(opening(kind, about) for kind in kinds), *([_END] if ends else [])}:
-                self._socket.subscribe(topic)
+        self._socket.subscribe(b"" if only is None else opening(only, about))
         self._connect()
-        if also_to_tracks:
-            self._socket.connect(endpoint.address(TRACKS))
 
     def pending(self) -> bool:
         """Whether something has arrived that was not received yet."""
         return bool(self._arrived) or super().pending()
 
-    def receive(self, seconds: float) -> Message | End | None:
+    def receive(self, seconds: float) -> Message | None:
         """The next message, None if none arrived in time; repeats and what is rejected are passed over."""
         deadline = monotonic() + seconds
         while (frame := self._next_frame(deadline)) is not None:
-            message = self._decode(frame.buffer, *self._received)
+            message = self._decode(frame.buffer, *self.channel.messages)
             if message is not None and not self._is_repeat(message, frame.buffer):
                 return message
         return None
 
-    def receive_all(self, seconds: float = 0.0) -> list[Message | End]:
+    def receive_all(self, seconds: float = 0.0) -> list[Message]:
         """All messages that have arrived, oldest first; if none has, wait at most this long for one."""
         first = self.receive(seconds)
         return [] if first is None else [first, *iter(lambda: self.receive(0), None)]
@@ -189,12 +175,12 @@ class Subscriber(ChannelSocket[Message]):
             self._arrived[topic_of(frame.buffer)] = frame  # in the place of an older one
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
 
-    def _is_repeat(self, message: Message | End, data: memoryview) -> bool:
+    def _is_repeat(self, message: Message, data: memoryview) -> bool:
         """Whether a message is the same as the last one of its object or process, which is sent again now and then.
 
         It is known by its version. One that has none is small, and known by all of its bytes.
         """
-        if not (self._newest or isinstance(message, End)):
+        if not self._newest:
             return False
         about = message.process if isinstance(message, Health) else getattr(message, "object", "")
         source = Topic(type(message).__name__, about), self.run

@@ -66,19 +66,6 @@ def test_a_tcp_endpoint_without_room_for_its_ports_is_rejected(text):
         Endpoint.parse(text)
 
 
-def test_with_keys_each_process_may_have_a_host_of_its_own(folder):
-    create(folder / "keys")
-    text = "tcp://10.0.0.1,compressor=10.0.0.2,trainer=[fe80::3]:5700"
-    endpoint = Endpoint.parse(text, str(folder / "keys"))
-    assert str(endpoint) == text
-    assert endpoint.address(CHANNELS["features"]) == "tcp://10.0.0.2:5700"
-    assert endpoint.address(CHANNELS["models"]) == "tcp://[fe80::3]:5702"
-    assert endpoint.address(CHANNELS["tracks"]) == "tcp://10.0.0.1:5703"
-    assert endpoint.address(CHANNELS["health"], "compressor") == "tcp://10.0.0.2:5706"
-    with pytest.raises(ServiceError, match="there are compressor, detector, owner, trainer"):
-        Endpoint.parse("tcp://10.0.0.1,cook=10.0.0.2:5700", str(folder / "keys"))
-
-
 def test_a_pipeline_with_keys_is_found_with_them(folder):
     create(folder / "keys")
     with private_folder() as note, meeting_place(str(folder / "run"), note, str(folder / "keys")) as place:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -15,11 +14,11 @@ import zmq
 import catstream
 from catstream.box import Box
 from catstream.errors import ObjectError, ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
+from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Track, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
-from catstream.wire.endpoint import Endpoint, meeting_place, names_of_early_subscribers
-from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.endpoint import meeting_place
+from catstream.wire.newest import Publisher
 
 
 def track(seq, name="", version=1):
@@ -143,7 +142,7 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
 
 @pytest.mark.parametrize("channel", ["features", "health", "previews"])
 def test_a_channel_whose_messages_are_about_all_objects_has_none_of_one_object(endpoint, channel):
-    with pytest.raises(ServiceError, match="about all objects: subscribe to tracks, models, samples for one object"):
+    with pytest.raises(ServiceError, match="about all objects: subscribe to samples, models, tracks for one object"):
         catstream.subscribe(str(endpoint), channel, object="anna")
 
 
@@ -210,7 +209,7 @@ def test_the_health_of_each_process_arrives_once(endpoint):
 
 def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
     with (
-        Publisher(TRAINING, endpoint, first_message=Run("0", {"coreset.size": "64"})) as training,
+        Publisher(TRAINING, endpoint) as training,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
     ):
         until(lambda: training.has_subscribers, training.serve_late_joiners)
@@ -296,19 +295,6 @@ def test_a_subscriber_that_receives_only_the_end_has_missed_all(endpoint, tracks
         assert (subscription.missed, subscription.missed_before) == (60, 60)
 
 
-@pytest.mark.parametrize("channel", ["tracks", "features"])
-def test_a_pipeline_waits_for_a_subscriber_that_started_first(endpoint, until, channel):
-    with catstream.subscribe(str(endpoint), channel, timeout=20) as subscription:
-        row = CHANNELS["tracks" if channel == "tracks" else "training"]
-        with Publisher(row, endpoint) as publisher:
-            assert publisher.awaited
-            until(lambda: not publisher.awaited, publisher.serve_late_joiners)
-            message = track(1) if channel == "tracks" else features(1)
-            publisher.send(message)
-            assert next(subscription).seq == 1
-        assert not names_of_early_subscribers(row, endpoint), "it has heard the pipeline: no other one waits for it"
-
-
 def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_folder(folder, until):
     with catstream.subscribe(str(folder), "tracks", timeout=20) as subscription:
         with meeting_place(str(folder), folder) as place, Publisher(TRACKS, place) as publisher:
@@ -317,32 +303,3 @@ def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_fold
             assert next(subscription).seq == 1
         assert list(subscription) == []
         assert "did not receive its end" in subscription.end.reason
-
-
-def test_subscribers_that_are_not_awaited_do_not_count_for_those_that_are(endpoint, until):
-    with (
-        catstream.subscribe(str(endpoint), "models"),  # it subscribes to the end of the tracks, too
-        Subscriber(CHANNELS["tracks"], endpoint),
-        Publisher(CHANNELS["tracks"], endpoint) as publisher,
-    ):
-        publisher.awaited.add("recorder")
-        until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
-        assert publisher.awaited == {"recorder"}
-        with Subscriber(CHANNELS["tracks"], endpoint, name="recorder"):
-            until(lambda: not publisher.awaited, publisher.serve_late_joiners)
-
-
-def test_a_subscriber_is_early_for_one_channel_of_one_endpoint_and_as_long_as_it_lives(folder, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    here, there = Endpoint.parse(str(folder)), Endpoint.parse("tcp://127.0.0.1:5700")
-    tracks, training = CHANNELS["tracks"], CHANNELS["training"]
-    with Subscriber(tracks, here, early=True):
-        (name,) = names_of_early_subscribers(tracks, here)
-        assert not names_of_early_subscribers(training, here)
-        assert not names_of_early_subscribers(tracks, there)
-        monkeypatch.chdir(folder.parent)
-        assert names_of_early_subscribers(tracks, Endpoint.parse(folder.name)) == {name}, "however the folder is named"
-        shutil.copy(tmp_path / f"catstream-early-{name}", dead := tmp_path / "catstream-early-0")
-        assert names_of_early_subscribers(tracks, here) == {name}
-        assert not dead.exists()
-    assert not list(tmp_path.iterdir())
