@@ -28,11 +28,10 @@ from catstream.errors import BoxError, FrameError, MissingFileError, ObjectError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages import storage
-from catstream.messages.checks import check_message
 from catstream.messages.kinds import Features, Model, Track, Tracks
 from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
-from catstream.messages.packing import pack, unpack
-from catstream.messages.storage import Arrays, Metadata, with_prefix
+from catstream.messages.schema import check_message
+from catstream.messages.storage import Arrays, Metadata, pack, unpack, with_prefix
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import Settings

@@ -24,7 +24,6 @@ from catstream.detection.detector import Detector, Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import storage
 from catstream.messages.kinds import Command, End, Features, Model, Position, Tracks
 from catstream.numerics import ridge
 from catstream.run.learned import Learned
@@ -66,7 +65,6 @@ def prepare() -> None:
     """Import everything that tracking needs, and limit OpenCV to the thread that calls it."""
     ridge.prepare()
     source.prepare()
-    storage.prepare()
     cv2.setNumThreads(1)
 
 

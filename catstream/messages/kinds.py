@@ -4,7 +4,7 @@ A message is frozen and complete by itself. In one process the stages pass the o
 `catstream.wire` converts them to msgpack and back, and checks every field on arrival.
 
 The annotations are the schema (see `catstream.messages.schema`), and the docstrings describe the fields. The checks,
-the files of `catstream.messages.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
+the files of `catstream.messages.storage`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
 `d` is the length of a feature row (`catstream.features.layout.row_length`), `n` the coreset size, frames count from 0.
 The objects of a stream have names (`catstream.messages.names`); an object that is alone may have the name "".

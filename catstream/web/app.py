@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Literal
+from typing import Literal
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -40,8 +40,7 @@ from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages.kinds import ObjectName
-from catstream.messages.schema import OnlyWith
+from catstream.messages.schema import ObjectName
 from catstream.video.annotate import draw_preview
 from catstream.web import metrics
 from catstream.web.connections import body_of
@@ -218,8 +217,12 @@ class Command:
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: ObjectName = ""
-    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    box: Box | None = None
     keep: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.box is not None) != (self.verb == "set-box"):
+            raise ProtocolError(f"expected a box with set-box and with nothing else, got {self.verb}")
 
 
 def _failed(_: Request, error: Exception) -> Response:

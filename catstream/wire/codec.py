@@ -31,9 +31,8 @@ import msgspec
 import numpy as np
 
 from catstream.errors import ProtocolError
-from catstream.messages.checks import check_message
 from catstream.messages.kinds import Position, Stored
-from catstream.messages.schema import Integer, Text
+from catstream.messages.schema import Integer, Text, check_message
 from catstream.wire.channels import CHANNELS, REGISTRY
 
 Message = TypeVar("Message")

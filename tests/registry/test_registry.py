@@ -127,7 +127,7 @@ def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder
         revoke(fleet_keys, "anna")
         with Registry(address, str(folder / "anna")) as registry, pytest.raises(ServiceError, match="rejects this key"):
             registry.streams()
-        assert rejects()["rejected"] == before + 1
+        assert rejects()["rejected"] > before
 
 
 def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(fleet_keys, folder):
