@@ -18,7 +18,6 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
 
 from catstream.errors import ServiceError
 from catstream.messages.storage import is_locked, lock, writing
@@ -176,7 +175,7 @@ def private_folder() -> Iterator[Path]:
         with writing(homes[0]):
             folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=homes[0]))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            stack.enter_context(Note(folder / _OWNER, ""))
+            stack.enter_context(note(folder / _OWNER, ""))
         yield folder
 
 
@@ -200,11 +199,19 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
     if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
         endpoint.keys.listening()
         endpoint.keys.client(endpoint.keys.public.decode())
-    if endpoint.folder is None:  # the kernel gives a port to one process only
-        with _noted(endpoint, default, source, fleet):
-            yield endpoint
-        return
-    folder = endpoint.folder.absolute()
+    with contextlib.ExitStack() as stack:
+        if endpoint.folder is not None:  # of tcp, the kernel gives a port to one process only
+            folder = stack.enter_context(_locked(endpoint.folder.absolute(), text))
+            endpoint = Endpoint.parse(str(folder), endpoint.keys or "")
+        place = str(endpoint), str(endpoint.keys.folder) if endpoint.keys is not None else "", fleet or source
+        with writing(default):
+            stack.enter_context(note(default / (_FLEET_NOTE if fleet else _NOTE), "\n".join(place)))
+        yield endpoint
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, text: str) -> Iterator[Path]:
+    """A folder for the sockets of one pipeline, which is made; the sockets are removed afterwards."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -222,21 +229,12 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
                 "wait for it, or give another folder (--set run.endpoint=FOLDER)"
             )
         try:
-            endpoint = Endpoint.parse(str(folder), keys)
-            with _noted(endpoint, default, source, fleet):
-                yield endpoint
+            yield folder
         finally:
             for file in _files(folder):
                 file.unlink(missing_ok=True)
     finally:
         os.close(handle)
-
-
-def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Note:
-    """Note an endpoint with its source or its fleet, until the note is closed or the process ends."""
-    keys = str(endpoint.keys.folder) if endpoint.keys is not None else ""
-    with writing(folder):
-        return Note(folder / (_FLEET_NOTE if fleet else _NOTE), "\n".join([str(endpoint), keys, fleet or source]))
 
 
 def running() -> list[Endpoint]:
@@ -333,37 +331,20 @@ def _follows(endpoint: Endpoint, source: str) -> bool:
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
-class Note:
-    """A file that is locked until it is closed or its process ends; it is never visible without its lock and text.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
-
-    def __init__(self, path: Path, text: str) -> None:
-        hidden = path.with_name(f".{path.name}")
-        self._path, self._file = path, hidden.open("w", encoding="utf-8", errors=_ANY_BYTES)
-        with contextlib.ExitStack() as unfinished:
-            unfinished.callback(self._file.close)
-            unfinished.callback(hidden.unlink)
-            lock(self._file.fileno(), math.inf)
-            self._file.write(text)
-            self._file.flush()
+@contextlib.contextmanager
+def note(path: Path, text: str) -> Iterator[None]:
+    """A file that is locked as long as its process uses it; it is never visible without its lock and text."""
+    hidden = path.with_name(f".{path.name}")
+    with hidden.open("w", encoding="utf-8", errors=_ANY_BYTES) as file:
+        try:
+            lock(file.fileno(), math.inf)
+            file.write(text)
+            file.flush()
             hidden.rename(path)
-            unfinished.pop_all()
-
-    def close(self) -> None:
-        """Remove the file."""
-        self._path.unlink(missing_ok=True)
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            yield
+        finally:
+            hidden.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
 
 def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:

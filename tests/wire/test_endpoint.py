@@ -16,7 +16,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, Note, find, is_deserted, meeting_place, private_folder, running, source_at
+from catstream.wire.endpoint import Endpoint, find, is_deserted, meeting_place, note, private_folder, running, source_at
 from catstream.wire.keys import Keys, create
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
@@ -239,7 +239,7 @@ def test_a_note_of_another_version_does_not_hide_the_pipelines_of_this_one(text)
         private_folder() as one,
         meeting_place("", one, source="good.mp4") as good,
         private_folder() as two,
-        Note(two / "endpoint", text),
+        note(two / "endpoint", text),
     ):
         assert {str(good): "good.mp4"}.items() <= {str(endpoint): endpoint.source for endpoint in running()}.items()
 
