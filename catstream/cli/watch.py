@@ -19,7 +19,7 @@ from rich.text import Text
 from catstream.box import Box
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.output import table
-from catstream.client.subscription import AnyMessage, Subscription
+from catstream.client.subscription import Subscription
 from catstream.messages.heads import APPEARANCE, GROUPS, TREES
 from catstream.messages.kinds import Features, Health, Model, Preview, Sample, Track
 
@@ -144,7 +144,7 @@ def watch(
       catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
     """
     seen = 0
-    with Subscription[AnyMessage](endpoint, channel, object=name, keys=keys) as messages:
+    with Subscription[Any](endpoint, channel, object=name, keys=keys) as messages:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(messages.endpoint, messages.keys, wait)
             if as_json:
@@ -162,7 +162,7 @@ def watch(
         click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
 
 
-def _print_json(message: AnyMessage) -> None:
+def _print_json(message: Any) -> None:
     click.echo(json.dumps(asdict(message), default=_described))
 
 
@@ -181,7 +181,7 @@ def _print_line(channel: str, message: object) -> None:
 class _Screen:
     """A table of the newest messages, of health the newest of each process, redrawn in a thread of its own."""
 
-    def __init__(self, channel: str, messages: Subscription[AnyMessage]) -> None:
+    def __init__(self, channel: str, messages: Subscription[Any]) -> None:
         self._cells, self._messages = _CELLS[channel], messages
         # Replaced, never changed: the thread reads them.
         self._rows: dict[object, dict[str, str]] = {}

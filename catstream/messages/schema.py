@@ -113,9 +113,13 @@ class Field:
         return next((limit for limit in self.limits if isinstance(limit, kind)), None)
 
 
-@cache
 def fields(kind: type) -> tuple[Field, ...]:
     """The fields of a message, in their order."""
+    return _fields(kind)
+
+
+@cache
+def _fields(kind: type) -> tuple[Field, ...]:
     hints = get_type_hints(kind, include_extras=True)
     return tuple(_field(field.name, hints[field.name]) for field in dataclasses.fields(kind))
 
@@ -149,8 +153,9 @@ def check_message(message: object) -> _Lengths:
         If an array breaks its schema.
     """
     lengths: _Lengths = {}
-    for field in _with_arrays(type(message)):
-        _check(field, getattr(message, field.name), lengths, f"{type(message).__name__.lower()} {field.name}")
+    kind: type = type(message)
+    for field in _with_arrays(kind):
+        _check(field, getattr(message, field.name), lengths, f"{kind.__name__.lower()} {field.name}")
     return lengths
 
 

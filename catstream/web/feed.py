@@ -8,11 +8,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from time import monotonic
+from typing import Any
 
 from catstream.box import Box
 from catstream.client.control import Control
 from catstream.client.registry import locate
-from catstream.client.subscription import AnyMessage, Subscription
+from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError
 from catstream.messages.kinds import Answer, End, Verb
 from catstream.web.dashboard import Dashboard, Parts
@@ -158,7 +159,7 @@ class PipelineFeed(Feed):
         while True:
             if channel in _FOR_VIEWERS:
                 await self._has_viewers.wait()
-            with Subscription[AnyMessage](place, channel, timeout=timeout) as messages:
+            with Subscription[Any](place, channel, timeout=timeout) as messages:
                 async for message in messages:
                     self.dashboard.take(message, monotonic(), messages.run)
                     if channel in _FOR_VIEWERS and not self.viewers:

@@ -42,6 +42,7 @@ from catstream.messages.kinds import (
     Track,
     Tracks,
 )
+from catstream.messages.schema import fields
 
 #: The permissions of a client: each role includes those before it.
 Role = Literal["watch", "control", "pipeline"]
@@ -87,7 +88,7 @@ class Channel(Generic[Message]):
     @property
     def by_object(self) -> bool:
         """Whether each message is about one object."""
-        return "object" in self.messages[0].__dataclass_fields__
+        return any(field.name == "object" for field in fields(self.messages[0]))
 
     @property
     def limit(self) -> int:
