@@ -77,14 +77,13 @@ class Motion:
 class DetectorState:
     """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
 
-    first_frame       the object's first: with its name, it says which object this is; see `began` of a track
-    level             of the belief that the object was found, see `catstream.detection.belief`
+    first_frame       the object's first, see `began` of a track
+    level             belief that the object was found
     window            window of the object; the next search is centred on it
-    confident_window  the same in the last frame whose level was confident or redetected; while the object of a saved
-                      model is searched for, the best window of the last frame
-    first_window      the same in the first frame; None while the object of a saved model has not been found
-    trusted           false after the object was found again elsewhere in the frame, until its score is high
-    sightings         frames in a row in which the object of a saved model was seen in one place
+    confident_window  the same in the last confident frame; before a saved model's object is found, the best window
+    first_window      the same in the first frame; None before a saved model's object is found
+    trusted           false after the object was found again elsewhere, until its score is high
+    sightings         frames in a row in which a saved model's object was seen in one place
     motion            of the Kalman filter of the centre, None before a model had any
     centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
     """
@@ -110,11 +109,11 @@ class TrainingRows:
     """Feature rows of windows of a frame, each with its label and weight.
 
     rows     features of the windows
-    labels   group "appearance": 1 for the object, 0 for background, between them for a near miss; group "extent": 1 for
-             a window of the right size and aspect, towards 0 for windows far from it
+    labels   group "appearance": 1 for the object, 0 for background; group "extent": 1 for a window of the right size
+             and aspect; between them for a near miss
     weights  number of ordinary rows that each stands for
-    offsets  group "extent": 0.5 for a window of the right size, and 1/16 more for each step by which it is too large;
-             then the same for the aspect; None if all are right
+    offsets  group "extent": 0.5 for the right size, 1/16 more for each step that it is too large; then the same for the
+             aspect; None if all are right
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
@@ -145,9 +144,9 @@ class ObjectFeatures:
     """The part of `Features` for one object.
 
     box       the object's box, None if it was not found
-    training  training rows of each group of `catstream.messages.heads`; a group without rows is left out
-    detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
-    begins    whether a new object is tracked under this name from this frame on: its trees start empty
+    training  training rows of each group; a group without rows is left out
+    detector  state of the detector after this frame, None before it has one
+    begins    whether a new object begins under this name: its trees start empty
     model     the saved model that the trees continue, if the object begins with one; otherwise empty
     """
 
@@ -162,10 +161,10 @@ class ObjectFeatures:
 class Features:
     """The training rows of one frame, detector -> compressor.
 
-    seq      number of the message: 1, 2, 3 ... without a gap, one message a frame
+    seq      1, 2, 3 ... without a gap, one message a frame
     frame    number of the frame that the rows were cut from
     time     seconds since the start of the source, or of the run if the source is live
-    objects  the part of each object that is tracked, by name; the trees of all other objects are dropped
+    objects  the part of each object that is tracked, by name
     """
 
     seq: Integer
@@ -247,8 +246,8 @@ class Sample:
 
     version  1, 2, 3 ... in the order in which the samples of all objects are made
     frame    number of the newest frame that it summarises
-    trees    the summary of each tree of `catstream.messages.heads.TREES`; a tree without a leaf is left out
-    centres  centre of the object in each frame of the last complete block of frames, pixels; NaN while absent
+    trees    the summary of each tree; a tree without a leaf is left out
+    centres  centre of the object in each frame of the last complete block, pixels; NaN while absent
     object   name of the object
     began    number of the object's first frame
     """
@@ -271,11 +270,11 @@ class Model:
     bias     chosen so that the score is 0 at the mean of the background and 1 at the mean of the object
     motion   parameters of the Kalman filter, None until there are enough centres for EM
     heads    vector of each head that does not add to the score, once it is trained. A window fits well if
-             (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for the names
-             "size" and "aspect"
+             (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for "size" and
+             "aspect"
     biases   bias of each of these heads that has one
     object   name of the object
-    began    number of the object's first frame: the detector uses no model of an object that had the name before
+    began    number of the object's first frame
     """
 
     version: Integer
@@ -298,8 +297,8 @@ class Track:
     Attributes
     ----------
     seq : int
-        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means that this subscriber
-        missed messages, or that the object was not tracked in between.
+        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means missed messages, or
+        that the object was not tracked in between.
     frame : int
         Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
     time : float
@@ -374,7 +373,7 @@ class Track:
 class Tracks:
     """The tracks of one frame, detector -> the owner of the run.
 
-    seq     number of the message: 1, 2, 3 ... without a gap, one message a frame
+    seq     1, 2, 3 ... without a gap, one message a frame
     frame   number of the frame
     tracks  the track of each object, by name
     """
@@ -447,8 +446,8 @@ class End:
     seq     number of the last message before it, plus one
     reason  description of why the stream ended
     failed  whether it ended because of an error
-    totals  final counters, by name: features messages `sent` and `stored`, frames that were `damaged` or `skipped`, and
-            how often a live source was `reopened`
+    totals  final counters, by name: `sent` and `stored` features messages, `damaged` and `skipped` frames, and how
+            often a live source was `reopened`
     """
 
     seq: Integer
@@ -463,11 +462,11 @@ class Command:
 
     id      unique for each command: a command that is received twice is executed once and answered twice
     verb    the action
-    box     for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
-            the frame that is held
+    box     for "set-box" only: box of the object in the next frame that is tracked; during a pause of a file, in the
+            frame that is held
     keep    for "set-box": whether it is the same object, so that everything learned about it is kept
     object  for "set-box", "search", "forget" and "save": name of the object
-    model   for "search": the saved model of the object, which is searched for from the next frame on
+    model   for "search" only: the saved model of the object, which is searched for from the next frame on
     """
 
     id: Text

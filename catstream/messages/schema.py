@@ -102,6 +102,11 @@ class Field:
         return dataclasses.is_dataclass(self.type)
 
     @property
+    def is_name(self) -> bool:
+        """Whether it is the name of an object."""
+        return any(isinstance(limit, Meta) and limit.pattern for limit in self.limits)
+
+    @property
     def has_arrays(self) -> bool:
         """Whether it is an array, or holds some."""
         if self.is_message:

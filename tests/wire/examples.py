@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args, get_origin
 
-import msgspec
 import numpy as np
 
 from catstream.box import Box, Window
@@ -28,15 +27,10 @@ def example(kind: type, full: bool = True, d: int = 5) -> Any:
     return kind(**values)
 
 
-def is_name(field: Field) -> bool:
-    """Whether a text is the name of an object."""
-    return any(isinstance(limit, msgspec.Meta) and limit.pattern for limit in field.limits)
-
-
 def _value(field: Field, full: bool, d: int) -> Any:
     if field.values is not None:
         named = field.limit(Named) or Named({"sent": 0, "stored": 0})
-        if is_name(field.keys):
+        if field.keys.is_name:
             named = Named({"anna": 0, "ben": 0} if full else {"": 0}, frozenset({""}))
         names = [name for name in named.columns if full or name in named.required]
         return {name: _value(field.values, full, d + named.columns[name]) for name in names}
@@ -51,5 +45,5 @@ def _value(field: Field, full: bool, d: int) -> Any:
         return (3, 1, 0)
     if field.type in (Box, Window):
         return field.type(4.5, 3.0, 20.0, 10.0)
-    text = "anna" if is_name(field) and full else "" if is_name(field) else "7f"
+    text = "anna" if field.is_name and full else "" if field.is_name else "7f"
     return {bool: full, int: 4, float: 0.75, str: text, bytes: b"a file"}[field.type]

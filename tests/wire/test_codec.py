@@ -35,7 +35,6 @@ from catstream.video import demo
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 from tests.wire.examples import example as example_of
-from tests.wire.examples import is_name
 
 
 def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
@@ -105,7 +104,7 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
         return _map(draw, field, lengths)
     if field.is_message:
         return draw(messages(field.type))
-    if is_name(field):
+    if field.is_name:
         return draw(NAMES)
     if array := field.limit(Array):
         return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
@@ -115,7 +114,7 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
 def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, Any]:
     named = field.limit(Named)
     if named is None:
-        names = NAMES if is_name(field.keys) else st.text(max_size=8)
+        names = NAMES if field.keys.is_name else st.text(max_size=8)
         return {name: _value(draw, field.values, lengths) for name in draw(st.sets(names, max_size=3))}
     names = [name for name in named.columns if name in named.required or draw(st.booleans())]
     if field.values.is_message:
