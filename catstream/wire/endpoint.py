@@ -87,16 +87,16 @@ class Endpoint:
     def _tcp(cls, text: str, keys: Keys | None) -> Endpoint:
         last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
         host, _, port = text.removeprefix("tcp://").rpartition(":")
-        if not (_is_host(host) and port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
-            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
         host = {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
         address = _address(host)
-        if keys is None and (address is None or not address.is_loopback):
+        if keys is None and _is_host(host) and (address is None or not address.is_loopback):
             raise ServiceError(
                 f"other machines can reach {text}, and without keys anybody could connect: make keys "
                 "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
+        if not (_is_host(host) and port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
         return cls(host=host, port=int(port), keys=keys)
 
     def address(self, channel: Channel[object], sender: str | None = None) -> str:
