@@ -48,7 +48,7 @@ class Origin:
     image_rate  frames per second of a folder of images
     endpoint    of the running pipeline, for a sink that receives other messages, too
     keys        folder of the keys for this endpoint
-    resume      whether the run is resumed
+    last        number of the last frame in the log of a run that is resumed; -1 for a new run
     """
 
     source: str | None = None
@@ -56,7 +56,7 @@ class Origin:
     image_rate: float = RATE
     endpoint: str = ""
     keys: str = ""
-    resume: bool = False
+    last: int = -1
 
 
 class Sink(Protocol):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import ObjectPosition, Position
 from catstream.messages.storage import writing
-from catstream.sinks.destinations import Origin, Sink, TrackedFrame, check_file, is_file, open_sink, sink_of
+from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
 from catstream.sinks.track_log import is_log, read_frames, whole_frames
 from catstream.video.frames import without_password
 from catstream.video.source import is_live
@@ -28,8 +27,9 @@ def places_of(name: str, output: Path | None, video: bool) -> list[str]:
 class RunFiles:
     """All destinations of a run.
 
-    A resumed run continues after the last frame that one of its logs, NDJSON or CSV, holds whole. Each log is cut after
-    its own last whole frame, and gets the frames that it lacks from that one; a video is drawn again.
+    A resumed run continues after the last frame that its log holds whole: an NDJSON file, which has all digits, or else
+    a CSV file. All its logs are cut after that frame; one that is shorter or new gets the frames that it lacks from the
+    first one, and a video is drawn again.
 
     origin  the source of the run, and the frames that are tracked
     output  folder of the results, which is made; None for none
@@ -63,14 +63,13 @@ class RunFiles:
                 check_file(Path(place), may_exist=overwrite or continued, source=source, made=self.output)
 
     def position(self) -> Position | None:
-        """Return the position of the last frame that a log holds whole; None if there is no log."""
+        """Return the position of the last frame that the log holds whole; None if there is to be no log."""
         if not self._logs():
             return None
-        lasts = {log: max((frame.number for frame, _ in whole_frames(log)), default=-1) for log in self._logs()}
         frames = 0
         boxes: dict[str, Box | None] = {}
         objects: list[str] = []
-        for frame, _ in whole_frames(max(lasts, key=lambda log: lasts[log])):
+        for frame, _ in self._earlier():
             frames, objects = frame.number + 1, [track.object for track in frame.tracks]
             boxes |= {track.object: track.box for track in frame.tracks if track.box is not None}
         return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
@@ -95,30 +94,27 @@ class RunFiles:
         VideoError
             If a destination cannot be written; also later, from the function and at the end.
         """
-        origin = replace(self.origin, endpoint=endpoint, resume=resume)
+        last = max((frame.number for frame, _ in self._earlier()), default=-1) if resume else -1
+        origin = replace(self.origin, endpoint=endpoint, last=last)
         with ExitStack() as stack:
-            sinks = {place: stack.enter_context(closing(open_sink(place, origin))) for place in self.places}
-            if resume:
-                self._complete(sinks)
+            sinks = [stack.enter_context(closing(open_sink(place, origin))) for place in self.places]
+            behind = [(sink, sink.last) for sink in sinks if hasattr(sink, "last") and sink.last < last]
+            for frame, _ in read_frames(self._logs()[0]) if behind else ():
+                for sink, its_last in behind:
+                    if its_last < frame.number:
+                        sink.write(frame)
 
             def write(frame: TrackedFrame) -> None:
-                for sink in sinks.values():
+                for sink in sinks:
                     sink.write(frame)
 
             yield write
 
-    def _complete(self, sinks: dict[str, Sink]) -> None:
-        """Write to each sink the frames that it lacks, from the longest log: that was cut, so its frames are whole."""
-        lasts = {place: getattr(sink, "last", sys.maxsize) for place, sink in sinks.items()}
-        longest = max(self._logs(), key=lambda log: lasts[str(log)], default=None)
-        if longest is not None and min(lasts.values()) < lasts[str(longest)]:
-            for frame, _ in read_frames(longest):
-                for place, sink in sinks.items():
-                    if lasts[place] < frame.number:
-                        sink.write(frame)
-
     def _logs(self) -> list[Path]:
-        """Return the logs, NDJSON first: it has all fields."""
-        return sorted(
-            (Path(place) for place in self.places if is_log(Path(place))), key=lambda log: log.suffix == ".csv"
-        )
+        """Return the logs, the one that is continued first."""
+        logs = (Path(place) for place in self.places if is_log(Path(place)))
+        return sorted(logs, key=lambda log: (not log.exists(), log.suffix == ".csv"))
+
+    def _earlier(self) -> Iterator[tuple[TrackedFrame, int]]:
+        """Yield the frames that the earlier part of this run has written whole."""
+        return whole_frames(self._logs()[0]) if self._logs() else iter(())

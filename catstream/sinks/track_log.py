@@ -33,7 +33,7 @@ _FIRST = frozenset({UNNAMED})
 class LineSink(ABC):
     """A file with a line for each track. What was written remains, however this process ends.
 
-    An existing file is replaced; if the run is resumed, it is cut after its last whole frame and continued.
+    An existing file is replaced; if the run is resumed, it is cut after the frame `origin.last` and continued.
 
     Attributes
     ----------
@@ -46,7 +46,9 @@ class LineSink(ABC):
     def __init__(self, place: str, origin: Origin) -> None:
         self.path, self.last, self._before = Path(place), -1, _FIRST
         end = 0
-        for frame, after in whole_frames(self.path) if origin.resume else ():
+        for frame, after in whole_frames(self.path) if origin.last >= 0 else ():
+            if frame.number > origin.last:
+                break
             self.last, self._before, end = frame.number, _objects(frame), after
         with writing(self.path, VideoError), ExitStack() as stack:
             if end:
