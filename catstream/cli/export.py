@@ -54,5 +54,6 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
         raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
-    check_file(dest, may_exist=overwrite or not row.key, source=str(log))
+    if row.key:
+        check_file(dest, may_exist=overwrite, source=str(log))
     make((frame for frame, _ in read_frames(log)), dest, row, log.stem)
