@@ -26,7 +26,7 @@ import catstream
 from catstream.cli import COMMANDS, load_command
 from catstream.fleet import life
 from catstream.settings import PRESETS, describe
-from catstream.sinks.destinations import TABLE
+from catstream.sinks.destinations import EXPORTS, SINKS
 from catstream.sinks.run_files import places_of
 
 ROOT = Path(__file__).parents[1]
@@ -162,9 +162,8 @@ def test_every_destination_and_format_of_tracks_is_explained():
     for name in places_of("NAME", Path(), video=True):
         assert f"`{name}`" in shown
         assert f"`{name}`" in page("docs/tutorial.md")
-    for row in TABLE:
-        key = f"`{row.name}`" if not row.is_sink else f"`FILE{row.key}`" if row.key.startswith(".") else f"`{row.key}`"
-        assert key in shown, f"docs/how-to/sinks.md does not say what {row.name} is"
+    for key in [*(f"FILE{key}" if key[0] == "." else key for key in SINKS), *EXPORTS]:
+        assert f"`{key}`" in shown, f"docs/how-to/sinks.md does not say what {key} is"
 
 
 def errors_on(check: Callable[[Path], Iterator[str]]) -> str:

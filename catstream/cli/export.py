@@ -11,7 +11,7 @@ import click
 
 from catstream.errors import VideoError
 from catstream.services.options import PATH, with_overwrite
-from catstream.sinks.destinations import FORMATS, check_file, export_of, table_help
+from catstream.sinks.destinations import EXPORTS, SINKS, check_file, export_of
 from catstream.sinks.destinations import export as make
 from catstream.sinks.track_log import is_log, read_frames
 
@@ -22,7 +22,8 @@ def with_table(*, sinks: bool) -> Callable[[Command], Command]:
     """Replace {table} in the help of a command by the lines of the sinks, or of the exports."""
 
     def changed(command: Command) -> Command:
-        command.__doc__ = cleandoc(command.__doc__ or "").replace("{table}", table_help(sinks=sinks))
+        lines = (f"  {key:9} {row.meaning}" for key, row in (SINKS if sinks else EXPORTS).items())
+        command.__doc__ = cleandoc(command.__doc__ or "").replace("{table}", "\n".join(["\b", *lines]))
         return command
 
     return changed
@@ -31,7 +32,7 @@ def with_table(*, sinks: bool) -> Callable[[Command], Command]:
 @click.command()
 @click.argument("log", type=PATH)
 @click.argument("dest", type=PATH)
-@click.option("--format", "name", type=click.Choice(FORMATS), help="The format; needed for a folder.")
+@click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
 @with_overwrite
 @with_table(sinks=False)
 def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
@@ -54,6 +55,6 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
         raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
-    if row.key:
+    if row.suffix:
         check_file(dest, may_exist=overwrite, source=str(log))
     make((frame for frame, _ in read_frames(log)), dest, row, log.stem)

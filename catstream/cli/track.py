@@ -33,7 +33,7 @@ from catstream.services.options import (
     with_part,
     with_reading,
 )
-from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, absolute, check_file
+from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file
 from catstream.sinks.run_files import RunFiles, places_of
 
 
@@ -97,7 +97,7 @@ class _Request:
             results=Results(  # absolute, to resume from any folder
                 output=self.output and self.output.absolute(),
                 video=self.video,
-                write=tuple(absolute(place) for place in self.write if place != STDOUT),
+                write=tuple(str(Path(it).absolute()) if is_file(it) else it for it in self.write if it != STDOUT),
                 models={name: file.absolute() for name, file in self.saved.items()},
             ),
         )

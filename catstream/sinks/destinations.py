@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 from catstream.errors import VideoError, require_extra
 from catstream.messages.kinds import Track
@@ -74,100 +74,70 @@ class Sink(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Destination:
+class Row:
     """A row of the table.
 
-    name      of the format, for `catstream export --format`
-    key       what selects it: the suffix of a file, the scheme of an address ("mqtt://"), or "-"; empty for a folder
-    home      the class of a sink, or the function `export(frames, path, name)`
-    meaning   a line of the help
-    extra     the extra that it needs
-    is_sink   whether it is a sink
-    repeats   whether it can be continued, or made again from the log, when a run is resumed
+    home     the class of a sink, or the function `export(frames, path, name)`
+    meaning  a line of the help
+    suffix   of the file of an export; empty for a folder
+    extra    the extra that it needs
+    repeats  whether a sink can be continued, or made again from the log, when a run is resumed
     """
 
-    name: str
-    key: str
     home: str
     meaning: str
+    suffix: str = ""
     extra: str = ""
-    is_sink: bool = False
     repeats: bool = True
 
     def load(self) -> Any:
-        """Import the class or function."""
+        """Import the class or function; raises MissingExtraError if its extra is not installed."""
         if self.extra:
             require_extra(self.extra)
         module, _, name = self.home.rpartition(".")
         return getattr(import_module(f"catstream.sinks.{module}"), name)
 
 
-def _sink(name: str, key: str, home: str, meaning: str, **options: Any) -> Destination:
-    return Destination(name, key, home, meaning, is_sink=True, **options)
+#: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
+SINKS = {
+    ".ndjson": Row("track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
+    STDOUT: Row("track_log.StdoutSink", "the same, on standard output", repeats=False),
+    ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    ".mcap": Row(
+        "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
+    ),
+}
+
+#: Name of a format -> the export.
+EXPORTS = {
+    "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
+    "sqlite": Row("exports.write_sqlite", "the table tracks of a database", ".sqlite"),
+    "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
+    "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB"),
+    "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k"),
+    "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment"),
+}
 
 
-TABLE = (
-    _sink("ndjson", ".ndjson", "track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
-    _sink("stdout", STDOUT, "track_log.StdoutSink", "the same, on standard output", repeats=False),
-    _sink("csv", ".csv", "track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
-    _sink("video", ".mp4", "video_sink.open_video", "the frames with their boxes drawn in"),
-    _sink("mcap", ".mcap", "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap",
-          repeats=False),
-    Destination("mot", ".txt", "exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1"),
-    Destination("sqlite", ".sqlite", "exports.write_sqlite", "the table tracks of a database"),
-    Destination("parquet", ".parquet", "exports.write_parquet", "the same columns in a column store", extra="parquet"),
-    Destination("otb", "", "exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB"),
-    Destination("got10k", "", "exports.write_got10k", "the same in the layout of GOT-10k"),
-    Destination("vot", "", "exports.write_vot", "the same in the layout of VOT's long-term experiment"),
-)  # fmt: skip
-
-_SINKS = {row.key: row for row in TABLE if row.is_sink}
-_EXPORTS = {row.name: row for row in TABLE if not row.is_sink}
-
-#: The names of the formats of `export`.
-FORMATS = tuple(_EXPORTS)
-
-
-def table_help(*, sinks: bool) -> str:
-    """Return a paragraph for the help of a command, with a line for each sink or export."""
-    lines = [(row.key if sinks else row.name, row.meaning) for row in TABLE if row.is_sink is sinks]
-    return "\b\n" + "\n".join(f"  {key:9} {meaning}" for key, meaning in lines)
-
-
-def sink_of(place: str) -> Destination:
-    """Return the row of a sink.
-
-    Raises
-    ------
-    VideoError
-        If there is none for this suffix or scheme.
-    """
-    scheme, is_address, _ = place.partition("://")
-    row = _SINKS.get(f"{scheme}://" if is_address else place if place == STDOUT else Path(place).suffix)
+def sink_of(place: str) -> Row:
+    """Return the row of a sink; raises VideoError if there is none for this suffix or scheme."""
+    scheme, mark, _ = place.partition("://")
+    row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
     if row is None:
         raise VideoError(
-            f"{place}: tracks are written to a file that ends with {', '.join(_files())}, or to - (standard output); "
-            "for other formats use catstream export"
+            f"{place} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where - is "
+            "standard output; for other formats use catstream export"
         )
     return row
 
 
-def export_of(path: Path, name: str | None) -> Destination:
-    """Return the row of an export, by its name, or else by the suffix of the file.
-
-    Raises
-    ------
-    VideoError
-        If there is none, or several, for this suffix.
-    """
-    rows = (
-        [row for row in _EXPORTS.values() if row.key and row.key == path.suffix] if name is None else [_EXPORTS[name]]
-    )
-    if len(rows) != 1:
-        raise VideoError(
-            f"the name of {path} does not say which format it has: give --format, one of {', '.join(FORMATS)}"
-        )
-    return rows[0]
+def export_of(path: Path, name: str | None) -> Row:
+    """Return the row of an export, by its name, or else by the suffix; raises VideoError if that selects not one."""
+    rows = [row for row in EXPORTS.values() if row.suffix and row.suffix == path.suffix]
+    if name is None and len(rows) != 1:
+        raise VideoError(f"the format of {path} is not known: give --format, one of {', '.join(EXPORTS)}")
+    return rows[0] if name is None else EXPORTS[name]
 
 
 def is_file(place: str) -> bool:
@@ -175,17 +145,10 @@ def is_file(place: str) -> bool:
     return place != STDOUT and "://" not in place
 
 
-def absolute(place: str) -> str:
-    """Return a destination with the whole path of a file."""
-    return str(Path(place).absolute()) if is_file(place) else place
-
-
 def check_file(path: Path, *, may_exist: bool, source: str = "", made: Path | None = None) -> None:
     """Raise VideoError if a file exists and may not, is the source of the frames, or cannot be written.
 
-    Parameters
-    ----------
-    made : a folder that is made before the file, if it does not exist
+    The folder `made` is made before the file, if it does not exist.
     """
     if source and path.exists() and Path(source).exists() and path.samefile(source):
         raise VideoError(f"{path} is the source, which would be lost: give another name or folder")
@@ -197,33 +160,20 @@ def check_file(path: Path, *, may_exist: bool, source: str = "", made: Path | No
 
 def open_sink(place: str, origin: Origin) -> Sink:
     """Open the sink of a destination; raises VideoError or MissingExtraError if that is not possible."""
-    sink: Sink = sink_of(place).load()(place, origin)
-    return sink
+    return cast(Sink, sink_of(place).load()(place, origin))
 
 
-def export(frames: Iterable[TrackedFrame], path: Path, row: Destination, name: str) -> None:
-    """Make a file or a folder from the frames of a log; a file gets its name once it is complete.
+def export(frames: Iterable[TrackedFrame], path: Path, row: Row, name: str) -> None:
+    """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
 
-    Parameters
-    ----------
-    name : of the source or the log, for the files in a folder
-
-    Raises
-    ------
-    VideoError
-        If it cannot be written.
+    They are named after `name`, that of the log. Raises VideoError if they cannot be written.
     """
     make: Callable[[Iterable[TrackedFrame], Path, str], None] = row.load()
-    part = path.with_name(f"{path.name}.part") if row.key else path
+    part = path.with_name(f"{path.name}.part")
     with writing(path, VideoError):
         try:
-            make(frames, part, name)
-            if part != path:
+            make(frames, part if row.suffix else path, name)
+            if row.suffix:
                 part.replace(path)
         finally:
-            if part != path:
-                part.unlink(missing_ok=True)
-
-
-def _files() -> list[str]:
-    return [key for key in _SINKS if key.startswith(".")]
+            part.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import closing
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,21 +54,6 @@ def write_layout(layout: str, folder: Path, name: str, rows: ObjectRows) -> None
             file = folder / pattern.format(name)
             file.parent.mkdir(parents=True, exist_ok=True)
             np.savetxt(file, values, fmt=form, delimiter=",")
-
-
-def write_otb(frames: Iterable[TrackedFrame], folder: Path, name: str) -> None:
-    """Write NAME.txt, NAME_confidence.value and times/NAME_time.txt of each object."""
-    _write_objects("otb", frames, folder, name)
-
-
-def write_got10k(frames: Iterable[TrackedFrame], folder: Path, name: str) -> None:
-    """Write NAME/NAME_001.txt, NAME/NAME_confidence.value and NAME/NAME_time.txt of each object."""
-    _write_objects("got10k", frames, folder, name)
-
-
-def write_vot(frames: Iterable[TrackedFrame], folder: Path, name: str) -> None:
-    """Write NAME/NAME_001.txt, NAME/NAME_001_confidence.value and NAME/NAME_001_time.value of each object."""
-    _write_objects("vot", frames, folder, name)
 
 
 def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
@@ -139,3 +125,8 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, na
         write_layout(
             layout, folder, f"{name}-{thing}" if thing else name, ObjectRows(table[:, :4], table[:, 4], seconds)
         )
+
+
+write_otb = partial(_write_objects, "otb")
+write_got10k = partial(_write_objects, "got10k")
+write_vot = partial(_write_objects, "vot")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import time
 from base64 import b64encode
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,19 @@ from catstream.messages.kinds import Health, Model, Preview
 from catstream.messages.storage import writing
 from catstream.sinks.destinations import Origin, TrackedFrame
 
-#: Foxglove shows messages of this schema as pictures.
-_PICTURE = "foxglove.CompressedImage"
-_DATA = {"type": "string", "contentEncoding": "base64"}
-_SCHEMAS: dict[str, dict[str, Any]] = {"tracks": {}, "models": {}, "health": {}, "previews": {"data": _DATA}}
+_DATA = {"data": {"type": "string", "contentEncoding": "base64"}}
+
+#: Topic -> name and fields of its schema. Foxglove shows the last one as pictures.
+_SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
+    **{topic: (f"catstream.{topic}", {}) for topic in ("tracks", "models", "health")},
+    "previews": ("foxglove.CompressedImage", _DATA),
+}
 
 
 class McapSink:
     """The tracks, and the models, health reports and pictures that the pipeline sends meanwhile, as JSON.
 
-    If the process is killed, `mcap recover` finds the messages up to the last second.
+    If the process is killed, `mcap recover` finds the messages but those of the last megabyte.
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
@@ -41,10 +43,9 @@ class McapSink:
             self._writer = Writer(file)
             self._writer.start("catstream")
             self._topics: dict[str, int] = {}
-            for topic, fields in _SCHEMAS.items():
+            for topic, (name, fields) in _SCHEMAS.items():
                 schema = json.dumps({"type": "object", "properties": fields}).encode()
-                kind = _PICTURE if topic == "previews" else f"catstream.{topic}"
-                number = self._writer.register_schema(kind, "jsonschema", schema)
+                number = self._writer.register_schema(name, "jsonschema", schema)
                 self._topics[topic] = self._writer.register_channel(topic, "json", number)
             self._others = {
                 topic: stack.enter_context(Subscription[Any](origin.endpoint, topic, timeout=0, keys=origin.keys))
@@ -64,24 +65,13 @@ class McapSink:
 
     def close(self) -> None:
         """Write the index, and close the file."""
-        with self._translated_errors(), self._stack:
+        with writing(self._place, VideoError), self._stack:
             self._writer.finish()
 
     def _add(self, topic: str, fields: dict[str, Any]) -> None:
-        now = time.time_ns()
-        with self._translated_errors():
-            self._writer.add_message(self._topics[topic], now, json.dumps(fields, default=_numbers).encode(), now)
-
-    @contextmanager
-    def _translated_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise VideoError(f"cannot write to {self._place} any more: {error.strerror}") from None
-
-
-def _numbers(array: np.ndarray) -> Any:
-    return array.tolist()
+        now, data = time.time_ns(), json.dumps(fields, default=np.ndarray.tolist).encode()
+        with writing(self._place, VideoError):
+            self._writer.add_message(self._topics[topic], now, data, now)
 
 
 def _fields(message: Model | Health | Preview) -> dict[str, Any]:

@@ -41,18 +41,15 @@ class RunFiles:
     places: list[str]
 
     def check(self, *, overwrite: bool, earlier: list[str]) -> None:
-        """Raise an error before the run if a destination cannot be written, or must not be.
+        """Raise VideoError or MissingExtraError before the run if a destination cannot be written, or must not be.
 
-        Parameters
-        ----------
-        overwrite : whether existing files may be replaced
-        earlier : the destinations of an earlier part of this run, which are continued
+        If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued.
         """
         source = self.origin.source or ""
         for place in self.places:
             row = sink_of(place)
             row.load()
-            if row.name == "video" and is_live(source):
+            if place.endswith(".mp4") and is_live(source):
                 raise VideoError(
                     f"a video needs its frames once more, but {without_password(source)} is live: omit the video"
                 )
@@ -84,15 +81,8 @@ class RunFiles:
     def opened(self, endpoint: str, *, resume: bool = False) -> Iterator[Callable[[TrackedFrame], None]]:
         """Yield a function that writes a frame everywhere; at the end, everything is closed.
 
-        Parameters
-        ----------
-        endpoint : of the run
-        resume : whether to continue after `position`; otherwise existing files are replaced
-
-        Raises
-        ------
-        VideoError
-            If a destination cannot be written; also later, from the function and at the end.
+        If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
+        raise VideoError if a destination cannot be written any more.
         """
         last = max((frame.number for frame, _ in self._earlier()), default=-1) if resume else -1
         origin = replace(self.origin, endpoint=endpoint, last=last)

@@ -13,6 +13,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import chain, pairwise
 from math import isnan, nan
 from pathlib import Path
 from typing import IO, get_args
@@ -88,6 +89,8 @@ class LineSink(ABC):
     def _translated_errors(self) -> Iterator[None]:
         try:
             yield
+        except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
+            raise
         except OSError as error:
             raise VideoError(f"cannot write to {self.path} any more: {error.strerror}") from None
 
@@ -107,31 +110,12 @@ class NdjsonSink(LineSink):
 class StdoutSink(NdjsonSink):
     """The same on standard output, where each frame is seen at once."""
 
-    def __init__(self, place: str, _: Origin) -> None:
-        super().__init__(place, Origin())
+    def __init__(self, _: str, __: Origin) -> None:
+        super().__init__("standard output", Origin())
         self.last = sys.maxsize  # what a run has printed before it was resumed is not repeated
 
-    def write(self, frame: TrackedFrame) -> None:
-        super().write(frame)
-        with self._translated_errors():
-            self._file.flush()
-
-    def close(self) -> None:
-        """Do nothing: standard output belongs to the process."""
-
     def _open(self, _: str) -> IO[str]:
-        return sys.stdout
-
-    @contextmanager
-    def _translated_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            # The interpreter flushes standard output again when it exits: that must not fail a second time.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), self._file.fileno())
-            if isinstance(error, BrokenPipeError):  # its reader has ended, as `head` does: not an error of catstream
-                raise
-            raise VideoError(f"cannot write to standard output any more: {error.strerror}") from None
+        return os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", buffering=1)
 
 
 class CsvSink(LineSink):
@@ -189,14 +173,10 @@ def read_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
 def whole_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
     """Yield the same, except for a last frame that may be incomplete."""
     before = _FIRST
-    waiting: tuple[TrackedFrame, int] | None = None
-    for each in read_frames(path):
-        if waiting is not None:
-            yield waiting
-            before = _objects(waiting[0])
-        waiting = each
-    if waiting is not None and before <= _objects(waiting[0]):
-        yield waiting
+    for each, later in pairwise(chain(read_frames(path), [None])):
+        if each is not None and (later is not None or before <= _objects(each[0])):
+            yield each
+            before = _objects(each[0])
 
 
 def _objects(frame: TrackedFrame) -> frozenset[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sys
 import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -72,12 +73,13 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
     assert list(read_frames(tmp_path / f"none{suffix}")) == []
 
 
-def test_standard_output_has_a_line_of_json_for_each_track(capsys):
+def test_standard_output_has_a_line_of_json_for_each_track(capfd, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.__stdout__)
     sink = open_sink("-", Origin())
     for number in range(3):
         sink.write(TrackedFrame([track(number)]))
     sink.close()
-    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(3)]
+    assert [json.loads(line) for line in capfd.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(3)]
 
 
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
@@ -184,9 +186,9 @@ def test_existing_files_are_replaced_only_if_requested_and_continued_only_by_the
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("t.xls", "ends with .ndjson, .csv, .mp4, .mcap, or to -"),
+        ("t.xls", r"one of .ndjson, -, .csv, .mp4, .mcap, where - is"),
         ("t.txt", "for other formats use catstream export"),
-        ("ftp://host/t.csv", "ftp://host/t.csv: tracks are written to a file"),
+        ("ftp://host/t.csv", "ftp://host/t.csv is no destination of tracks"),
         ("none/t.csv", "a folder that exists and that you may write to"),
     ],
 )
