@@ -66,7 +66,7 @@ class RunFiles:
         frames = 0
         boxes: dict[str, Box | None] = {}
         objects: list[str] = []
-        for frame, _ in self._earlier():
+        for frame, _ in whole_frames(self._logs()[0]):
             frames, objects = frame.number + 1, [track.object for track in frame.tracks]
             boxes |= {track.object: track.box for track in frame.tracks if track.box is not None}
         return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
@@ -84,12 +84,13 @@ class RunFiles:
         If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
         raise VideoError if a destination cannot be written any more.
         """
-        last = max((frame.number for frame, _ in self._earlier()), default=-1) if resume else -1
+        log = self._logs()[0] if resume and self._logs() else None  # before new ones exist, too
+        last = max((frame.number for frame, _ in whole_frames(log)), default=-1) if log is not None else -1
         origin = replace(self.origin, endpoint=endpoint, last=last)
         with ExitStack() as stack:
             sinks = [stack.enter_context(closing(open_sink(place, origin))) for place in self.places]
             behind = [(sink, sink.last) for sink in sinks if hasattr(sink, "last") and sink.last < last]
-            for frame, _ in read_frames(self._logs()[0]) if behind else ():
+            for frame, _ in read_frames(log) if log is not None and behind else ():
                 for sink, its_last in behind:
                     if its_last < frame.number:
                         sink.write(frame)
@@ -104,7 +105,3 @@ class RunFiles:
         """Return the logs, the one that is continued first."""
         logs = (Path(place) for place in self.places if is_log(Path(place)))
         return sorted(logs, key=lambda log: (not log.exists(), log.suffix == ".csv"))
-
-    def _earlier(self) -> Iterator[tuple[TrackedFrame, int]]:
-        """Yield the frames that the earlier part of this run has written whole."""
-        return whole_frames(self._logs()[0]) if self._logs() else iter(())

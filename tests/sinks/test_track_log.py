@@ -143,6 +143,15 @@ def test_wherever_a_crash_cuts_the_files_no_row_is_lost_or_doubled(history, data
         assert rows_of(again) == rows_of(whole)
 
 
+def test_an_ndjson_file_that_is_new_when_a_run_is_resumed_gets_the_frames_of_its_csv_file(tmp_path):
+    run = RunFiles(Origin(), None, [str(tmp_path / "t.csv")])
+    add(run, [[""]] * 7)
+    more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
+    add(more, [[""]] * 9, first=7, resume=True)
+    for place in more.places:
+        assert [frame.number for frame, _ in read_frames(Path(place))] == list(range(9))
+
+
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
 def test_a_frame_counts_only_if_it_is_whole_at_each_byte_at_which_a_file_can_end(tmp_path, name):
     run = RunFiles(Origin(), None, [str(tmp_path / name)])
