@@ -54,7 +54,7 @@ def main(process: Process) -> None:
 
 
 class CompressorLoop:
-    """A forest, its checkpoints, its recording, and the sockets that it is connected to."""
+    """A forest, its checkpoints, and the sockets that it is connected to."""
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
         job, settings, endpoint = process.job, process.settings, process.endpoint
@@ -120,8 +120,7 @@ class CompressorLoop:
         """Serve late joiners, send the trees to subscribers, and publish the health."""
         self._samples.serve_late_joiners()
         self._saved_models.turn(self._forest.compressors, self._process.watchdog.beat)
-        trouble = [self._checkpoints.trouble if self._checkpoints is not None else ""]
-        self._process.trouble = "; ".join(filter(None, trouble))
+        self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
         self._process.beat(self._counters, self._forest.object_counters, now=last)
 
     def end(self, end: End) -> None:
@@ -141,5 +140,4 @@ class CompressorLoop:
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        own: dict[str, float] = {"stored": self._stored.stored}
-        return self._forest.counters() | own
+        return self._forest.counters() | {"stored": self._stored.stored}

@@ -463,14 +463,15 @@ def _desired(process: Process, models: ModelFiles) -> DesiredState:
     job = process.job
     if job.resume and job.state is not None and (job.state / DESIRED).exists():
         try:
-            return DesiredState.load(job.state / DESIRED)
+            desired = DesiredState.load(job.state / DESIRED)
+            return replace(desired, paused=desired.paused or job.paused)
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)
     boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
     saved = {name: models.add(Learned.load(file)) for name, file in job.models.items()}
     sought = {name: DesiredObject(each.box, 1, each.name, each.size) for name, each in saved.items()}
-    return DesiredState(boxes | sought)
+    return DesiredState(boxes | sought, paused=job.paused)
 
 
 def _shown(source: str) -> str:

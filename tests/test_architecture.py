@@ -24,7 +24,8 @@ LEVELS = [
     {"paper"},
     {"detection", "compression", "training", "wire", "video"},
     {"run"},
-    {"multi", "client", "sinks"},
+    {"multi", "client"},
+    {"sinks"},
     {"tracker", "services", "web"},
     {"pipeline"},
     {"applications", "fleet"},
@@ -47,7 +48,6 @@ IMPORTERS = {
         "catstream/detection",
         "catstream/paper",
         "catstream/video",
-        "catstream/applications/summaries/images.py",
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
         "services/detector.py",
@@ -60,8 +60,7 @@ IMPORTERS = {
     "obstore": ["catstream/fleet/objects.py"],
     "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
-    "pyarrow": ["catstream/sinks/made.py"],
-    "supervision": ["catstream/sinks/adapters.py"],
+    "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video"],
     "zmq": [
         "catstream/wire/socket.py",
@@ -71,7 +70,7 @@ IMPORTERS = {
         "catstream/wire/keys.py",
         "catstream/client/subscription.py",
     ],
-    "mcap": ["catstream/sinks/recording/container.py"],
+    "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
         *("catstream/box.py", "catstream/messages"),
@@ -95,7 +94,6 @@ SLOW = {
     "scipy",
     "filterpy",
     "pyarrow",
-    "supervision",
     "ray",
     "obstore",
 }

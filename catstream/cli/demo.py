@@ -66,6 +66,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
 def _one(output: Path, frames: int | None, render_only: bool) -> None:
     """The demo with one object."""
     from catstream.applications.evaluation.metrics import score
+    from catstream.sinks.track_log import read_frames
     from catstream.video.demo import FRAMES, write
 
     frames = frames or FRAMES
@@ -75,7 +76,8 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
     tracks = output / "tracks"
     _track(video, tracks, ["--box", str(boxes[0])])
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
-    found = np.loadtxt(tracks / "demo.txt", delimiter=",", ndmin=2)
+    tracked = [frame.tracks[0].box for frame, _ in read_frames(tracks / "demo.ndjson")]
+    found = np.array([box or (np.nan,) * 4 for box in tracked])
     absent, nothing = np.isnan(truth).any(axis=1), np.isnan(found).any(axis=1)
     click.echo(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
     if absent.any():
@@ -86,7 +88,7 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
 def _several(output: Path, objects: int, frames: int | None, render_only: bool) -> None:
     """The demo with several objects."""
     from catstream.applications.evaluation.multiple import score_multiple
-    from catstream.sinks.formats import CsvSink
+    from catstream.sinks.track_log import read_frames
     from catstream.video.crowd import FRAMES, write
 
     frames = frames or FRAMES
@@ -95,9 +97,9 @@ def _several(output: Path, objects: int, frames: int | None, render_only: bool) 
         return
     tracks = output / "tracks"
     _track(video, tracks, [word for name, box in truth[0].items() for word in ("--box", f"{name}={box}")])
-    found: list[dict[str, Box | None]] = [{} for _ in truth]
-    for each in CsvSink.tracks(tracks / "crowd.csv"):
-        found[each.frame][each.object] = each.box
+    found: list[dict[str, Box | None]] = [
+        {track.object: track.box for track in frame.tracks} for frame, _ in read_frames(tracks / "crowd.ndjson")
+    ]
     scores = score_multiple(truth, found)
     click.echo(
         f"MOTA {scores.mota:.3f}, IDF1 {scores.idf1:.3f}, HOTA {scores.hota:.3f}, identity switches {scores.switches}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from catstream.cli.output import line_of
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted
 from catstream.pipeline import Pipeline
-from catstream.sinks.sink import STDOUT
 
 _SHORTEST_SECONDS = 1.0  # of a run whose rate is told
 
@@ -29,20 +28,15 @@ class _Object:
 
 
 class RunProgress:
-    """Counts the tracks of a run, and shows them during the run and at its end.
+    """Counts the tracks of a run, and shows them during the run and at its end."""
 
-    Parameters
-    ----------
-    names : the objects of the earlier part of a resumed run, in the order in which they appeared
-    """
-
-    def __init__(self, pipeline: Pipeline, names: Iterable[str] = ()) -> None:
+    def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
         self._started = time.perf_counter()
         self._first = 0.0
         self._shown = 0.0
         self.frames = 0
-        self._objects = {name: _Object() for name in names}
+        self._objects: dict[str, _Object] = {}
 
     def progress(self, console: Console) -> Progress:
         progress = line_of(console, self._line)
@@ -79,7 +73,7 @@ class RunProgress:
         )
         progress.update(self._task, completed=self.frames, state=_state(tracks), figures=figures)
 
-    def summary(self, results: Sequence[Path]) -> str:
+    def summary(self, results: Sequence[str]) -> str:
         """The closing lines of the run."""
         rate = f"first track after {self._first:.2f} s"
         if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
@@ -103,15 +97,15 @@ class RunProgress:
             )
         if self._pipeline.restarts:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
-        if written := [_shown(file) for file in results if file != STDOUT]:
-            lines.append(f"results: {', '.join(written)}")
+        if results:
+            lines.append(f"results: {', '.join(map(_shown, results))}")
         return "\n".join(lines)
 
     def _of_each(self) -> Iterator[str]:
-        """A line for each object; the numbers are the ids in MOT text."""
-        for number, (name, each) in enumerate(self._objects.items(), 1):
+        """A line for each object."""
+        for name, each in self._objects.items():
             frames = f"present in {each.present} of {counted(each.frames, 'frame')}, model version {each.version}"
-            yield f"  {number} {name or '(no name)'}: {frames}"
+            yield f"  {name or '(no name)'}: {frames}"
 
     def _detector(self, counter: str) -> float:
         """A counter of the detector: the final one, or before the end that of its last report."""
@@ -137,6 +131,6 @@ def _figures(tracks: Mapping[str, Track]) -> list[str]:
     return [f"{name or '(no name)'} {track.score:+.2f}" for name, track in tracks.items()]
 
 
-def _shown(path: Path) -> str:
+def _shown(place: str) -> str:
     """A path relative to the current folder, if it is in it."""
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+    return str(Path(place).relative_to(Path.cwd())) if Path(place).is_relative_to(Path.cwd()) else place
