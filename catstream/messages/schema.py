@@ -28,8 +28,8 @@ _Lengths = dict[str, int]
 
 _TYPES = {name: np.dtype(name) for name in ("float32", "float64")}
 
-Limit = TypeVar("Limit")
 Value = TypeVar("Value")
+Limit = TypeVar("Limit")
 
 LARGEST_INTEGER = 2**53  # so that a reader in any language holds it exactly
 LONGEST_LIST = 256  # entries of a list or map: levels of a tree, counters
@@ -85,37 +85,28 @@ class Field:
 
     type          without None, and without metadata
     optional      whether None is allowed
-    limits        the metadata
+    array, named  limits of an array, and of a map
+    meta          limits that msgspec checks
+    is_message    whether its values are messages themselves
+    has_arrays    whether it is an array, or holds some
     keys, values  of a map: what its names and its values are
     """
 
     name: str
     type: Any
     optional: bool
-    limits: tuple[object, ...]
+    array: Array | None
+    named: Named | None
+    meta: Meta | None
+    is_message: bool
+    has_arrays: bool
     keys: Field | None = None
     values: Field | None = None
 
     @property
-    def is_message(self) -> bool:
-        """Whether its values are messages themselves."""
-        return dataclasses.is_dataclass(self.type)
-
-    @property
     def is_name(self) -> bool:
         """Whether it is the name of an object."""
-        return any(isinstance(limit, Meta) and limit.pattern for limit in self.limits)
-
-    @property
-    def has_arrays(self) -> bool:
-        """Whether it is an array, or holds some."""
-        if self.is_message:
-            return any(field.has_arrays for field in fields(self.type))
-        return self.limit(Array) is not None or (self.values is not None and self.values.has_arrays)
-
-    def limit(self, kind: type[Limit]) -> Limit | None:
-        """The metadata of a kind, None if there is none."""
-        return next((limit for limit in self.limits if isinstance(limit, kind)), None)
+        return self.meta is not None and self.meta.pattern is not None
 
 
 def fields(kind: type) -> tuple[Field, ...]:
@@ -142,7 +133,19 @@ def _field(name: str, hint: Any) -> Field:
         else:
             break
     keys, values = (_field(name, each) for each in get_args(hint)) if get_origin(hint) is dict else (None, None)
-    return Field(name, hint, optional, limits, keys, values)
+    is_message, array = dataclasses.is_dataclass(hint), _first(limits, Array)
+    has_arrays = (
+        any(field.has_arrays for field in fields(hint))
+        if is_message
+        else array is not None or (values is not None and values.has_arrays)
+    )
+    return Field(
+        name, hint, optional, array, _first(limits, Named), _first(limits, Meta), is_message, has_arrays, keys, values
+    )
+
+
+def _first(limits: tuple[object, ...], kind: type[Limit]) -> Limit | None:
+    return next((limit for limit in limits if isinstance(limit, kind)), None)
 
 
 def check_message(message: object) -> _Lengths:
@@ -175,12 +178,12 @@ def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths 
         return None
     if field.values is not None:
         found = {name: _check(field.values, entry, lengths, where) for name, entry in value.items()}
-        if (named := field.limit(Named)) is not None:
-            _check_names(found, named, where)
+        if field.named is not None:
+            _check_names(found, field.named, where)
     elif field.is_message:
         return check_message(value)
-    elif (limits := field.limit(Array)) is not None:
-        _check_array(value, limits, lengths, where)
+    elif field.array is not None:
+        _check_array(value, field.array, lengths, where)
     return None
 
 

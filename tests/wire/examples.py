@@ -8,7 +8,7 @@ import numpy as np
 
 from catstream.box import Box, Window
 from catstream.messages.kinds import Command, Preview
-from catstream.messages.schema import Array, Field, Named, fields
+from catstream.messages.schema import Field, Named, fields
 
 
 def example(kind: type, full: bool = True, d: int = 5) -> Any:
@@ -29,14 +29,14 @@ def example(kind: type, full: bool = True, d: int = 5) -> Any:
 
 def _value(field: Field, full: bool, d: int) -> Any:
     if field.values is not None:
-        named = field.limit(Named) or Named({"sent": 0, "stored": 0})
+        named = field.named or Named({"sent": 0, "stored": 0})
         if field.keys.is_name:
             named = Named({"anna": 0, "ben": 0} if full else {"": 0}, frozenset({""}))
         names = [name for name in named.columns if full or name in named.required]
         return {name: _value(field.values, full, d + named.columns[name]) for name in names}
     if field.is_message:
         return example(field.type, full, d)
-    if array := field.limit(Array):
+    if array := field.array:
         shape = [side if isinstance(side, int) else d if side == "d" else 3 * full for side in array.shape]
         return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=array.dtype).reshape(shape)
     if get_origin(field.type) is Literal:

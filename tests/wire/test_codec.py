@@ -29,7 +29,7 @@ from catstream.messages.kinds import (
     Track,
     TrainingRows,
 )
-from catstream.messages.schema import LARGEST_INTEGER, LONGEST_TEXT, Array, Field, Named, fields
+from catstream.messages.schema import LARGEST_INTEGER, LONGEST_TEXT, Array, Field, fields
 from catstream.settings import RunSettings, Settings
 from catstream.video import demo
 from catstream.wire.channels import CHANNELS
@@ -106,13 +106,13 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
         return draw(messages(field.type))
     if field.is_name:
         return draw(NAMES)
-    if array := field.limit(Array):
+    if array := field.array:
         return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
     return draw(_plain(field))
 
 
 def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, Any]:
-    named = field.limit(Named)
+    named = field.named
     if named is None:
         names = NAMES if field.keys.is_name else st.text(max_size=8)
         return {name: _value(draw, field.values, lengths) for name in draw(st.sets(names, max_size=3))}

@@ -16,7 +16,6 @@ from typing import Literal, get_args, get_origin
 
 import msgpack
 import pytest
-from msgspec import Meta
 
 from catstream.box import Box, Window
 from catstream.messages.heads import TREES
@@ -33,7 +32,7 @@ from catstream.messages.kinds import (
     Track,
     TrainingRows,
 )
-from catstream.messages.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Named, fields
+from catstream.messages.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, fields
 from catstream.wire import codec
 from catstream.wire.channels import CHANNELS, REGISTRY, TRACKS
 from catstream.wire.endpoint import Endpoint
@@ -72,16 +71,16 @@ def described(field):
 
 def kind_of(field):
     if field.values is not None:
-        names = "objects" if field.keys.is_name else names_of(field.limit(Named))
+        names = "objects" if field.keys.is_name else names_of(field.named)
         return f"map of {names} to {kind_of(field.values)}"
     if field.is_name:
         return "name of an object"
     if field.is_message:
         return f"`{field.type.__name__.lower()}`"
-    if array := field.limit(Array):
+    if array := field.array:
         nan = ", may be NaN" if array.may_be_nan else ""
         return f"{array.dtype} ({', '.join(map(str, array.shape))}){array.range()}{nan}"
-    limits = field.limit(Meta)
+    limits = field.meta
     if get_origin(field.type) is Literal:
         return f"text: {', '.join(f'`{value}`' for value in get_args(field.type))}"
     if get_origin(field.type) is tuple:
