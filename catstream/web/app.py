@@ -14,8 +14,7 @@ of a pipeline only
 
 of a fleet only
 
-/streams/NAME/              all of the above for the pipeline of a stream
-/streams/NAME/picture.jpg   a small picture of its newest frame; 204 if there is none
+/streams/NAME/    all of the above for the pipeline of a stream
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Literal
@@ -43,14 +41,16 @@ from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError
 from catstream.messages.kinds import ObjectName
 from catstream.messages.schema import OnlyWith
 from catstream.video.annotate import draw_preview
-from catstream.web import metrics
-from catstream.web.connections import body_of
-from catstream.web.feed import Feed, PipelineFeed
-from catstream.web.streams import FleetFeed
-from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
+from catstream.web import prometheus
+from catstream.web.feed import Feed, FleetFeed, PipelineFeed
 from catstream.wire.codec import decode_json
 
 _PAGE = Path(__file__).with_name("page")
+
+UPDATE_SECONDS = 0.1  #: between two updates
+COMMENT_SECONDS = 5.0  #: without an update, after which a comment is sent, which detects closed connections
+RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
+_MAX_BODY = 4096  # bytes
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.
 _CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, CatstreamError: 503}
@@ -88,7 +88,7 @@ class Site:
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         self._feed.start()
         yield
-        await asyncio.wait([self._feed.stop()])
+        await asyncio.to_thread(self._feed.stop)
 
     def _routes(self, feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
         common = [
@@ -107,11 +107,7 @@ class Site:
         ]
         if isinstance(feed, PipelineFeed):
             return of_pipeline
-        return [
-            *common,
-            Route("/streams/{stream}/picture.jpg", partial(_small_picture, feed)),
-            Mount("/streams/{stream}", routes=of_pipeline),
-        ]
+        return [*common, Mount("/streams/{stream}", routes=of_pipeline)]
 
     async def _index(self, request: Request) -> Response:
         self._feed_of(request)
@@ -121,7 +117,7 @@ class Site:
         return _endless(request, self._updates(self._feed_of(request)), "text/event-stream")
 
     async def _metrics(self, request: Request) -> Response:
-        text = metrics.text(self._feed_of(request))
+        text = prometheus.text(self._feed_of(request))
         return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _healthz(self, _: Request) -> Response:
@@ -146,7 +142,7 @@ class Site:
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise HTTPException(415, "expected application/json\n")
-        command = decode_json(await body_of(request), Command)
+        command = decode_json(await _body_of(request), Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
         try:
@@ -174,7 +170,7 @@ class Site:
                 if parts := feed.dashboard.updates(seen):
                     last_sent = monotonic()
                     yield _event(parts)
-                elif monotonic() - last_sent > KEEP_ALIVE_SECONDS:
+                elif monotonic() - last_sent > COMMENT_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)
@@ -189,7 +185,7 @@ class Site:
                 newest = feed.dashboard.newest
                 if newest is not None and newest != shown:
                     shown = newest
-                    jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.objects.colours)
+                    jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.colours)
                     # The boundary after the picture is sent with it: many clients show a picture only after it.
                     yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
                         len(jpeg),
@@ -207,9 +203,14 @@ def _event(parts: dict[str, object]) -> str:
     return f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
 
 
-async def _small_picture(feed: FleetFeed, request: Request) -> Response:
-    jpeg = await feed.picture(request.path_params["stream"])
-    return Response(status_code=204) if jpeg is None else Response(jpeg, media_type="image/jpeg")
+async def _body_of(request: Request) -> bytes:
+    """Return the body of a request, of at most 4096 bytes."""
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > _MAX_BODY:
+            raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
+    return body
 
 
 @dataclass(frozen=True, slots=True)

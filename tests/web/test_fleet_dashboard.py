@@ -38,15 +38,6 @@ def test_a_page_is_told_of_all_streams_and_nodes_once_for_each_status(dashboard)
     assert (list(told(dashboard, seen)["streams"]), told(dashboard, {})["nodes"]) == (["cam-7"], {})
 
 
-@pytest.mark.parametrize(
-    ("state", "endpoint", "picture"),
-    [("running", "/tmp/a", True), ("paused", "/tmp/a", True), ("running", "", False), ("moving", "/tmp/a", False)],
-)
-def test_only_a_pipeline_that_runs_is_asked_for_a_picture(dashboard, state, endpoint, picture):
-    dashboard.take(status(StreamStatus("cam-7", state, endpoint=endpoint)), 0.0)
-    assert told(dashboard, {})["streams"]["cam-7"]["picture"] == picture
-
-
 def test_no_address_nor_key_of_a_pipeline_is_told(dashboard):
     secret = StreamStatus("cam-7", "running", endpoint="/tmp/secret-place", server="a public key")
     dashboard.take(status(secret), 0.0)

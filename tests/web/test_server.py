@@ -27,8 +27,7 @@ from catstream.web import app
 from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
 from catstream.web.feed import PipelineFeed
-from catstream.web.guard import Guard
-from catstream.web.server import Server
+from catstream.web.server import Guard, Server
 from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
 from catstream.wire.newest import Publisher
 
@@ -105,8 +104,8 @@ def test_each_file_of_the_page_has_its_content_type(page, name):
 
 
 def test_files_outside_the_page_folder_are_not_served(page):
-    assert page.get("/page/..%2fguard.py").status_code == 404
-    assert page.get("/page/%2e%2e/guard.py").status_code == 404
+    assert page.get("/page/..%2fserver.py").status_code == 404
+    assert page.get("/page/%2e%2e/server.py").status_code == 404
 
 
 def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline, until):
@@ -121,8 +120,8 @@ def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline
     until(ready)
     shown = page.get("/metrics").text
     assert "\ncatstream_up 1.0\n" in shown
-    assert "\ncatstream_frames_total 3.0\n" in shown
-    assert '\ncatstream_rejected_messages_total{process="trainer"} 1.0\n' in shown
+    assert "\ncatstream_detector_sent 3.0\n" in shown
+    assert '\ncatstream_trainer_rejected 1.0\n' in shown
 
 
 def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
@@ -195,9 +194,9 @@ def test_the_response_to_head_ends_and_its_client_is_no_viewer(page, path):
     assert "\ncatstream_viewers 0.0\n" in page.get("/metrics").text, "on the same connection"
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1", ""])
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1"])
 def test_a_request_with_a_foreign_host_name_is_rejected(page, host):
-    assert page.get("/", headers={"Host": host}).status_code in (400, 421)
+    assert page.get("/", headers={"Host": host}).status_code == 400
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1"])
@@ -342,29 +341,27 @@ def test_a_browser_may_open_two_pages_at_two_ports(serve):
     assert [page.get("/metrics").status_code for page in (one, other)] == [200, 200]
 
 
-def test_a_page_whose_cookie_is_that_of_an_earlier_server_asks_for_the_token(locked):
-    port = locked.base_url.port
-    answer = locked.get("/", headers={"Cookie": f"catstream-{port}=0123; {{another program: yes}}"})
+def test_a_page_with_a_wrong_cookie_asks_for_the_token(locked):
+    name = locked.get(f"/?token={TOKEN}").headers["set-cookie"].partition("=")[0]
+    locked.cookies.clear()
+    answer = locked.get("/", headers={"Cookie": f"{name}=0123; {{another program: yes}}"})
     assert (answer.status_code, "<form" in answer.text) == (401, True)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
 def test_a_public_address_requires_a_token(host):
-    with pytest.raises(ServiceError, match="without --no-token"):
+    with pytest.raises(ServiceError, match="without --token none"):
         Server(pipeline_site(), host=host, port=0)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host):
+def test_a_server_on_all_interfaces_is_found_at_the_loopback_and_by_the_name_of_the_machine(host):
     server = Server(pipeline_site(), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
+        assert httpx.get(server.url, follow_redirects=True).status_code == 200
     assert {url.query for url in urls} == {f"token={TOKEN}"}
-    assert [url.hostname for url in urls[:2]] == ["127.0.0.1", socket.gethostname().lower()]
-    assert not {"0.0.0.0", "::"} & {url.hostname for url in urls}
-    for url in urls[2:]:
-        with socket.socket() as other:  # only what is an address of this machine can be bound
-            other.bind((url.hostname, 0))
+    assert [url.hostname for url in urls] == ["127.0.0.1", socket.gethostname().lower()]
 
 
 def test_a_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatch):
