@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from catstream.web import streams
+from catstream.web import feed
 
 pytestmark = pytest.mark.system
 
@@ -17,7 +17,7 @@ TOKEN = "correct-horse-battery"
 def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
     fleet, manager, serve_fleet, camera, turning, folder, script_of_browser, monkeypatch
 ):
-    monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
+    monkeypatch.setattr(feed, "REGISTRY_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
     fleet.node("south-2", cores=4.0)
     fleet.node("south", "dead", cores=4.0, trouble="no answer since 02:14:07")
