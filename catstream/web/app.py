@@ -5,16 +5,10 @@
 /metrics          metrics for Prometheus
 /healthz          200 while this server runs
 /readyz           200 while all processes of the pipeline send health reports, or while the fleet answers
-
-of a pipeline only
-
-/pictures/N.jpg   the picture of frame N
-/live.mjpeg       the newest pictures with their tracks drawn in, as an MJPEG stream
-/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...}
-
-of a fleet only
-
-/streams/NAME/    all of the above for the pipeline of a stream
+/pictures/N.jpg   the picture of frame N of a pipeline
+/live.mjpeg       the newest pictures of a pipeline with their tracks drawn in, as an MJPEG stream
+/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...} to a pipeline
+/streams/NAME/    all of the above for the pipeline of a stream of a fleet
 """
 
 from __future__ import annotations
@@ -33,7 +27,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import BaseRoute, Mount, Route
+from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
@@ -77,20 +71,6 @@ class Site:
     def __init__(self, feed: PipelineFeed | FleetFeed) -> None:
         self._feed = feed
         self._closed = False
-        routes = self._routes(feed)
-        self.app = Starlette(lifespan=self._lifespan, routes=routes, exception_handlers={CatstreamError: _failed})
-
-    def close(self) -> None:
-        """End the streams of all open pages; called before the shutdown of a server, which waits for them."""
-        self._closed = True
-
-    @asynccontextmanager
-    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        self._feed.start()
-        yield
-        await asyncio.to_thread(self._feed.stop)
-
-    def _routes(self, feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
         common = [
             Route("/", self._index),
             Route("/events", self._events),
@@ -105,9 +85,22 @@ class Site:
             Route("/live.mjpeg", self._live),
             Route("/control", self._control, methods=["POST"]),
         ]
-        if isinstance(feed, PipelineFeed):
-            return of_pipeline
-        return [*common, Mount("/streams/{stream}", routes=of_pipeline)]
+        of_fleet = [*common, Mount("/streams/{stream}", routes=of_pipeline)]
+        self.app = Starlette(
+            lifespan=self._lifespan,
+            routes=of_pipeline if isinstance(feed, PipelineFeed) else of_fleet,
+            exception_handlers={CatstreamError: _failed},
+        )
+
+    def close(self) -> None:
+        """End the streams of all open pages; called before the shutdown of a server, which waits for them."""
+        self._closed = True
+
+    @asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        self._feed.start()
+        yield
+        await asyncio.to_thread(self._feed.stop)
 
     async def _index(self, request: Request) -> Response:
         self._feed_of(request)
@@ -142,7 +135,11 @@ class Site:
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise HTTPException(415, "expected application/json\n")
-        command = decode_json(await _body_of(request), Command)
+        body = b""
+        async for part in request.stream():
+            if len(body := body + part) > _MAX_BODY:
+                raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
+        command = decode_json(body, Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
         try:
@@ -187,10 +184,8 @@ class Site:
                     shown = newest
                     jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.colours)
                     # The boundary after the picture is sent with it: many clients show a picture only after it.
-                    yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
-                        len(jpeg),
-                        jpeg,
-                    )
+                    head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+                    yield head + jpeg + b"\r\n--picture\r\n"
                 await asyncio.sleep(UPDATE_SECONDS)
 
 
@@ -201,16 +196,6 @@ def _endless(request: Request, parts: AsyncIterator[str] | AsyncIterator[bytes],
 
 def _event(parts: dict[str, object]) -> str:
     return f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
-
-
-async def _body_of(request: Request) -> bytes:
-    """Return the body of a request, of at most 4096 bytes."""
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > _MAX_BODY:
-            raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
-    return body
 
 
 @dataclass(frozen=True, slots=True)

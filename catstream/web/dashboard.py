@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import takewhile
 from typing import Any, Literal, TypeVar
 
@@ -328,8 +328,11 @@ class FleetDashboard(Parts):
                 "status": lambda _: {
                     "name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age),
                 },
-                "streams": lambda _: {name: _stream(each) for name, each in self.status.streams.items()},
-                "nodes": lambda _: {name: _node(each) for name, each in self.status.nodes.items()},
+                "streams": lambda _: {  # JSON objects of a browser have numbers first
+                    name: _shown(each) | {"models": list(each.models.items())}
+                    for name, each in self.status.streams.items()
+                },
+                "nodes": lambda _: {name: _shown(each) for name, each in self.status.nodes.items()},
             }
         )  # fmt: skip
         self.status = FleetStatus("", 0.0)
@@ -347,20 +350,7 @@ class FleetDashboard(Parts):
             self.age = now - self._arrived
 
 
-def _stream(stream: StreamStatus) -> dict[str, Any]:
-    """Return what the page shows of a stream: neither the address nor a key of its pipeline."""
-    names = ("state", "trouble", "node", "source", "restarts", "skipped", "stored_seconds")
-    return {name: getattr(stream, name) for name in names} | {
-        "rate": round(stream.rate, 1),
-        "models": list(stream.models.items()),
-    }
-
-
-def _node(node: NodeStatus) -> dict[str, Any]:
-    """Return what the page shows of a node."""
-    names = ("state", "trouble", "address", "streams")
-    return {name: getattr(node, name) for name in names} | {
-        "cores": round(node.cores, 2),
-        "used": round(node.used, 2),
-        "labels": [f"{name}={value}" for name, value in sorted(node.labels.items())],
-    }
+def _shown(status: StreamStatus | NodeStatus) -> dict[str, Any]:
+    """Return what the page shows of a stream or a node: neither the address nor a key of a pipeline."""
+    hidden = ("name", "endpoint", "server", "token", "began")
+    return {field.name: getattr(status, field.name) for field in fields(status) if field.name not in hidden}

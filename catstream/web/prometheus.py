@@ -6,14 +6,11 @@ object; it begins again at 0 with a restarted process, which `rate` and `increas
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import fields
 from time import time
 
-from prometheus_client import generate_latest
-from prometheus_client.metrics_core import Metric, UnknownMetricFamily
-from prometheus_client.registry import Collector
+from prometheus_client import CollectorRegistry, Gauge, generate_latest
 
 from catstream.messages.kinds import NodeStatus, StreamStatus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
@@ -25,24 +22,12 @@ _Sample = tuple[str, float, dict[str, str]]
 def text(feed: Feed) -> bytes:
     """Return the current metrics of what a feed shows."""
     samples = _of_fleet(feed) if isinstance(feed, FleetFeed) else _of_pipeline(feed.pipeline(""))
-    return generate_latest(_Collected([("viewers", feed.viewers, {}), *samples]))
-
-
-class _Collected(Collector):
-    """Samples as metrics."""
-
-    def __init__(self, samples: list[_Sample]) -> None:
-        self._samples = samples
-
-    def collect(self) -> Iterator[Metric]:
-        families: dict[str, list[_Sample]] = defaultdict(list)
-        for sample in self._samples:
-            families[sample[0]].append(sample)
-        for name, samples in families.items():
-            family = UnknownMetricFamily(f"catstream_{name}", name.replace("_", " "), labels=list(samples[0][2]))
-            for _, value, labels in samples:
-                family.add_metric(list(labels.values()), float(value))
-            yield family
+    registry, metrics = CollectorRegistry(), dict[str, Gauge]()
+    for name, value, labels in [("viewers", feed.viewers, {}), *samples]:
+        if name not in metrics:
+            metrics[name] = Gauge(f"catstream_{name}", name.replace("_", " "), list(labels), registry=registry)
+        (metrics[name].labels(**labels) if labels else metrics[name]).set(value)
+    return generate_latest(registry)
 
 
 def _of_pipeline(feed: PipelineFeed) -> Iterator[_Sample]:

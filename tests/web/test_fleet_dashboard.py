@@ -32,7 +32,7 @@ def test_a_page_is_told_of_all_streams_and_nodes_once_for_each_status(dashboard)
     dashboard.take(status(StreamStatus("cam-7", "running"), StreamStatus("cam-8", "failed", trouble="no source")), 0.0)
     first = told(dashboard, seen)
     assert (list(first["streams"]), first["streams"]["cam-8"]["trouble"]) == (["cam-7", "cam-8"], "no source")
-    assert first["nodes"]["north-1"]["labels"] == ["site=north"]
+    assert first["nodes"]["north-1"]["labels"] == {"site": "north"}
     assert told(dashboard, seen) == {}
     dashboard.take(status(StreamStatus("cam-7", "running"), nodes=()), 1.0)
     assert (list(told(dashboard, seen)["streams"]), told(dashboard, {})["nodes"]) == (["cam-7"], {})

@@ -1,8 +1,8 @@
 // The page of a fleet: a table of the streams, each with a link to its page, and one of the nodes; those in trouble first.
 
 import { $, add, duration, Items, write } from "./dom.js";
-import { Search } from "./search.js";
 
+const STATES = ["trouble", "failed", "unplaced", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
   stopping: "bootstrapping", failed: "absent", unplaced: "absent", alive: "present", dead: "absent" };
 const WORDS = { waiting: "waiting for a box" };
@@ -30,7 +30,7 @@ export class FleetPage {
 
   take({ status, streams, nodes }) {
     this.fleet = status ?? this.fleet;
-    this.labels = nodes ? Object.fromEntries(Object.entries(nodes).map(([name, { labels }]) => [name, labels])) : this.labels;
+    this.labels = nodes ? Object.fromEntries(Object.entries(nodes).map(([name, node]) => [name, labels(node)])) : this.labels;
     if (nodes) this.showNodes(nodes);
     if (streams) this.showStreams(streams);
     this.showMatching();
@@ -122,6 +122,8 @@ function inOrder(values) {
   return Object.entries(values).sort(([name, one], [other, two]) => two.level - one.level || byNumber(name, other));
 }
 
+const labels = (node) => Object.entries(node.labels).map(([name, value]) => `${name}=${value}`).sort();
+
 /** A row: the name, which is a link or a button, with lines below it, the state, and cells of text. */
 function makeRow(tag, properties, cells) {
   const element = document.createElement("tr");
@@ -150,7 +152,7 @@ function fillStream(item, one) {
 const makeNode = (name, onclick) => makeRow("button", { type: "button", textContent: name, onclick }, ["number", "number"]);
 
 function fillNode(item, one) {
-  write(item.about, one.labels.join(" · "));
+  write(item.about, labels(one).join(" · "));
   item.name.title = `Show the streams of this node${one.address && `, at ${one.address}`}`;
   fillRow(item, one, [one.state === "dead" ? "–" : `${round(one.used)} of ${round(one.cores)}`, String(one.streams)]);
 }
@@ -160,4 +162,66 @@ function stored(seconds) {
   if (seconds === null) return "–";
   const limit = [5, 10, 15, 30, 60].find((each) => seconds < each);
   return limit ? `< ${limit} s ago` : `${duration(Math.floor(seconds / 60) * 60)} ago`;
+}
+
+/** The search field, and buttons that search for the streams in a state. The search is kept in the address of the page. */
+class Search {
+  /** changed() is called whenever another search is made. */
+  constructor(field, buttons, changed) {
+    Object.assign(this, { field, changed });
+    this.buttons = new Items(buttons, { make: (state) => this.make(state), fill: fillButton });
+    field.value = new URLSearchParams(location.search).get("search") ?? "";
+    field.addEventListener("input", () => this.tell());
+    field.addEventListener("keydown", (event) => event.key === "Escape" && this.ask(""));
+    document.addEventListener("keydown", (event) => {
+      if (event.key !== "/" || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return;
+      event.preventDefault();
+      field.focus();
+    });
+  }
+
+  get text() {
+    return this.field.value.trim();
+  }
+
+  get words() {
+    return this.text.toLowerCase().split(/\s+/).filter(Boolean);
+  }
+
+  /** Search for a text. */
+  ask(text) {
+    this.field.value = text;
+    this.tell();
+  }
+
+  tell() {
+    history.replaceState(null, "", this.text ? `?${new URLSearchParams({ search: this.text })}` : location.pathname);
+    this.changed();
+  }
+
+  /** Whether all words are found in the words of a stream, those with an = as whole words. */
+  matches(stream) {
+    return this.words.every((word) => (word.includes("=") ? ` ${stream.words} `.includes(` ${word} `) : stream.words.includes(word)));
+  }
+
+  /** Show a button for each state that streams are in, how many there are, and whether they are searched for. */
+  offer(streams) {
+    const counts = STATES.map((state) => [state, streams.filter((one) => (state === "trouble" ? one.level : one.state === state)).length]);
+    const shown = counts.map(([state, count]) => [state, { count, pressed: this.words.includes(state) }]);
+    this.buttons.show(shown.filter(([, { count, pressed }]) => count || pressed));
+  }
+
+  /** A button that adds its state to the words, in place of another one, or removes it. */
+  make(state) {
+    const press = () => this.ask([...this.words.filter((word) => !STATES.includes(word)), ...(this.words.includes(state) ? [] : [state])].join(" "));
+    const element = Object.assign(document.createElement("button"), { type: "button", onclick: press });
+    element.dataset.state = state;
+    return { element };
+  }
+}
+
+function fillButton({ element }, { count, pressed }) {
+  const { state } = element.dataset;
+  write(element, `${state === "trouble" ? "in trouble" : state} ${count}`);
+  element.setAttribute("aria-pressed", String(pressed));
 }

@@ -1,9 +1,8 @@
 // The page of a stream: passes updates to the parts of the page, and commands of the user to the pipeline.
 
-import { BoxForm } from "./boxform.js";
 import { Charts } from "./charts.js";
 import { $, write } from "./dom.js";
-import { Objects } from "./objects.js";
+import { BoxForm, Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { Trees } from "./trees.js";
 
