@@ -121,7 +121,7 @@ def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline
     shown = page.get("/metrics").text
     assert "\ncatstream_up 1.0\n" in shown
     assert "\ncatstream_detector_sent 3.0\n" in shown
-    assert '\ncatstream_trainer_rejected 1.0\n' in shown
+    assert "\ncatstream_trainer_rejected 1.0\n" in shown
 
 
 def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
