@@ -6,7 +6,6 @@ const STATES = ["trouble", "failed", "unplaced", "running", "waiting", "paused",
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
   stopping: "bootstrapping", failed: "absent", unplaced: "absent", alive: "present", dead: "absent" };
 const WORDS = { waiting: "waiting for a box" };
-const WIDE = matchMedia("(min-width: 75rem)");
 const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 before cam-10
 const round = (value, digits = 2) => String(Number(value.toFixed(digits)));
 
@@ -19,11 +18,7 @@ export class FleetPage {
     this.rows = new Items($("#fleet tbody"), { make: makeStream, fill: fillStream });
     this.nodes = new Items($("#nodes tbody"), { make: (name) => makeNode(name, () => this.search.ask(`node=${name}`)), fill: fillNode });
     this.search = new Search($("#search"), $(".states"), () => this.showMatching());
-    const details = $("#nodes details");
-    details.open = WIDE.matches;
-    WIDE.addEventListener("change", () => (details.open = WIDE.matches));
     $("#streams").hidden = false;
-    addEventListener("pagehide", () => sessionStorage.setItem("top", String(scrollY)));
     setInterval(() => server.silent !== null && this.showState(), 1000);
     this.showState();
   }
@@ -35,7 +30,6 @@ export class FleetPage {
     if (streams) this.showStreams(streams);
     this.showMatching();
     this.showState();
-    this.restorePosition();
   }
 
   /** Show all streams; one is found by its `words`: name, state, node with its labels, and objects. */
@@ -54,7 +48,7 @@ export class FleetPage {
     const total = (field) => round(alive.reduce((sum, row) => sum + row[field], 0));
     const states = alive.length === rows.length ? `${rows.length}` : `${alive.length} of ${rows.length} alive`;
     $("#nodes .scrolled").hidden = !rows.length;
-    write($("#nodes summary span"), rows.length ? `${states} · ${total("used")} of ${total("cores")} cores used` : "none");
+    write($("#nodes .count"), rows.length ? `${states} · ${total("used")} of ${total("cores")} cores used` : "none");
     this.nodes.show(inOrder(nodes));
   }
 
@@ -105,14 +99,6 @@ export class FleetPage {
     if (silent !== null) return `The server of this page does not answer. This page tries again.${shown}`;
     if (fleet.phase === "silent") return `The fleet does not answer.${shown.replace("It", "This page")} The reason: ${fleet.reason}`;
     return fleet.phase === "waiting" && fleet.reason ? `Waiting for the fleet: ${fleet.reason}` : "";
-  }
-
-  /** After a page of a stream, return to the same rows. */
-  restorePosition() {
-    const top = sessionStorage.getItem("top");
-    if (top === null || !this.streams.length) return;
-    sessionStorage.removeItem("top");
-    scrollTo(0, Number(top));
   }
 }
 
