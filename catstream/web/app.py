@@ -20,7 +20,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Literal
+from typing import Literal
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -33,7 +33,6 @@ from starlette.staticfiles import StaticFiles
 from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages.kinds import ObjectName
-from catstream.messages.schema import OnlyWith
 from catstream.video.annotate import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
@@ -142,6 +141,8 @@ class Site:
         command = decode_json(body, Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
+        if (command.box is not None) != (command.verb == "set-box"):
+            raise ProtocolError(f"expected a box with set-box and with no other verb, got {command.verb}")
         try:
             answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
@@ -204,7 +205,7 @@ class Command:
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: ObjectName = ""
-    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    box: Box | None = None
     keep: bool = False
 
 

@@ -51,6 +51,7 @@ def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
     for stream in status.streams.values() if running else ():
         labels = {"stream": stream.name, "node": stream.node}
         yield from _of_status("stream", stream, labels)
+        yield "stream_trouble", bool(stream.trouble), labels
         for name, version in stream.models.items():
             yield "stream_model_version", version, labels | {"object": name}
     for node in status.nodes.values() if running else ():
@@ -59,7 +60,6 @@ def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
 
 def _of_status(kind: str, status: StreamStatus | NodeStatus, labels: dict[str, str]) -> Iterator[_Sample]:
     yield f"{kind}_state", 1, labels | {"state": status.state}
-    yield f"{kind}_trouble", bool(status.trouble), labels
     for field in fields(status):
         if isinstance(value := getattr(status, field.name), int | float):
             yield f"{kind}_{field.name}", value, labels

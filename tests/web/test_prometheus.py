@@ -53,12 +53,12 @@ def test_a_pipeline_that_does_not_run_has_no_old_values(feed, facts):
 
 def test_each_number_of_a_stream_and_of_a_node_is_a_metric_with_their_names_as_labels(fleet):
     feed = FleetFeed(fleet.address)
-    fleet.stream("cam-7", node="north", models={"anna": 3}, rate=25.0)
+    fleet.stream("cam-7", node="north", models={"anna": 3}, frame=25)
     fleet.stream("cam-8", "failed", trouble="no source")
     fleet.node("north", cores=4.0)
     feed.dashboard.take(fleet.status(), 0.0)
     found = samples(feed)
-    assert found["catstream_stream_rate"] == [('node="north",stream="cam-7"', 25.0), ('node="",stream="cam-8"', 0.0)]
+    assert found["catstream_stream_frame"] == [('node="north",stream="cam-7"', 25.0), ('node="",stream="cam-8"', 0.0)]
     assert found["catstream_stream_state"][1] == ('node="",state="failed",stream="cam-8"', 1.0)
     assert [value for _, value in found["catstream_stream_trouble"]] == [0.0, 1.0]
     assert found["catstream_stream_model_version"] == [('node="north",object="anna",stream="cam-7"', 3.0)]

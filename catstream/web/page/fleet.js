@@ -2,12 +2,12 @@
 
 import { $, add, duration, Items, write } from "./dom.js";
 
-const STATES = ["trouble", "failed", "unplaced", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
+const STATES = ["trouble", "failed", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
-  stopping: "bootstrapping", failed: "absent", unplaced: "absent", alive: "present", dead: "absent" };
+  stopping: "bootstrapping", failed: "absent", alive: "present", dead: "absent" };
 const WORDS = { waiting: "waiting for a box" };
 const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 before cam-10
-const round = (value, digits = 2) => String(Number(value.toFixed(digits)));
+const round = (value) => String(Number(value.toFixed(2)));
 
 export class FleetPage {
   /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
@@ -104,7 +104,7 @@ export class FleetPage {
 
 /** Pairs of name and value: those that do not run because of trouble, others with trouble, the rest; by name. */
 function inOrder(values) {
-  for (const value of Object.values(values)) value.level = ["failed", "unplaced", "dead"].includes(value.state) ? 2 : value.trouble ? 1 : 0;
+  for (const value of Object.values(values)) value.level = ["failed", "dead"].includes(value.state) ? 2 : value.trouble ? 1 : 0;
   return Object.entries(values).sort(([name, one], [other, two]) => two.level - one.level || byNumber(name, other));
 }
 
@@ -119,20 +119,19 @@ function makeRow(tag, properties, cells) {
     trouble: add(first, "p", { className: "trouble" }), word: add(pill, "b"), cells: cells.map((className) => add(element, "td", { className })) };
 }
 
-function fillRow({ pill, word, trouble, cells }, { state, trouble: problem }, texts) {
+function fillRow({ pill, word, trouble, cells }, { state, trouble: problem = "" }, texts) {
   pill.dataset.state = TONES[state] ?? state;
   write(word, WORDS[state] ?? state);
   write(trouble, problem);
   texts.forEach((text, place) => write(cells[place], text));
 }
 
-const makeStream = (name) => makeRow("a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name }, ["", "number", "", "", "number"]);
+const makeStream = (name) => makeRow("a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name }, ["", "number", "number", "", ""]);
 
 function fillStream(item, one) {
-  const runs = ["running", "waiting", "moving"].includes(one.state);
   item.name.title = one.source;
-  fillRow(item, one, [one.node || "–", runs ? round(one.rate, one.rate < 9.95 ? 1 : 0) : "–",
-    one.models.map(([name, version]) => (name ? `${name}: ${version}` : version)).join(", ") || "–", stored(one.stored_seconds), String(one.restarts)]);
+  fillRow(item, one, [one.node || "–", one.frame.toLocaleString("en"), one.skipped.toLocaleString("en"),
+    one.models.map(([name, version]) => (name ? `${name}: ${version}` : version)).join(", ") || "–", stored(one.stored_seconds)]);
 }
 
 const makeNode = (name, onclick) => makeRow("button", { type: "button", textContent: name, onclick }, ["number", "number"]);
