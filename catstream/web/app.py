@@ -60,12 +60,7 @@ def fleet_site(fleet: str = "", keys: str = "") -> Site:
 
 
 class Site:
-    """The web application of a pipeline or of a fleet, without access control; `Server` serves it.
-
-    Attributes
-    ----------
-    app : the application
-    """
+    """The web application of a pipeline or of a fleet, `app`, without access control; `Server` serves it."""
 
     def __init__(self, feed: PipelineFeed | FleetFeed) -> None:
         self._feed = feed

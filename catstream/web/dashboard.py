@@ -31,32 +31,20 @@ _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
 class Parts:
-    """The state of a page, in parts that are sent to each open page when they have changed.
+    """The state of a page, in parts that are sent to each open page, in this order, when they have changed.
 
-    Parameters
-    ----------
-    parts : of each part the function that returns it as JSON values; its argument is the number of changes since the
-        page has received it. The parts are sent in this order
-
-    Attributes
-    ----------
-    phase, reason : phase of the pipeline or the fleet, and the reason of its end or silence
+    A part is a function of the number of its changes since the page has received it, which returns JSON values.
     """
 
     def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
         self._parts = parts
         self._revisions: Counter[str] = Counter()
         self.phase: Phase = "waiting"
-        self.reason = ""
+        self.reason = ""  #: of the end or the silence
         self._mark_changed(*parts)
 
     def updates(self, seen: dict[str, int]) -> dict[str, object]:
-        """Return the parts that have changed since the last call for this page; all at first.
-
-        Parameters
-        ----------
-        seen : revisions that the page has received; empty at first, updated by this call
-        """
+        """Return the parts that have changed since the last call with these revisions; they are empty at first."""
         news = {name: self._revisions[name] - seen.get(name, 0) for name in self._parts}
         seen.update(self._revisions)
         return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
@@ -101,14 +89,6 @@ class Dashboard(Parts):
 
     It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
     then it drops all state of the previous one.
-
-    Attributes
-    ----------
-    endpoint, source : endpoint of the pipeline, and its source of frames
-    health : last health report of each process
-    last_reports : arrival time of the last health report of each process
-    objects : the objects that are tracked, by name, in the order in which they began
-    colours : the colour of each of them
     """
 
     def __init__(self) -> None:
@@ -131,10 +111,10 @@ class Dashboard(Parts):
         """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
         self.reason = self.source = ""
-        self.objects: dict[str, ShownObject] = {}
+        self.objects: dict[str, ShownObject] = {}  #: in the order in which they began
         self.colours = Colours()
-        self.health: dict[str, Health] = {}
-        self.last_reports: dict[str, float] = {}
+        self.health: dict[str, Health] = {}  #: the last report of each process
+        self.last_reports: dict[str, float] = {}  #: the times at which they arrived
         self._pictures: dict[int, Preview] = {}
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
@@ -152,9 +132,7 @@ class Dashboard(Parts):
     def take(self, message: object, now: float, run: str = "") -> None:
         """Process a message that arrived at the time `now`, in seconds of a monotonic clock.
 
-        Parameters
-        ----------
-        run : id of the run that it is from; empty if its sender knows none: then it is of the run that is shown
+        It is from the run with this id; without one, from the run that is shown.
         """
         if run in self._runs_before:
             return
@@ -315,11 +293,6 @@ class FleetDashboard(Parts):
     """Receives the status of a fleet, and returns the updates for each open page: all streams and nodes, once a second.
 
     It keeps the last status while the fleet does not answer.
-
-    Attributes
-    ----------
-    status : the last status, without a stream before the first
-    age : seconds since the last status arrived, 0 while the fleet answers
     """
 
     def __init__(self) -> None:
@@ -336,7 +309,7 @@ class FleetDashboard(Parts):
             }
         )  # fmt: skip
         self.status = FleetStatus("", 0.0)
-        self.age = self._arrived = 0.0
+        self.age = self._arrived = 0.0  # seconds since the last status arrived, 0 while the fleet answers
 
     def take(self, status: FleetStatus, now: float) -> None:
         """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""

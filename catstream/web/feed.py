@@ -42,20 +42,14 @@ _MAX_FEEDS = 32  # of streams of a fleet, each with a thread
 
 
 class Feed(ABC):
-    """Keeps a dashboard up to date from `start` to `stop`, and counts the open pages.
-
-    Attributes
-    ----------
-    dashboard : the state of the page
-    viewers : number of open pages
-    used : time of the last request to the page, of the monotonic clock
-    """
+    """Keeps a dashboard up to date from `start` to `stop`, and counts the open pages."""
 
     dashboard: Parts
     _pause: float  # seconds between two calls of `_feed`
 
     def __init__(self) -> None:
-        self.viewers, self.used = 0, monotonic()
+        self.viewers = 0  #: open pages
+        self.used = monotonic()  #: time of the last request to the page
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
@@ -116,13 +110,8 @@ class Feed(ABC):
 class PipelineFeed(Feed):
     """Receives the messages of a pipeline, and reconnects after each end, silence or restart.
 
-    Previews, which cost the pipeline processor time, are received only while a page is open.
-
-    Parameters
-    ----------
-    endpoint : endpoint of the pipeline, or address of a stream of a fleet; empty for the only running pipeline of this
-        user. It is looked up at each connection
-    keys : folder of the keys of this client, if the pipeline requires keys
+    Previews, which cost the pipeline processor time, are received only while a page is open. The endpoint, or the
+    address of a stream of a fleet, is looked up at each connection; it is empty for the only running pipeline.
     """
 
     dashboard: Dashboard
@@ -200,10 +189,7 @@ def _next(messages: Subscription[Any]) -> object | None:
 class FleetFeed(Feed):
     """Asks the registry of a fleet once a second for all streams and nodes, and opens the feeds of single streams.
 
-    Parameters
-    ----------
-    fleet : address of the fleet, as for `Registry`; the fleet may start later
-    keys : folder of the keys of this client, if the fleet requires keys
+    The address of the fleet is that of `Registry`; the fleet may start later.
     """
 
     dashboard: FleetDashboard
@@ -221,13 +207,7 @@ class FleetFeed(Feed):
         return "" if self.dashboard.phase == "running" else "the fleet does not answer"
 
     def pipeline(self, stream: str) -> PipelineFeed:
-        """Return the feed of a stream, opened by the first request to its page.
-
-        Raises
-        ------
-        HTTPException
-            If there is no such stream, or too many are open, and somebody looks at each of their pages.
-        """
+        """Return the feed of a stream, opened by the first request to its page."""
         if stream not in self.dashboard.status.streams:
             raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
         if stream not in self._streams:

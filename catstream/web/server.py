@@ -25,9 +25,6 @@ from catstream.web.app import Site
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
 
-_NEEDED = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN\n"
-_WRONG = "this is not the token that this page was started with\n"
-
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "localhost")
 
@@ -151,11 +148,6 @@ class Guard:
     page sets if it is opened with `?token=TOKEN`. Without a token, only requests to a loopback host name are answered;
     this prevents DNS rebinding. Requests that change something must come from a page of the same origin, or from a
     program, which sends no Origin header; this prevents CSRF. The length of the token protects it from being guessed.
-
-    Raises
-    ------
-    ServiceError
-        If the token is so short that it could be guessed.
     """
 
     def __init__(self, app: ASGIApp, token: str | None) -> None:
@@ -195,7 +187,8 @@ class Guard:
             return _enter(request, cookie, shown) if in_url and path.endswith("/") and request.method == "GET" else None
         if path.endswith("/") and given is None:
             return FileResponse(_LOGIN_PAGE, 401)
-        return PlainTextResponse(_NEEDED if given is None else _WRONG, 401)
+        expected = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN"
+        return PlainTextResponse(f"{expected}\n" if given is None else "this is not the token of this page\n", 401)
 
 
 def _reject_foreign(request: Request) -> Response | None:
