@@ -1,7 +1,8 @@
-"""The dashboard: what a page is told of the messages of a pipeline."""
+"""The dashboards: what a page is told of the messages of a pipeline, or of the status of a fleet."""
 
 from __future__ import annotations
 
+import json
 from time import monotonic
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as some
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Health
 from catstream.video.palette import PALETTE
-from catstream.web.dashboard import Dashboard
+from catstream.web.dashboard import Dashboard, FleetDashboard
 from catstream.web.feed import SILENCE_SECONDS, PipelineFeed
 
 
@@ -249,3 +250,44 @@ def test_the_tracked_objects_are_shown_and_no_others_once_the_reports_have_arriv
     for report in (*reports, facts.tracking(float(seq), *alive)):
         dashboard.take(report, float(seq))
     assert set(dashboard.objects) == set(alive)
+
+
+@pytest.fixture
+def of_fleet():
+    return FleetDashboard()
+
+
+def told(of_fleet, seen):
+    """The updates as a browser gets them."""
+    return json.loads(json.dumps(of_fleet.updates(seen)))
+
+
+def test_a_page_is_told_of_all_streams_and_nodes_once_for_each_status(of_fleet, fleet):
+    seen = {}
+    assert "streams" in told(of_fleet, seen), "a new page is told which page it is, before the first status"
+    fleet.node("north-1", labels={"site": "north"})
+    fleet.stream("cam-7", endpoint="/tmp/secret-place", server="a public key", models={"ben": 3, "2024": 1, "anna": 2})
+    fleet.stream("cam-8", "failed", trouble="no source")
+    of_fleet.take(fleet.status(), 0.0)
+    first = told(of_fleet, seen)
+    assert (list(first["streams"]), first["streams"]["cam-8"]["trouble"]) == (["cam-7", "cam-8"], "no source")
+    assert first["streams"]["cam-7"]["models"] == [["ben", 3], ["2024", 1], ["anna", 2]], "as they began"
+    assert first["nodes"]["north-1"]["labels"] == {"site": "north"}
+    assert "secret-place" not in str(first)
+    assert "public key" not in str(first)
+    assert told(of_fleet, seen) == {}
+
+
+def test_the_last_status_is_kept_with_its_age_while_the_fleet_does_not_answer(of_fleet, fleet):
+    seen, fleet.name = {}, "site"
+    of_fleet.mark_silent("no fleet of yours is running", 5.0)
+    status = {"name": "", "phase": "waiting", "reason": "no fleet of yours is running", "age": 0}
+    assert told(of_fleet, seen)["status"] == status
+    fleet.stream("cam-7")
+    of_fleet.take(fleet.status(), 10.0)
+    of_fleet.updates(seen)
+    of_fleet.mark_silent("no answer", 17.5)
+    assert told(of_fleet, seen) == {"status": {"name": "site", "phase": "silent", "reason": "no answer", "age": 7}}
+    assert "cam-7" in of_fleet.updates({})["streams"]
+    of_fleet.take(fleet.status(), 18.0)
+    assert told(of_fleet, seen)["status"] == {"name": "site", "phase": "running", "reason": "", "age": 0}
