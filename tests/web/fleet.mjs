@@ -28,7 +28,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   say("all", await shown());
   say("nodes", await page.locator("#nodes tbody button").allInnerTexts());
   await check("all");
-  await page.keyboard.press("/");
+  await page.focus("#search");
   await page.keyboard.type("NORTH ann");
   say("search", await shown());
   await page.keyboard.press("Escape");

@@ -158,11 +158,6 @@ class Search {
     field.value = new URLSearchParams(location.search).get("search") ?? "";
     field.addEventListener("input", () => this.tell());
     field.addEventListener("keydown", (event) => event.key === "Escape" && this.ask(""));
-    document.addEventListener("keydown", (event) => {
-      if (event.key !== "/" || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return;
-      event.preventDefault();
-      field.focus();
-    });
   }
 
   get text() {
