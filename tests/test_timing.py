@@ -10,7 +10,7 @@ import catstream
 from catstream.client import control, registry, subscription
 from catstream.fleet import timing as fleet
 from catstream.services import timing as services
-from catstream.web import timing as web
+from catstream.web import app, dashboard, feed, server
 from catstream.wire import commands, go_back_n, newest, socket
 
 DOCS = Path(catstream.__file__).parents[1] / "docs"
@@ -18,7 +18,6 @@ DOCS = Path(catstream.__file__).parents[1] / "docs"
 #: A limit, a longer one, and what goes wrong otherwise.
 ORDER = [
     *services.ORDER,
-    *web.ORDER,
     *fleet.ORDER,
     (socket.RECONNECT_MOST_SECONDS, control.DESERTED_SECONDS, "a pipeline that has just started counts as absent"),
     (commands.RETRY_SECONDS, control.DESERTED_SECONDS, "a command is sent once to a detector that was not connected"),
@@ -30,6 +29,11 @@ ORDER = [
     (subscription.CHECK_SECONDS, subscription.REPORT_SECONDS, "a pipeline that rejects the keys counts as silent"),
     (services.HEALTH_SECONDS, subscription.REPORT_SECONDS, "a client that waits for a health report receives none"),
     (services.TURN_SECONDS, go_back_n.PATIENCE_SECONDS, "a receiver asks a detector that waits a second time"),
+    (app.UPDATE_SECONDS, server.SHUTDOWN_SECONDS, "the server closes a page before it is told of its end"),
+    (dashboard.POINT_SECONDS, dashboard.RATE_SECONDS, "a chart of frames per second leaves out frames"),
+    (subscription.CHECK_SECONDS, feed.SILENCE_SECONDS, "a page with keys that are rejected says that it is silent"),
+    (subscription.DRAIN_SECONDS, feed.DRAIN_SECONDS, "the last messages are dropped before their subscriptions end"),
+    (app.RETRY_SECONDS, feed.IDLE_SECONDS, "the feed of a stream is closed while its page connects again"),
 ]
 
 
@@ -39,7 +43,7 @@ def test_a_time_limit_is_shorter_than_those_that_build_on_it(shorter, longer, ot
 
 
 def test_the_docs_say_after_which_time_a_process_is_silent_and_a_stream_is_started_again():
-    assert f"within {web.SILENCE_SECONDS:g} s" in (DOCS / "how-to" / "view.md").read_text()
+    assert f"within {feed.SILENCE_SECONDS:g} s" in (DOCS / "how-to" / "view.md").read_text()
     pause = f"a pause of {fleet.FIRST_PAUSE_SECONDS:g} s to {fleet.LONGEST_PAUSE_SECONDS:g} s"
     assert pause in (DOCS / "how-to" / "fleet.md").read_text()
 
