@@ -35,7 +35,6 @@ Message = TypeVar("Message")
 
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
-_MOST_BYTES_BESIDE = len("..part") + 16  # that the name of an unfinished file is longer than that of the file
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
@@ -129,17 +128,6 @@ def is_writable(folder: Path) -> bool:
         return False
 
 
-def name_fits(path: Path) -> bool:
-    """Return whether the file system takes a name of this length in the folder of a file, which need not exist yet."""
-    return len(os.fsencode(path.name)) + _MOST_BYTES_BESIDE <= os.pathconf(nearest(path.parent), "PC_NAME_MAX")
-
-
-def nearest(folder: Path) -> Path:
-    """Return a folder, or if it does not exist the nearest one above it that does."""
-    folder = folder.absolute()
-    return next(path for path in (folder, *folder.parents) if path.exists())
-
-
 def why_not_writable(path: Path, made: Path | None = None) -> str:
     """Return why a file cannot be made or replaced, and what to do; empty if it can.
 
@@ -149,11 +137,9 @@ def why_not_writable(path: Path, made: Path | None = None) -> str:
     """
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
-        folder = nearest(folder)
+        folder = next(each for each in (folder, *folder.parents) if each.exists())
     if path.is_dir() or not is_writable(folder):
         return f"cannot write {path}: give a file in a folder that exists and that you may write to"
-    if not name_fits(path):
-        return f"cannot write {path}: its name is too long for the folder, give a shorter one"
     return ""
 
 
@@ -163,11 +149,9 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
     The kernel releases the lock when the handle is closed, or when the process ends, however that happens.
     """
     deadline = time.monotonic() + seconds
-    while not _flock(handle, fcntl.LOCK_EX):
-        if time.monotonic() >= deadline:
-            return False
+    while not (locked := _flock(handle, fcntl.LOCK_EX)) and time.monotonic() < deadline:
         time.sleep(_PAUSE_SECONDS)
-    return True
+    return locked
 
 
 def is_locked(handle: int) -> bool:
@@ -194,7 +178,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode
     Raises
     ------
     OSError
-        If the file cannot be written, as in `write_atomically`.
+        As in `write_atomically`.
     """
     write_atomically(path, encode(arrays, metadata), mode=mode)
 
