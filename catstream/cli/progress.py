@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,15 +28,20 @@ class _Object:
 
 
 class RunProgress:
-    """Counts the tracks of a run, and shows them during the run and at its end."""
+    """Counts the tracks of a run, and shows them during the run and at its end.
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    Parameters
+    ----------
+    names : the objects of the earlier part of a resumed run, in the order in which they appeared
+    """
+
+    def __init__(self, pipeline: Pipeline, names: Iterable[str] = ()) -> None:
         self._pipeline = pipeline
         self._started = time.perf_counter()
         self._first = 0.0
         self._shown = 0.0
         self.frames = 0
-        self._objects: dict[str, _Object] = {}
+        self._objects = {name: _Object() for name in names}
 
     def progress(self, console: Console) -> Progress:
         progress = line_of(console, self._line)
@@ -73,7 +78,7 @@ class RunProgress:
         )
         progress.update(self._task, completed=self.frames, state=_state(tracks), figures=figures)
 
-    def summary(self, results: Sequence[str]) -> str:
+    def summary(self, results: Sequence[Path]) -> str:
         """The closing lines of the run."""
         rate = f"first track after {self._first:.2f} s"
         if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
@@ -102,10 +107,10 @@ class RunProgress:
         return "\n".join(lines)
 
     def _of_each(self) -> Iterator[str]:
-        """A line for each object."""
-        for name, each in self._objects.items():
+        """A line for each object; the numbers are the ids in MOT text."""
+        for number, (name, each) in enumerate(self._objects.items(), 1):
             frames = f"present in {each.present} of {counted(each.frames, 'frame')}, model version {each.version}"
-            yield f"  {name or '(no name)'}: {frames}"
+            yield f"  {number} {name or '(no name)'}: {frames}"
 
     def _detector(self, counter: str) -> float:
         """A counter of the detector: the final one, or before the end that of its last report."""
@@ -131,6 +136,6 @@ def _figures(tracks: Mapping[str, Track]) -> list[str]:
     return [f"{name or '(no name)'} {track.score:+.2f}" for name, track in tracks.items()]
 
 
-def _shown(place: str) -> str:
+def _shown(path: Path) -> str:
     """A path relative to the current folder, if it is in it."""
-    return str(Path(place).relative_to(Path.cwd())) if Path(place).is_relative_to(Path.cwd()) else place
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

@@ -308,5 +308,5 @@ class _Run:
                     self._progress.show(progress, tracks)
 
     def _print_summary(self) -> None:
-        output = [] if self._files.output is None else [str(self._files.output)]
-        self._console.print(self._progress.summary([*output, *self._pipeline.results.write]))
+        output = [] if self._files.output is None else [self._files.output]
+        self._console.print(self._progress.summary([*output, *map(Path, self._pipeline.results.write)]))
