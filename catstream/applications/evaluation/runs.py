@@ -31,7 +31,7 @@ from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.messages.storage import write_atomically, writing
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
-from catstream.sinks.exports import LAYOUTS, ObjectRows, write_layout
+from catstream.sinks.exports import LAYOUTS, write_layout
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,20 +110,14 @@ def _files(output: Path, tracker: str, name: str) -> list[Path]:
 
 
 def save(output: Path, run: EvaluationRun) -> None:
-    """Write a run. The folder in VOT's layout is renamed into place last: its existence marks the run as complete.
-
-    Raises
-    ------
-    ServiceError
-        If a file cannot be written.
-    """
+    """Write a run. The folder in VOT's layout is renamed into place last: its existence marks the run as complete."""
     folder, home = _files(output, run.tracker, run.name)[0].parent, output / run.tracker
     part = home / f"{run.name}.part"
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(folder, ignore_errors=True)
     with writing(home):
-        write_layout("otb", home, run.name, ObjectRows(run.boxes, None, run.seconds))
-        write_layout("vot", part, run.name, ObjectRows(run.boxes, run.confidence, run.seconds))
+        write_layout("otb", home, run.name, run.boxes, None, run.seconds)
+        write_layout("vot", part, run.name, run.boxes, run.confidence, run.seconds)
         folder.parent.mkdir(exist_ok=True)
         (part / run.name).rename(folder)
         part.rmdir()
