@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from catstream.cli.interrupts import INTERRUPTED, Interrupts
+from catstream.cli.common import INTERRUPTED, Interrupts
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from catstream.box import Box
-from catstream.cli.progress import RunProgress
+from catstream.cli.common import RunProgress
 from catstream.messages.kinds import Track
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from catstream.cli.status import _format, _summary
+from catstream.cli.attach import _format, _summary
 from catstream.messages.kinds import Health
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.attributes import attributes_of, computed_attributes, read_attributes
+from catstream.applications.evaluation.datasets import attributes_of, computed_attributes, read_attributes
 from catstream.errors import SettingsError
 
 

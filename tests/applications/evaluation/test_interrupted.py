@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import psutil
 import pytest
 
-from catstream.applications.evaluation.workers import run_tasks
-from catstream.cli.interrupts import INTERRUPTED
+from catstream.applications.workers import run_tasks
+from catstream.cli.common import INTERRUPTED
 from catstream.services.start import sigint_blocked
 
 

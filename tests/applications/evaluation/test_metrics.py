@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from catstream.applications.evaluation.metrics import (
+from catstream.applications.evaluation.scores import (
     distances,
     is_lost,
     long_term,

@@ -13,11 +13,10 @@ import psutil
 import pytest
 
 from catstream.applications.evaluation import onepass, runs
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.accuracy import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
+from catstream.applications.evaluation.datasets import FIRST, Sequence, Start, jittered, spatial, temporal
 from catstream.applications.evaluation.onepass import evaluate, follow
 from catstream.applications.evaluation.runs import EvaluationRun, load, save
-from catstream.applications.evaluation.starts import FIRST, Start, jittered, spatial, temporal
-from catstream.applications.evaluation.summary import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
 from catstream.errors import CatstreamError, ServiceError, SettingsError
 from catstream.settings import Settings
 
@@ -239,7 +238,7 @@ def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
 import signal
 from catstream.applications.evaluation.datasets import find_sequences
 from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.starts import temporal
+from catstream.applications.evaluation.datasets import temporal
 from catstream.settings import Settings
 
 def done(run):

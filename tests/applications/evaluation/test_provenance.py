@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 from catstream.applications.evaluation import provenance as module
-from catstream.applications.evaluation.provenance import machine, provenance
+from catstream.applications.evaluation.runs import machine, provenance
 from catstream.settings import Settings
 
 

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation.accuracy import write_report, write_strips
+from catstream.applications.evaluation.datasets import FIRST
 from catstream.applications.evaluation.failures import failure_strip, worst_runs
-from catstream.applications.evaluation.report import write_report, write_strips
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.starts import FIRST
 from catstream.errors import ServiceError
 from catstream.settings import Settings
 

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.starts import (
+from catstream.applications.evaluation.datasets import (
     FIRST,
     SHIFTS,
+    Sequence,
     Start,
     choose_starts,
     jittered,
@@ -21,6 +20,7 @@ from catstream.applications.evaluation.starts import (
     spatial,
     temporal,
 )
+from catstream.applications.evaluation.onepass import evaluate
 from catstream.box import Box
 from catstream.errors import CatstreamError
 from catstream.settings import Settings

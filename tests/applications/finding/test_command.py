@@ -12,7 +12,7 @@ import signal
 import pytest
 
 import catstream
-from catstream.applications.finding.log import SearchLog
+from catstream.applications.finding.found import SearchLog
 
 
 @pytest.fixture

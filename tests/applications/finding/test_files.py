@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.applications.finding.files import File, find_files
+from catstream.applications.finding.find import File, find_files
 from catstream.errors import VideoError
 from catstream.settings import RunSettings
 

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 import catstream
-from catstream.applications.finding.files import File
-from catstream.applications.finding.log import SearchLog
-from catstream.applications.finding.search import Search, load_models
+from catstream.applications.finding.find import File, Search, load_models
+from catstream.applications.finding.found import SearchLog
 from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoError
 from catstream.video.writer import VideoWriter
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.finding.sightings import FileResult, Sighting
+from catstream.applications.finding.found import FileResult
 from catstream.box import Box
 
 

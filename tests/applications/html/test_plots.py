@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from catstream.applications.html.plots import DASHES, SHARES, Axis, plot
+from catstream.applications.html.page import DASHES, SHARES, Axis, plot
 
 
 def parsed(svg):

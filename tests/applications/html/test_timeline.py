@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from catstream.applications.html.timeline import Bar, legend, timeline
+from catstream.applications.html.page import Bar, legend, timeline
 
 
 def test_a_bar_is_at_its_share_of_the_time():

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from catstream.applications.loadtest.measures import Measures
+from catstream.applications.loadtest.latency import Measures
+from catstream.applications.loadtest.load_test import Result
 from catstream.applications.loadtest.plan import Plan
-from catstream.applications.loadtest.run import Result
 from catstream.box import Box
 from catstream.messages.kinds import Track
 from catstream.video.broadcast import Schedule

@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.loadtest.limits import KINDS, Limit, violations
 from catstream.applications.loadtest.load_test import find_highest_rate
-from catstream.applications.loadtest.plan import Plan
+from catstream.applications.loadtest.plan import KINDS, Limit, Plan, violations
 from catstream.errors import ObjectError, SettingsError
 from catstream.settings import Settings
 

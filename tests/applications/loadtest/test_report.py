@@ -9,11 +9,10 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.applications.loadtest.limits import Limit
-from catstream.applications.loadtest.load_test import LoadTest
-from catstream.applications.loadtest.report import to_json, write_report
-from catstream.applications.loadtest.run import Result
-from catstream.applications.loadtest.usage import UsageReading
+from catstream.applications.loadtest.latency import UsageReading
+from catstream.applications.loadtest.load_report import to_json, write_report
+from catstream.applications.loadtest.load_test import LoadTest, Result
+from catstream.applications.loadtest.plan import Limit
 
 
 def search(*results: Result, highest: float | None = None) -> LoadTest:

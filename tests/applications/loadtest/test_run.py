@@ -9,10 +9,9 @@ from multiprocessing import resource_tracker
 import psutil
 import pytest
 
-from catstream.applications.loadtest.limits import Limit, violations
+from catstream.applications.loadtest.latency import REST, Usage
 from catstream.applications.loadtest.load_test import run_load_test
-from catstream.applications.loadtest.plan import Plan
-from catstream.applications.loadtest.usage import REST, Usage
+from catstream.applications.loadtest.plan import Limit, Plan, violations
 
 
 @pytest.fixture

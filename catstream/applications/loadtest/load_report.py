@@ -11,47 +11,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from catstream.applications.evaluation.provenance import provenance
-from catstream.applications.html.page import table, write_page
-from catstream.applications.html.plots import Axis, plot
-from catstream.applications.loadtest.limits import violations
-from catstream.applications.loadtest.load_test import LoadTest
-from catstream.applications.loadtest.measures import Measures, percentiles
-from catstream.applications.loadtest.run import Result
-from catstream.applications.loadtest.usage import REST, summary
+from catstream.applications.evaluation.runs import provenance
+from catstream.applications.html.page import Axis, plot, table, write_page
+from catstream.applications.loadtest.latency import Measures, percentiles, summary
+from catstream.applications.loadtest.load_test import LoadTest, Result
+from catstream.applications.loadtest.plan import violations
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64
 
 _STREAMS = 6  # maximum number of curves in a plot
 _SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
-_POINTS = 200  # maximum number of points of a curve over time
-_MODEL = ("p50", "p99")  # percentiles of the model latency that are shown
-
-Curves = dict[str, tuple[np.ndarray, np.ndarray]]
+_POINTS = 200  # maximum number of points of a curve
 
 
 class Table(NamedTuple):
-    """A table of text.
-
-    rows   cells by the heads of their columns; the first row has all of them
-    note   explanation of the columns
-    means  number of rows at the end that summarise the others
-    texts  number of columns of words, the first ones
-    """
+    """A table of text: its title, rows of cells by the heads of their columns, and an explanation of the columns."""
 
     title: str
     rows: list[dict[str, str]]
     note: str = ""
-    means: int = 0
-    texts: int = 1
-
-    def cells(self) -> list[list[str]]:
-        """Return the cells of each row, empty where a row has none."""
-        return [[row.get(head, "") for head in self.rows[0]] for row in self.rows]
 
 
 def tables(result: Result) -> Iterator[Table]:
     """Yield the tables of a run: streams, processes and, if there were any, subscribers."""
+    together = [{"stream": "all", **_latencies(result.track, result.model)}] if len(result.streams) > 1 else []
     streams = [
         {
             "stream": str(number),
@@ -59,13 +42,12 @@ def tables(result: Result) -> Iterator[Table]:
             "skipped": f"{100 * each.skipped_share:.1f} %",
             **_latencies(each.track, each.model),
             "lag": str(each.max_lag),
-            "not stored": "-" if each.not_stored is None else str(each.not_stored),
-            "success": _share(each.success),
-            "of tracked": _share(each.success_followed),
+            "not stored": _shown(each.not_stored, "d"),
+            "success": _shown(each.success, ".3f"),
+            "of tracked": _shown(each.success_followed, ".3f"),
         }
         for number, each in enumerate(result.streams)
     ]
-    together = [{"stream": "all", **_latencies(result.track, result.model)}] if len(streams) > 1 else []
     yield Table(
         "Streams",
         streams + together,
@@ -73,12 +55,11 @@ def tables(result: Result) -> Iterator[Table]:
         "stored: features messages that were not in the coreset trees at the end. Success: share of frames with an "
         "overlap with the ground truth above 0.5; a skipped frame has the last known box. Of tracked: the same over "
         "the frames that were not skipped.",
-        len(together),
     )
     processes = [{"process": name, **_use(summary(readings))} for name, readings in result.usage.items()]
     if processes:
         yield Table("Processes", processes)
-    if plan := result.plan.subscribers and result.plan:
+    if (plan := result.plan).subscribers:
         subscribers = {
             "of each stream": plan.subscribers,
             "slow": plan.slow_subscribers - plan.frozen,
@@ -102,21 +83,17 @@ def milliseconds(seconds: float) -> str:
 
 
 def _latencies(track: Float64, model: Float64) -> dict[str, str]:
-    of_model = percentiles(model)
-    shown = percentiles(track) | {f"model {name}": of_model[name] for name in _MODEL}
-    return {name: milliseconds(seconds) for name, seconds in shown.items()}
+    of_model = {f"model {name}": seconds for name, seconds in percentiles(model).items() if name in ("p50", "p99")}
+    return {name: milliseconds(seconds) for name, seconds in (percentiles(track) | of_model).items()}
 
 
 def _use(use: dict[str, float]) -> dict[str, str]:
-    cores = {"cores": use["cores"], "cores, most": use["cores_most"]}
-    memory = {"MB": use["memory"], "MB, most": use["memory_most"]}
-    return {head: f"{value:.2f}" for head, value in cores.items()} | {
-        head: f"{value / 1e6:.0f}" for head, value in memory.items()
-    }
+    cores = {"cores": f"{use['cores']:.2f}", "cores, most": f"{use['cores_most']:.2f}"}
+    return cores | {"MB": f"{use['memory'] / 1e6:.0f}", "MB, most": f"{use['memory_most'] / 1e6:.0f}"}
 
 
-def _share(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+def _shown(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
 
 
 def to_json(load_test: LoadTest) -> dict[str, object]:
@@ -165,22 +142,14 @@ def _stream(measures: Measures, rate: float) -> dict[str, object]:
         "track": percentiles(measures.track),
         "model": percentiles(measures.model),
         "lag": measures.max_lag,
-        "sent": measures.totals.get("sent"),
-        "stored": measures.totals.get("stored"),
-        "restarts": measures.totals.get("restarts"),
+        **{name: measures.totals.get(name) for name in ("sent", "stored", "restarts")},
         "success": measures.success,
         "success_followed": measures.success_followed,
     }
 
 
 def write_report(path: Path, load_test: LoadTest) -> Path:
-    """Write the report of the decisive run, and of the search steps.
-
-    Raises
-    ------
-    ServiceError
-        If the file cannot be written.
-    """
+    """Write the report of the decisive run, and of the search steps."""
     result = load_test.result
     streams, *others = tables(result)
     return write_page(
@@ -190,7 +159,9 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             "<h1>Load test</h1>",
             _verdict(result),
             f'<p class="about">{result.plan}, {result.seconds:.1f} s{", interrupted" * load_test.interrupted}. Latency '
-            "counts from the due time of a frame; that of a skipped frame ends with the track of a newer one.</p>",
+            "counts from the due time of a frame; that of a skipped frame ends with the track of a newer one. The "
+            f"camera was at most {milliseconds(result.camera_late)} ms late, and other processes of this machine kept "
+            f"{result.other_load:.2f} cores busy.</p>",
             *(f'<p class="bad">{escape(error)}</p>' for error in result.errors),
             *(
                 f'<p class="{"good" if limit.is_met(result) else "bad"}">{escape(limit.describe(result))}</p>'
@@ -200,20 +171,17 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
             _html(streams),
             f'<div class="plots">{"".join(_plots(result))}</div>',
             *map(_html, others),
-            "<h2>Reliability</h2>",
-            '<p class="about">The precision of the latencies is the largest delay that the camera itself caused: '
-            f"{milliseconds(result.camera_late)} ms. Other processes of this machine kept {result.other_load:.2f} "
-            "cores busy; on a quiet machine it is close to 0.</p>",
             "<h2>Settings that are not the default</h2>",
-            f"<pre>{escape(chr(10).join(result.plan.settings.changed()) or 'none')}</pre>",
+            f"<pre>{escape(chr(10).join(result.plan.settings.changed())) or 'none'}</pre>",
         ],
     )
 
 
 def _html(shown: Table) -> str:
-    rows = [map(escape, cells) for cells in shown.cells()]
+    heads = list(shown.rows[0])
+    rows = [[escape(row.get(head, "")) for head in heads] for row in shown.rows]
     note = f'<p class="about">{shown.note}</p>' if shown.note else ""
-    return f"<h2>{shown.title}</h2>{table(shown.rows[0], rows, texts=shown.texts, means=shown.means)}{note}"
+    return f"<h2>{shown.title}</h2>{table(heads, rows, means=int(rows[-1][0] == 'all'))}{note}"
 
 
 def _verdict(result: Result) -> str:
@@ -244,26 +212,17 @@ def _steps(load_test: LoadTest) -> Table:
         }
         for step in load_test.results
     ]
-    return Table(title, rows, "The runs, in this order.", texts=2)
+    return Table(title, rows, "The runs, in this order.")
 
 
 def _plots(result: Result) -> Iterator[str]:
     shown = {f"stream {number}": measures for number, measures in enumerate(result.streams[:_STREAMS])}
-    start = min(measures.due[0] for measures in shown.values())
-    seconds = Axis.upto(result.seconds, "seconds")
-    yield _percentiles("From frame to track", {name: measures.track for name, measures in shown.items()})
+    yield _percentiles("From frame to track", {name: each.track for name, each in shown.items()})
     yield _percentiles("From frame to the model trained on it", {name: each.model for name, each in shown.items()})
-    latencies = {name: _peaks(each.due - start, 1000 * each.track) for name, each in shown.items()}
-    yield _lines("Latency to the track over time", seconds, "ms", latencies)
-    rates = {name: _rate(each, each.due - start, result.plan.rate) for name, each in shown.items()}
-    yield _lines("Frames tracked", seconds, "frames/s", rates, minimum=result.plan.rate)
-    reports = {name: np.array(each.lag, float).reshape(-1, 2) for name, each in shown.items()}
-    lag = {name: (each[:, 0] - start, each[:, 1]) for name, each in reports.items()}
-    yield _lines("Lag of the compressor", seconds, "messages", lag, minimum=5)
-    yield _lines("Processor", seconds, "cores", _used(result, 1, start))
-    memory = {name: (xs, ys / 1e6) for name, (xs, ys) in _used(result, 2, start).items()}
-    memory.pop(REST, None)  # that of all other programs would set the scale
-    yield _lines("Memory", seconds, "MB", memory)
+    start = min(measures.due[0] for measures in shown.values())
+    peaks = {name: _peaks(each.due - start, 1000 * each.track) for name, each in shown.items()}
+    most = max(float(ys.max()) for _, ys in peaks.values())
+    yield plot("Latency to the track over time", Axis.upto(result.seconds, "seconds"), Axis.upto(most, "ms"), peaks)
 
 
 def _percentiles(title: str, streams: Mapping[str, Float64]) -> str:
@@ -279,29 +238,7 @@ def _percentiles(title: str, streams: Mapping[str, Float64]) -> str:
     return plot(title, Axis("share of frames that waited less", nines, ticks), Axis.upto(most, "ms"), curves)
 
 
-def _lines(title: str, x: Axis, unit: str, curves: Curves, minimum: float = 1.0) -> str:
-    most = max((float(ys.max()) for _, ys in curves.values() if len(ys)), default=0.0)
-    return plot(title, x, Axis.upto(max(most, minimum), unit), curves)
-
-
 def _peaks(xs: Float64, ys: Float64) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a curve to the maximum of each of `_POINTS` parts, so that no peak is lost."""
     begins = np.unique(np.linspace(0, len(xs), _POINTS, endpoint=False).astype(int))
     return xs[begins], np.maximum.reduceat(ys, begins)
-
-
-def _rate(measures: Measures, when: Float64, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of tracked frames in each second."""
-    seconds = (when - when[0]).astype(int)
-    share = np.bincount(seconds, measures.followed) / np.bincount(seconds)
-    return np.arange(len(share)) + 0.5, rate * share
-
-
-def _used(result: Result, column: int, start: float) -> Curves:
-    """Return a column of the readings of each kind of process, summed over the streams."""
-    kinds: dict[str, dict[float, float]] = {}
-    for name, readings in result.usage.items():
-        kind = kinds.setdefault(name.rstrip(" 0123456789"), {})
-        for reading in readings:
-            kind[reading.moment] = kind.get(reading.moment, 0.0) + reading[column]
-    return {kind: (np.array([*sums]) - start, np.array([*sums.values()])) for kind, sums in kinds.items()}

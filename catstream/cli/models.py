@@ -1,26 +1,25 @@
-"""`catstream find`: find the objects of saved models in videos, folders and images."""
+"""`catstream find` and `merge`: find the objects of saved models, and make one saved model of several."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.progress import Task
 
-from catstream.cli.interrupts import INTERRUPTS, stopped
-from catstream.cli.output import complain, line_of, messages, screen, table
+from catstream.cli.common import INTERRUPTS, check_file, complain, line_of, messages, screen, stopped, table, text
 from catstream.errors import CatstreamError, VideoError
 from catstream.messages.names import counted
 from catstream.numerics.threads import one_thread
+from catstream.run.learned import Learned
+from catstream.run.learned import merge as merged
 from catstream.services.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 from catstream.settings import RunSettings
 
 if TYPE_CHECKING:
-    from catstream.applications.finding.files import File
-    from catstream.applications.finding.log import SearchLog
-    from catstream.applications.finding.search import Search
-    from catstream.applications.finding.sightings import FileResult
+    from catstream.applications.finding.find import File, Search
+    from catstream.applications.finding.found import FileResult, SearchLog
 
 _SHOWN = 12  # intervals that are printed
 
@@ -93,11 +92,10 @@ def find(
     A model is learned by tracking: `catstream track --save-model FILE` and
     `catstream save FILE` write one. All models are searched at once.
 
-    Of a video, one frame in 0.2 seconds is searched, and the frame in which an
-    object appears or disappears is determined between them. Ctrl-C keeps the
-    results so far. The same command then continues where it was; files that
-    were searched to the end are not searched again, unless they have changed
-    or --overwrite is given.
+    Of a video, one frame in 0.2 seconds is searched. Ctrl-C keeps the results so
+    far. The same command then continues with the next file; files that were
+    searched to the end are not searched again, unless they have changed or
+    --overwrite is given.
 
     \b
     Writes
@@ -121,11 +119,8 @@ def find(
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
-        from catstream.applications.finding.files import find_files
-        from catstream.applications.finding.log import SearchLog
-        from catstream.applications.finding.report import write_report
-        from catstream.applications.finding.search import Search, load_models
-        from catstream.applications.finding.tables import write_tables
+        from catstream.applications.finding.find import Search, find_files, load_models
+        from catstream.applications.finding.found import SearchLog, write_report, write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes)
@@ -154,49 +149,35 @@ def find(
 
 def _search(search: Search, files: list[File], log: SearchLog) -> None:
     """Search all files that are not complete, and show the progress."""
-    with line_of(messages(), _line) as progress:
-        task = progress.add_task("", total=None, files=len(files), result=None, searched=0.0)
-        searched = 0.0  # seconds of video
+    columns = (
+        text("file {task.fields[number]}/{task.total}"),
+        text("{task.fields[frame]}  {task.fields[sightings]} sightings  {task.description}"),
+    )
+    with line_of(messages(), *columns) as progress:
+        task = progress.add_task("", total=len(files), number=0, frame="", sightings=0)
         for number, file in enumerate(files, 1):
             result = log.begin(file)
-            progress.update(task, number=number, result=result)
             if result.complete:
                 continue
 
-            def opened(_: float, frames: int | None, result: FileResult = result) -> None:
-                log.note(result, frames=frames)
-
-            def damaged(reason: str, result: FileResult = result) -> None:
-                log.note(result, problem=reason)
+            def opened(frames: int | None, result: FileResult = result) -> None:
+                result.frames = frames
 
             try:
-                for step in search.file(file, result.position, opened=opened, damaged=damaged):
-                    searched += step.time - result.time
-                    with INTERRUPTS.deferred():  # a step is in the log as a whole
-                        log.step(result, step)
-                    progress.update(task, searched=searched)
+                for step in search.file(file, opened=opened, damaged=result.problems.append):
+                    with INTERRUPTS.deferred():
+                        result.add(step)
+                    frame = f"frame {step.frame.number + 1}/{result.frames or '?'}"
+                    found = len(result.sightings)
+                    progress.update(task, description=file.path.name, number=number, frame=frame, sightings=found)
             except VideoError as error:
-                log.note(result, problem=str(error))
-            log.note(result, complete=True)
-
-
-def _line(task: Task) -> list[str]:
-    """File, frames and sightings."""
-    result: FileResult | None = task.fields["result"]
-    if result is None:
-        return ["starting"]
-    return [
-        f"file {task.fields['number']}/{task.fields['files']}",
-        f"frame {(result.position or 0) + 1}/{result.frames or '?'}",
-        f"{len(result.sightings)} sightings",
-        f"{task.fields['searched'] / max(task.elapsed or 0.0, 1e-6):.1f} x real time",
-        Path(result.file).name,
-    ]
+                result.problems.append(str(error))
+            log.end(result)
 
 
 def _print(results: list[FileResult], report: Path) -> None:
     """Print the best intervals, and the path of the report."""
-    from catstream.applications.html.timeline import clock
+    from catstream.applications.html.page import clock
 
     intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)
     numbers = ("from", "to", "sightings", "score")
@@ -211,3 +192,35 @@ def _print(results: list[FileResult], report: Path) -> None:
     if not intervals:
         click.echo("nothing was found")
     click.echo(f"report: {report}")
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
+@click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="File to write.")
+@with_overwrite
+@click.option("--force", is_flag=True, help="Merge models although their objects look different.")
+def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -> None:
+    """Merge saved models of one object, for example from two cameras.
+
+    The coreset trees of all files are merged, and a model is trained from them.
+    Its scores are those of one tree that has seen all the videos, within the
+    bound of the coreset. The files must be of the same object and settings, and
+    no two of them may contain the same frames. Models that look like those of
+    different objects are rejected; in case of doubt there is a warning.
+
+    \b
+    EXAMPLES
+      catstream merge door.safetensors yard.safetensors -o anna.safetensors
+    """
+    check_file(output, overwrite=overwrite)
+    parts = [Learned.load(file) for file in files]
+    with warnings.catch_warnings(record=True, action="always", category=UserWarning) as doubts:
+        whole = merged(parts, force=force)
+    for doubt in doubts:
+        complain(f"warning: {doubt.message}")
+    whole.save(output)
+    tree = whole.trees["object"]
+    click.echo(
+        f"{output}: {len(files)} saved models, {len(whole.origins)} videos, {tree.rows_seen} rows of the object in "
+        f"{len(tree.nodes)} nodes"
+    )

@@ -12,7 +12,7 @@ import click
 
 from catstream.box import Box
 from catstream.cli.attach import with_endpoint
-from catstream.cli.files import check_file
+from catstream.cli.common import check_file
 from catstream.client.control import Control, control
 from catstream.errors import ServiceError
 from catstream.messages.names import UNNAMED, check_name, split_name

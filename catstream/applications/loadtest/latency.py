@@ -1,4 +1,4 @@
-"""Computes the measures of one stream under load from the messages that were received.
+"""What is observed of a stream under load, and the measures of it; and the use of processor and memory.
 
 Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
 one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
@@ -7,19 +7,103 @@ pipeline does not get better figures by skipping frames while it is slow (no coo
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from statistics import fmean
+from threading import Event, Thread
+from time import monotonic
+from typing import NamedTuple
 
 import numpy as np
+import psutil
 
-from catstream.applications.evaluation.metrics import overlaps
-from catstream.applications.loadtest.observer import Observations
+from catstream.applications.evaluation.scores import overlaps
+from catstream.client.subscription import Subscription
+from catstream.errors import SilenceError
+from catstream.messages.kinds import Health, Model, Track
 from catstream.numerics.arrays import Float64
 from catstream.video.broadcast import Schedule
 
 #: The percentiles of latencies that are reported, by name.
 PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
+#: Name of the load by other processes of this machine. If it is high, the figures of a load test are unreliable.
+REST = "everything else"
+
+_POLL_SECONDS = 0.1
 _SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a success
+
+
+@dataclass(slots=True)
+class Observations:
+    """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
+
+    tracks  tracks in order of arrival; a restarted detector may repeat a `seq` with another frame
+    models  newest training frame of each model, numbered as the tracks were at its arrival
+    health  health reports of all processes
+    first_motion_version  version of the first model with a motion model, 0 before it
+    """
+
+    tracks: list[tuple[float, Track]] = field(default_factory=list)
+    models: list[tuple[float, int]] = field(default_factory=list)
+    health: list[tuple[float, Health]] = field(default_factory=list)
+    first_motion_version: int = 0
+
+    @property
+    def warmed_up(self) -> bool:
+        """Whether the start-up phase is over: the detector uses a model with a motion model."""
+        return (
+            self.first_motion_version > 0
+            and bool(self.tracks)
+            and self.tracks[-1][1].model_version >= self.first_motion_version
+        )
+
+    def add(self, moment: float, message: Track | Model | Health) -> None:
+        """Add a message that arrived at a moment."""
+        if isinstance(message, Track):
+            self.tracks.append((moment, message))
+        elif isinstance(message, Model):
+            self.models.append((moment, message.frame))
+            if message.motion is not None:
+                self.first_motion_version = self.first_motion_version or message.version
+        else:
+            self.health.append((moment, message))
+
+
+@contextmanager
+def observed(endpoints: Sequence[str], name: str, keys: str) -> Iterator[list[Observations]]:
+    """Observe one object of each pipeline in threads, which end with the context or with their pipelines."""
+    seen, ended = [Observations() for _ in endpoints], Event()
+
+    def observe(endpoint: str, channel: str, observations: Observations) -> None:
+        about = None if channel == "health" else name
+        messages: Subscription[Track | Model | Health] = Subscription(
+            endpoint, channel, object=about, timeout=_POLL_SECONDS, keys=keys
+        )
+        with messages:
+            while not ended.is_set():
+                try:
+                    message = next(messages)
+                except SilenceError:
+                    continue
+                except StopIteration:
+                    return
+                observations.add(monotonic(), message)
+
+    threads = [
+        Thread(target=observe, args=(endpoint, channel, each), name=f"observer of {channel}", daemon=True)
+        for endpoint, each in zip(endpoints, seen, strict=True)
+        for channel in ("tracks", "models", "health")
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        yield seen
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
 
 
 @dataclass(slots=True)
@@ -185,3 +269,60 @@ def _models(observations: Observations, schedule: Schedule) -> list[tuple[float,
         if frame in number_of_frame:
             models.append((moment, number_of_frame[frame]))
     return models
+
+
+class UsageReading(NamedTuple):
+    """Processor and memory use of a group of processes since the previous reading.
+
+    moment  time of the reading by `time.monotonic`
+    cores   mean number of busy cores
+    memory  resident memory in bytes
+    """
+
+    moment: float
+    cores: float
+    memory: int
+
+
+class Usage:
+    """Readings of named groups of processes; after a restart, the process ids of a group may change.
+
+    readings  readings by name, oldest first, and those of `REST`
+    """
+
+    def __init__(self) -> None:
+        self.readings: dict[str, list[UsageReading]] = {}
+        self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
+
+    def read(self, moment: float, groups: Mapping[str, Iterable[int]]) -> None:
+        """Add a reading of groups of process ids; the first call only starts the measurement."""
+        is_first = not self._processes
+        cores, memory = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1), psutil.virtual_memory().used
+        for name, pids in groups.items():
+            used = [self._of(pid) for pid in pids]
+            reading = UsageReading(moment, sum(busy for busy, _ in used), sum(resident for _, resident in used))
+            cores, memory = cores - reading.cores, memory - reading.memory
+            if not is_first:
+                self.readings.setdefault(name, []).append(reading)
+        if not is_first:
+            self.readings.setdefault(REST, []).append(UsageReading(moment, max(0.0, cores), max(0, memory)))
+
+    def _of(self, pid: int) -> tuple[float, int]:
+        """Return busy cores and memory of a process; nothing if it has just ended."""
+        try:
+            process = self._processes.get(pid) or psutil.Process(pid)
+            self._processes[pid] = process
+            return process.cpu_percent() / 100, process.memory_info().rss
+        except psutil.Error:
+            return 0.0, 0
+
+
+def summary(readings: Sequence[UsageReading]) -> dict[str, float]:
+    """Return mean and maximum of busy cores and of memory in bytes."""
+    _, cores, memory = zip(*readings, strict=True)
+    return {
+        "cores": fmean(cores),
+        "cores_most": max(cores),
+        "memory": fmean(memory),
+        "memory_most": max(memory),
+    }

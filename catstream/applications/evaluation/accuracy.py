@@ -1,14 +1,20 @@
-"""Summaries of runs: a row for each sequence and tracker, the mean of each tracker, and both as JSON."""
+"""The accuracy of trackers from their runs: a row for each sequence and tracker, means, JSON, and a report in HTML."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
+from pathlib import Path
 from statistics import fmean, pstdev
 
-from catstream.applications.evaluation.provenance import provenance
-from catstream.applications.evaluation.runs import EvaluationRun
+import numpy as np
+
+from catstream.applications.evaluation.runs import EvaluationRun, provenance
+from catstream.applications.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
+from catstream.applications.html.page import SHARES, Axis, plot, table, write_page
+from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
 #: The measures of a row that are averaged, with their headings.
@@ -29,7 +35,7 @@ FLIP = 0.25
 class Row:
     """The measures of one tracker on one sequence: means over its runs.
 
-    `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of `metrics.py`,
+    `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of `scores.py`,
     from 0 to 1. `lost` is the share of the runs that have lost the object in the end. `f_score` and its two components
     are None if the object is never absent. The spreads are standard deviations over the runs. `flips` is None unless
     the runs have different first boxes; it is true if their smallest and largest success differ by more than 0.25: then
@@ -159,3 +165,80 @@ def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return fmean(known) if known else None
+
+
+def write_report(
+    path: Path, runs: list[EvaluationRun], settings: Settings, attributes: Mapping[str, Sequence[str]]
+) -> Path:
+    """Write the report of an evaluation as one self-contained HTML file.
+
+    attributes : names of the sequences that have each attribute
+    """
+    rows = rows_of(runs)
+    sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
+    body = [
+        "<h1>Accuracy</h1>",
+        f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
+        "the object count only for F. ± is the standard deviation over the runs of a sequence.</p>",
+        *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
+        _plots(runs),
+        "<h2>Sequences</h2>",
+        _table(rows),
+        *(["<h2>Attributes</h2>", _attribute_table(rows, attributes)] if attributes else []),
+        "<h2>Settings that are not the default</h2>",
+        f"<pre>{escape(chr(10).join(settings.changed())) or 'none'}</pre>",
+    ]
+    return write_page(path, "evaluation", body)
+
+
+def _plots(runs: list[EvaluationRun]) -> str:
+    """Plot success and precision of each tracker, averaged over the sequences."""
+
+    def curves(
+        places: np.ndarray, measure: Callable[..., Float64], at: Callable[[Float64], float]
+    ) -> dict[str, tuple[np.ndarray, Float64]]:
+        by_tracker: dict[str, dict[str, list[Float64]]] = {}
+        for run in runs:  # as in the table, the mean is taken first over the starts of a sequence
+            by_tracker.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(
+                measure(run.boxes, run.truth)
+            )
+        means = {
+            tracker: np.mean([np.mean(plots, axis=0) for plots in sequences.values()], axis=0)
+            for tracker, sequences in by_tracker.items()
+        }
+        ranked = sorted(means.items(), key=lambda item: -at(item[1]))
+        return {f"{tracker}  {at(curve):.3f}": (places, curve) for tracker, curve in ranked}
+
+    overlap, distance = (
+        dataclasses.replace(SHARES, label="overlap threshold"),
+        Axis.upto(PIXELS[-1], "distance in pixels"),
+    )
+    success = curves(OVERLAPS, success_plot, lambda curve: float(curve.mean()))
+    precision = curves(PIXELS, precision_plot, lambda curve: float(curve[20]))
+    left = plot("Success (AUC)", overlap, SHARES, success)
+    right = plot("Precision (at 20 pixels)", distance, SHARES, precision)
+    return f'<div class="plots">{left}{right}</div>'
+
+
+def _table(rows: list[Row]) -> str:
+    lines = [[escape(row.name), row.tracker, row.frames, *_shaded(cells(row))] for row in rows]
+    means = mean_of(rows)
+    lines += [["mean", tracker, "", *_shaded(cells(mean))] for tracker, mean in means.items()]
+    return table(("sequence", "tracker", "frames", *MEASURES.values()), lines, texts=2, means=len(means))
+
+
+def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
+    lines = [
+        [escape(attribute), tracker, len(attributes[attribute]), *_shaded(cells(mean))]
+        for attribute, means in by_attribute(rows, attributes).items()
+        for tracker, mean in means.items()
+    ]
+    return table(("attribute", "tracker", "sequences", *MEASURES.values()), lines, texts=2, means=0)
+
+
+def _shaded(texts: list[str]) -> list[str]:
+    """Give the measures from 0 to 1 a background that is darker for a higher value."""
+    shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:-1]]
+    style = "background: rgb(47 158 68 / {:.0f}%); padding: .1rem .3rem"
+    shown = [f'<span style="{style.format(each)}">{text}</span>' for each, text in zip(shades, texts, strict=False)]
+    return [*shown, texts[-1]]
