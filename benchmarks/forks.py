@@ -17,6 +17,7 @@ import numpy as np
 from accuracy import many_sequences, videos
 from table import Cell, Table, benchmark, command
 
+from catstream.applications.evaluation.accuracy import FLIP
 from catstream.applications.evaluation.datasets import jittered
 from catstream.applications.evaluation.onepass import evaluate
 from catstream.applications.evaluation.runs import EvaluationRun

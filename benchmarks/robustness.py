@@ -31,6 +31,7 @@ from catstream.applications.evaluation.datasets import (
     read_attributes,
     spatial,
     temporal,
+    with_attributes,
 )
 from catstream.applications.evaluation.onepass import TRACKERS, evaluate
 from catstream.applications.evaluation.runs import EvaluationRun

@@ -29,13 +29,10 @@ def tree(tmp_path, video):
     return tmp_path
 
 
-def frames(file, start=0):
+def frames(file):
     problems = []
-    found = [
-        (frame.number, name, frame.image.shape)
-        for frame, name in file.frames(start, RunSettings(), lambda *_: None, problems.append)
-    ]
-    return found, problems
+    searched = file.frames(0.0, RunSettings(), lambda _: None, problems.append)
+    return [(frame.number, name, frame.image.shape) for frame, name in searched], problems
 
 
 def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
