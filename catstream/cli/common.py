@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NoReturn
 import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from catstream.errors import ServiceError
@@ -68,12 +68,12 @@ def line_of(console: Console, *columns: ProgressColumn | str) -> Progress:
     """
     shown = columns or (text("{task.description}"), BarColumn(24), MofNCompleteColumn())
     hidden = not console.is_terminal
-    return Progress(*shown, console=console, transient=True, refresh_per_second=8, disable=hidden)
+    return Progress(*shown, console=console, transient=True, expand=True, refresh_per_second=8, disable=hidden)
 
 
-def text(form: str) -> TextColumn:
-    """A column of a progress display; names of files in it are no markup."""
-    return TextColumn(form, markup=False)
+def text(form: str, *, last: bool = False) -> TextColumn:
+    """A column of a progress display; the last one gets the room that is left, and is cut in a narrow terminal."""
+    return TextColumn(form, markup=False, table_column=Column(no_wrap=True, ratio=1 if last else None))
 
 
 class Interrupts:
@@ -189,12 +189,12 @@ class _State(ProgressColumn):
     """The state of the objects; while there are no tracks, why: the source is lost, or the run is paused or waits."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        super().__init__()
+        super().__init__(Column(no_wrap=True))
         self._pipeline = pipeline
 
     def render(self, task: Task) -> Text:
         lost = self._pipeline.lost_seconds
-        return Text(f"{f'lost {lost:.0f} s' if lost else self._pipeline.holding or task.description:13}", no_wrap=True)
+        return Text(f"{f'lost {lost:.0f} s' if lost else self._pipeline.holding or task.description:13}")
 
 
 class RunProgress:
@@ -213,7 +213,7 @@ class RunProgress:
     def progress(self, console: Console) -> Progress:
         total = "" if self._pipeline.live else f"/{self._pipeline.frames or '?'}"
         count = text("{task.completed:.0f}" + total)
-        progress = line_of(console, _State(self._pipeline), count, text("{task.fields[figures]}"))
+        progress = line_of(console, _State(self._pipeline), count, text("{task.fields[figures]}", last=True))
         self._task = progress.add_task("starting", total=self._pipeline.frames, figures="")
         return progress
 

@@ -266,7 +266,9 @@ def loadtest(
     if output is not None:
         with writing(output):
             output.mkdir(parents=True, exist_ok=True)
-    with line_of(messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}")) as progress:
+    with line_of(
+        messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
+    ) as progress:
         task = progress.add_task("starting", total=1.0, figures="")
 
         def report(activity: str, share: float, figures: str) -> None:

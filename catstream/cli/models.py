@@ -151,7 +151,7 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
     """Search all files that are not complete, and show the progress."""
     columns = (
         text("file {task.fields[number]}/{task.total}"),
-        text("{task.fields[frame]}  {task.fields[sightings]} sightings  {task.description}"),
+        text("{task.fields[frame]}  {task.fields[sightings]} sightings  {task.description}", last=True),
     )
     with line_of(messages(), *columns) as progress:
         task = progress.add_task("", total=len(files), number=0, frame="", sightings=0)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.datasets import find_sequences
-from catstream.errors import VideoError
+from catstream.applications.evaluation.datasets import find_sequences, read_attributes
+from catstream.errors import SettingsError, VideoError
 
 TRUTH = np.array([[10, 20, 30, 40], [12.5, 21, 30, 40], [np.nan] * 4, [15, 22, 31, 41.5]])
 
@@ -172,3 +172,12 @@ def test_fewer_frames_than_boxes_are_an_error(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH), frames=3)
     with pytest.raises(VideoError, match="1 frame too few"):
         list(find_sequences(place)[0].frames())
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b'{"walk": "blur"}', b'{"a": [1]}', b'{"\xff": []}'])
+def test_a_file_of_attributes_in_another_form_is_an_error(tmp_path, content):
+    file = tmp_path / "attributes.json"
+    file.write_bytes(content)
+    for path in (file, tmp_path / "missing.json"):
+        with pytest.raises(SettingsError, match="cannot read the attributes"):
+            read_attributes(path)

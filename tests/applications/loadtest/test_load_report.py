@@ -67,14 +67,11 @@ def test_every_stream_and_process_has_its_row(result, tmp_path):
         assert f'<td class="text">{row}</td>' in page
     assert "stream 1: &lt;it&gt; died" in page
     assert '<tr class="mean"><td class="text">all</td>' in page
-    for plot in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
-        ElementTree.fromstring(plot)
-    for title in ("From frame to track", "From frame to the model trained on it", "Latency to the track over time"):
-        (plot,) = (plot for plot in page.split("<svg")[1:] if f'aria-label="{title}"' in plot)
-        curves = re.findall(r'points="([^"]*)"', plot)
-        assert [len(set(curve.split())) > 1 for curve in curves] == [True, True], title
-    processor = next(plot for plot in page.split("<svg")[1:] if 'aria-label="Processor"' in plot)
-    assert ">detector<" in processor
+    plots = [ElementTree.fromstring(plot) for plot in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+    titles = ["From frame to track", "From frame to the model trained on it", "Latency to the track over time"]
+    assert [plot.get("aria-label") for plot in plots] == titles
+    for plot in page.split("<svg")[1:]:
+        assert [len(set(curve.split())) > 1 for curve in re.findall(r'points="([^"]*)"', plot)] == [True, True]
 
 
 def test_the_json_report_contains_only_valid_json(result):
