@@ -61,14 +61,14 @@ def table(*heads: str, right: Collection[str] = ()) -> Table:
     return made
 
 
-def line_of(console: Console, *columns: ProgressColumn | str) -> Progress:
+def line_of(console: Console, *columns: ProgressColumn) -> Progress:
     """A progress display of one line, which is erased at its end; nothing if the console is not a terminal.
 
-    columns : columns of rich, or formats of text; by default the description, a bar, and how much of the total is done
+    columns : by default the description, a bar, and how much of the total is done
     """
     shown = columns or (text("{task.description}"), BarColumn(24), MofNCompleteColumn())
-    hidden = not console.is_terminal
-    return Progress(*shown, console=console, transient=True, expand=True, refresh_per_second=8, disable=hidden)
+    hidden, wide = not console.is_terminal, shown[-1].get_table_column().ratio is not None
+    return Progress(*shown, console=console, transient=True, expand=wide, refresh_per_second=8, disable=hidden)
 
 
 def text(form: str, *, last: bool = False) -> TextColumn:
