@@ -90,7 +90,7 @@ def watch(
       health    the counters of each process, every second
       samples   the samples for the trainer
       features  the training rows of each frame
-      previews  small pictures of the newest frame, about ten per second
+      previews  small pictures of the newest frame
 
     \b
     EXAMPLES
@@ -146,18 +146,9 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
     The exit code is 0 if all three processes sent a health report, else 1, so
     that it can be the health check of a container.
 
-    \b
-    Prints
-      state      tracking, paused, or waiting for a box
-      frames     number of processed frames, and frames per second
-      learning   messages that the compressor has not received, or not stored
-      model      version of the model that the detector uses
-      trees      size of the coreset trees
-      source     whether a live source is available, and the number of skipped frames
-      rejected   messages that do not conform to the protocol
-      trouble    a problem of a process, if there is one
-      reports    each process, and the age of its last health report
-      objects    if they have names: the state, score, model and leaves of each
+    "learning" are the messages that the compressor has not received, or not
+    stored; "rejected" those that do not conform to the protocol; "reports" the
+    age of the last health report of each process.
 
     \b
     EXAMPLES

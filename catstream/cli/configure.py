@@ -43,8 +43,7 @@ def new(folder: Path) -> None:
 
     DIR gets the key pair of the listening sockets, the key pair of the
     pipeline's own processes, and the list of clients. Only you can read its
-    files, and no file is overwritten. If the processes run on several machines,
-    each machine needs a copy.
+    files, and no file is overwritten.
 
     \b
     EXAMPLE
@@ -121,17 +120,14 @@ def revoke_(folder: Path, name: str) -> None:
 def settings(words: tuple[str, ...], as_json: bool) -> None:
     """List the settings with their defaults and descriptions.
 
-    With words, only those whose name or description has all of them. If the output is no terminal, there is one line
-    for each setting, its columns separated by tabs.
-
-    Set them with --set GROUP.NAME=VALUE, in a TOML file with a table for each group (--settings FILE), or in the
-    environment (CATSTREAM_GROUP_NAME).
+    With words, only those whose name or description has all of them. Set them
+    with --set GROUP.NAME=VALUE, in a TOML file with a table for each group
+    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME).
 
     \b
     EXAMPLES
       catstream settings
       catstream settings coreset
-      catstream settings | grep size
       catstream settings --json | jq -r '.[].name'
     """
     rows = [row for row in describe() if all(word.lower() in f"{row[0]} {row[3]}".lower() for word in words)]

@@ -75,9 +75,7 @@ def evaluate(
       catstream        this one, in one process
       mil              OpenCV's, always available
       csrt, kcf, tld   OpenCV's, with pip install "catstream[peers]"
-      nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER:
-                       nanotrack_backbone_sim.onnx, nanotrack_head_sim.onnx and
-                       object_tracking_vittrack_2023sep.onnx, which are not included
+      nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER
 
     \b
     MEASURES, over the frames with the object
@@ -87,21 +85,11 @@ def evaluate(
       norm.      normalised precision: the same, relative to the size of the object
       F          F-score of VOT-LT, if the object is absent in some frames
 
-    On difficult sequences a single run varies much. One of these options makes
-    several runs of each sequence; mean and standard deviation are printed:
-
-    \b
-      --starts 5   from five frames: temporal robustness (TRE)
-      --shifts     from 12 first boxes: moved by 10 % in eight directions, and of
-                   0.8, 0.9, 1.1 and 1.2 times the size: spatial robustness (SRE)
-      --jitter 7   from the first box and six others within 2 %; a sequence flips
-                   if its success differs by more than 0.25 between them
-
-    With --output, results are stored in the layouts of the got10k and VOT
-    toolkits, complete runs are not repeated, and report.html shows plots.
-
-    With --attributes, the report and --json also have the means over the
-    sequences that share an attribute.
+    --starts, --shifts and --jitter make several runs of each sequence; mean and
+    standard deviation are printed. With --output, results are stored in the
+    layouts of the got10k and VOT toolkits, complete runs are not repeated, and
+    report.html shows plots. With --attributes, the report and --json also have
+    the means over the sequences that share an attribute.
 
     \b
     EXAMPLES
@@ -196,11 +184,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 )
 @click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="How many of them are slow or frozen.")
 @click.option(
-    "--rate",
-    type=NumberRange(0.5, 1000),
-    default=25.0,
-    show_default=True,
-    help="Frames per second of each stream.",
+    "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
 )
 @click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
 @click.option(
@@ -214,11 +198,7 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option("--output", type=FOLDER, help="Folder for report.html.")
 @with_settings
 def loadtest(
-    find_limit: bool,
-    limits: tuple[str, ...],
-    json_file: Path | None,
-    output: Path | None,
-    **plan: Any,
+    find_limit: bool, limits: tuple[str, ...], json_file: Path | None, output: Path | None, **plan: Any
 ) -> None:
     """Run pipelines under load, and measure latency and losses.
 
@@ -226,9 +206,6 @@ def loadtest(
     loopback interface; a pipeline of its own tracks each stream. The camera
     does not wait: frame i is due at start + i / RATE, and latency counts from
     then. The latency of a skipped frame ends with the track of a newer one.
-    With several objects, it is the video of `catstream demo --objects N`;
-    success and latencies are those of the first object.
-
     Slow subscribers read two tracks per second; half of them are frozen
     instead.
 
@@ -241,12 +218,8 @@ def loadtest(
       success                   share of frames with an overlap above 0.5, at least
 
     With --find-limit, the search begins with RATE, each rate runs for DURATION,
-    and the limits are p99=0.1 and skipped=0.01 if none are given.
-
-    With --output, OUTPUT/report.html has all figures and plots.
-
-    The exit code is 0; 1 if a limit was not met or a stream failed; 130 after
-    Ctrl-C, which ends all processes and prints the measurements so far.
+    and the limits are p99=0.1 and skipped=0.01 if none are given. The exit code
+    is 1 if a limit was not met or a stream failed.
 
     \b
     EXAMPLES
@@ -305,7 +278,7 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
 
     click.echo(
         f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
-        f"{milliseconds(result.camera_late)} ms late",
+        f"{milliseconds(result.camera_late)} ms late"
     )
     for each in tables(result):
         heads = list(each.rows[0])

@@ -89,13 +89,9 @@ def find(
     PATH is a video, an image, or a folder, which is searched with all its
     subfolders. The images of one folder are treated as one sequence.
 
-    A model is learned by tracking: `catstream track --save-model FILE` and
-    `catstream save FILE` write one. All models are searched at once.
-
-    Of a video, one frame in 0.2 seconds is searched. Ctrl-C keeps the results so
-    far. The same command then continues with the next file; files that were
-    searched to the end are not searched again, unless they have changed or
-    --overwrite is given.
+    Of a video, one frame in 0.2 seconds is searched. After Ctrl-C, the same
+    command continues with the file that was not finished; finished files are
+    not searched again, unless they have changed or --overwrite is given.
 
     \b
     Writes
@@ -105,9 +101,8 @@ def find(
       OUTPUT/found.json      both, by file
       OUTPUT/search.ndjson   the log from which a search is continued
 
-    The score is about 1 on the object; a sighting has at least 0.5. If
-    another thing is taken for the object, raise it with --threshold. If the
-    object is missed, lower it, or track the object a little longer first.
+    The score is about 1 on the object. If another thing is taken for the object,
+    raise --threshold. If the object is missed, lower it, or track it longer.
 
     \b
     EXAMPLES
@@ -115,7 +110,6 @@ def find(
       catstream find --model anna.safetensors holiday.mp4
       catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output found
       catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
-      catstream find --model anna.safetensors --threshold 0.7 --output sure videos/
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():

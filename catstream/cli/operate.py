@@ -23,10 +23,7 @@ from catstream.services.options import FOLDER, PATH, NumberRange, combined, with
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """The pipeline that a command is for, as given by the options.
-
-    yes  do not ask for confirmation if neither --endpoint nor --source is given
-    """
+    """The pipeline that a command is for, as given by the options."""
 
     endpoint: str
     source: str
@@ -47,8 +44,8 @@ class _Target:
         pipeline = control(self.endpoint, timeout=self.timeout, keys=self.keys, source=self.source)
         line = f"pipeline: {pipeline.source or 'a pipeline'} at {pipeline.endpoint}"
         if self.endpoint and not pipeline.source:
-            return pipeline  # nothing more is known than the endpoint
-        if self.is_named or self.yes or not sys.stdin.isatty():
+            pass  # nothing more is known than the endpoint
+        elif self.is_named or self.yes or not sys.stdin.isatty():
             click.echo(line, err=True)
         elif not click.confirm(f"{line}. Is this the right one?", default=True, err=True):
             pipeline.close()
@@ -92,9 +89,8 @@ def set_box(pipeline: Control, box: str, keep: bool) -> str:
 
     X,Y,W,H is the box in pixels in the next frame that is tracked; during a
     pause of a file, in the frame that is held. A new NAME begins an object
-    beside the others. Without NAME, the only object is meant. If an object has
-    this name already, another one takes its place, and everything learned of
-    the previous one is dropped.
+    beside the others; an object that has this name already is replaced, and
+    everything learned of it is dropped. Without NAME, the only object is meant.
 
     \b
     EXAMPLES
@@ -113,9 +109,8 @@ def search(pipeline: Control, file: str) -> str:
     """Search for the object of a saved model in a running pipeline.
 
     The object is absent until it is found in the whole frame, and learning
-    continues from FILE, which `catstream save` wrote. The other objects are
-    tracked as before. If an object has the NAME already, this one takes its
-    place. Without NAME, the only object is meant.
+    continues from FILE, which `catstream save` wrote. An object that has the
+    NAME already is replaced. Without NAME, the only object is meant.
 
     \b
     EXAMPLES
@@ -132,9 +127,8 @@ def search(pipeline: Control, file: str) -> str:
 def forget(pipeline: Control, name: str) -> str:
     """Stop tracking an object in a running pipeline.
 
-    Everything learned of the object NAME is dropped, and the other objects
-    continue. Without NAME, the only object is meant. If no object is left, the
-    run waits for `catstream set-box`.
+    Everything learned of it is dropped. Without NAME, the only object is meant.
+    If no object is left, the run waits for `catstream set-box`.
 
     \b
     EXAMPLES
@@ -154,7 +148,6 @@ def pause(pipeline: Control) -> str:
     \b
     EXAMPLES
       catstream pause
-      catstream pause --endpoint run
     """
     return pipeline.pause().reason
 
@@ -180,20 +173,15 @@ def resume(pipeline: Control) -> str:
 def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: bool) -> None:
     """Save everything that a pipeline has learned of an object to FILE.
 
-    The file has the coreset trees whole, and a model. `catstream track SOURCE
-    --model FILE` finds the object with it and continues to learn. A running
-    pipeline is not interrupted.
-
-    With --state, the newest checkpoint in that folder is saved, and no pipeline
-    has to run. `catstream track --save-model FILE` writes the same file at the
-    end of a run.
+    `catstream track SOURCE --model FILE` finds the object and continues to
+    learn. With --state, the newest checkpoint in that folder is saved, and no
+    pipeline has to run.
 
     \b
     EXAMPLES
       catstream save walker.safetensors
       catstream save anna.safetensors --object anna
       catstream save walker.safetensors --state checkpoints
-      catstream track other.mp4 --model walker.safetensors
     """
     check_file(file, overwrite=overwrite)
     if state is None:

@@ -77,10 +77,7 @@ class Scan:
     """
 
     def __init__(
-        self,
-        learned: Iterable[Learned],
-        threshold: float = THRESHOLD,
-        sizes: tuple[float, float] = SIZES,
+        self, learned: Iterable[Learned], threshold: float = THRESHOLD, sizes: tuple[float, float] = SIZES
     ) -> None:
         self._threshold = threshold
         self._models = [

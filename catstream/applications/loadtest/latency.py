@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from threading import Event, Thread
 from time import monotonic
-from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -117,7 +116,7 @@ class Measures:
     without_track    frames without such a track until the end of the run, which counts as their arrival
     success          share of frames with the object whose overlap is above 0.5; a skipped frame has the last known box
     success_followed the same share of the tracked frames alone; None if there are none
-    lag              reports of the number of messages that the compressor had not received: arrival time and number
+    max_lag          largest number of messages that the compressor had not received
     totals           those of the pipeline at its end; empty if the stream has not ended
     """
 
@@ -128,7 +127,7 @@ class Measures:
     without_track: int
     success: float | None
     success_followed: float | None
-    lag: list[tuple[float, int]] = field(default_factory=list)
+    max_lag: int = 0
     totals: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -150,10 +149,6 @@ class Measures:
         return rate * (1 - self.skipped_share)
 
     @property
-    def max_lag(self) -> int:
-        return max((behind for _, behind in self.lag), default=0)
-
-    @property
     def not_stored(self) -> int | None:
         """Number of features messages that are in no coreset tree at the end; None if the stream has not ended."""
         return self.totals["sent"] - self.totals["stored"] if self.totals else None
@@ -164,11 +159,7 @@ def measure(
 ) -> Measures:
     """Compute the measures of one stream.
 
-    Parameters
-    ----------
-    observations : messages of the stream
-    schedule : schedule of the camera
-    frames : number of due frames: all of the schedule, or those before an interruption
+    frames : number of due frames: all of the schedule of the camera, or those before an interruption
     truth : ground truth, float64 (pictures, 4), NaN if the object is absent
     end : time at which the observation ended
     totals : totals of the pipeline at its end
@@ -193,11 +184,14 @@ def measure(
         without_track=without_track,
         success=_success(carried_forward(boxes, followed), true),
         success_followed=_success(boxes[followed], true[followed]),
-        lag=[
-            (moment, int(health.counters["sent"] - health.counters["taken"]))
-            for moment, health in observations.health
-            if health.process == "detector" and schedule.start <= moment <= end
-        ],
+        max_lag=max(
+            (
+                int(health.counters["sent"] - health.counters["taken"])
+                for moment, health in observations.health
+                if health.process == "detector" and schedule.start <= moment <= end
+            ),
+            default=0,
+        ),
         totals=totals,
     )
 
@@ -213,17 +207,11 @@ def percentiles(seconds: Float64) -> dict[str, float]:
 
 
 def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: float) -> tuple[Float64, int]:
-    """Return the seconds from each frame's due time to the first answer for this frame or a newer one.
+    """Return the seconds from each frame's due time to the first answer for this or a newer frame, float64 (frames,).
 
-    Parameters
-    ----------
     due : due times, float64 (frames,)
     answers : arrival time and frame number of each answer
-    end : arrival time that is assumed for frames without an answer
-
-    Returns
-    -------
-    float64 (frames,), and the number of frames without an answer
+    end : arrival time that is assumed for frames without an answer, whose number is returned, too
 
     >>> latencies_to_answer(np.array([0.0, 1.0, 2.0, 3.0]), [(0.5, 0), (2.5, 2)], end=9.0)
     (array([0.5, 1.5, 0.5, 6. ]), 1)
@@ -271,41 +259,29 @@ def _models(observations: Observations, schedule: Schedule) -> list[tuple[float,
     return models
 
 
-class UsageReading(NamedTuple):
-    """Processor and memory use of a group of processes since the previous reading.
-
-    moment  time of the reading by `time.monotonic`
-    cores   mean number of busy cores
-    memory  resident memory in bytes
-    """
-
-    moment: float
-    cores: float
-    memory: int
-
-
 class Usage:
-    """Readings of named groups of processes; after a restart, the process ids of a group may change.
+    """Processor and memory use of named groups of processes; after a restart, the process ids of a group may change.
 
-    readings  readings by name, oldest first, and those of `REST`
+    readings  by name, and of `REST`, oldest first: mean number of busy cores since the reading before, resident bytes
     """
 
     def __init__(self) -> None:
-        self.readings: dict[str, list[UsageReading]] = {}
+        self.readings: dict[str, list[tuple[float, int]]] = {}
         self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
 
-    def read(self, moment: float, groups: Mapping[str, Iterable[int]]) -> None:
+    def read(self, groups: Mapping[str, Iterable[int]]) -> None:
         """Add a reading of groups of process ids; the first call only starts the measurement."""
         is_first = not self._processes
-        cores, memory = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1), psutil.virtual_memory().used
+        rest, rest_memory = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1), psutil.virtual_memory().used
+        read: dict[str, tuple[float, int]] = {}
         for name, pids in groups.items():
             used = [self._of(pid) for pid in pids]
-            reading = UsageReading(moment, sum(busy for busy, _ in used), sum(resident for _, resident in used))
-            cores, memory = cores - reading.cores, memory - reading.memory
-            if not is_first:
-                self.readings.setdefault(name, []).append(reading)
+            cores, memory = sum(busy for busy, _ in used), sum(resident for _, resident in used)
+            read[name] = cores, memory
+            rest, rest_memory = rest - cores, rest_memory - memory
         if not is_first:
-            self.readings.setdefault(REST, []).append(UsageReading(moment, max(0.0, cores), max(0, memory)))
+            for name, reading in (read | {REST: (max(0.0, rest), max(0, rest_memory))}).items():
+                self.readings.setdefault(name, []).append(reading)
 
     def _of(self, pid: int) -> tuple[float, int]:
         """Return busy cores and memory of a process; nothing if it has just ended."""
@@ -317,12 +293,7 @@ class Usage:
             return 0.0, 0
 
 
-def summary(readings: Sequence[UsageReading]) -> dict[str, float]:
+def summary(readings: Sequence[tuple[float, int]]) -> dict[str, float]:
     """Return mean and maximum of busy cores and of memory in bytes."""
-    _, cores, memory = zip(*readings, strict=True)
-    return {
-        "cores": fmean(cores),
-        "cores_most": max(cores),
-        "memory": fmean(memory),
-        "memory_most": max(memory),
-    }
+    cores, memory = zip(*readings, strict=True)
+    return {"cores": fmean(cores), "cores_most": max(cores), "memory": fmean(memory), "memory_most": max(memory)}

@@ -16,7 +16,6 @@ from catstream.applications.loadtest.latency import (
     Measures,
     Observations,
     Usage,
-    UsageReading,
     measure,
     observed,
     summary,
@@ -59,7 +58,7 @@ class Result:
     plan: Plan
     seconds: float
     streams: list[Measures]
-    usage: dict[str, list[UsageReading]]
+    usage: dict[str, list[tuple[float, int]]]
     received: list[int]
     missed: list[int]
     frozen: float
@@ -94,20 +93,7 @@ class Result:
 
 
 def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
-    """Run pipelines on the streams of a camera, and measure.
-
-    After Ctrl-C, the measurements so far are returned.
-
-    Parameters
-    ----------
-    camera : a running camera with the number of streams of the plan
-    report : function that is called with the progress
-
-    Raises
-    ------
-    CatstreamError
-        If a pipeline cannot start.
-    """
+    """Run pipelines on the streams of a running camera, and measure; after Ctrl-C, return the measurements so far."""
     camera.show_still()
     streams = [Stream(number, url, camera.video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
     usage, interrupted, next_reading = Usage(), False, 0.0
@@ -118,7 +104,7 @@ def run(plan: Plan, camera: Camera, report: Report = lambda *_: None) -> Result:
             for now in _until_the_last_track(plan, streams, seen, schedules):
                 if now >= next_reading:
                     next_reading = now + _READING_SECONDS
-                    usage.read(now, _pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]})
+                    usage.read(_pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]})
                 report(*_progress(plan, seen, now - schedules[0].start))
         except KeyboardInterrupt:
             interrupted = True
@@ -267,11 +253,8 @@ def run_load_test(
 ) -> LoadTest:
     """Run a load test. After Ctrl-C, the measurements so far are returned.
 
-    Parameters
-    ----------
     find : search for the highest rate that meets the limits, beginning with that of the plan
-    report : function that is called with the progress
-    done : function that is called after each run
+    report, done : functions that are called with the progress, and after each run
     """
     load_test, images = LoadTest(limits, find), demo.FRAMES if find else min(plan.frames, demo.FRAMES)
 

@@ -96,8 +96,7 @@ KINDS: dict[str, _Quantity] = {
         for name in PERCENTILES
     },
     "skipped": _Quantity(
-        "share of frames that were not tracked",
-        lambda result: max(stream.skipped_share for stream in result.streams),
+        "share of frames that were not tracked", lambda result: max(stream.skipped_share for stream in result.streams)
     ),
     "missed": _Quantity("share of frames whose tracks fast subscribers missed", lambda result: result.missed_share),
     "success": _Quantity(

@@ -52,7 +52,7 @@ def result() -> Callable[..., Result]:
                     without_track=0,
                     success=success,
                     success_followed=success,
-                    lag=[(100.5, 3)],
+                    max_lag=3,
                 )
             )
         facts = {"usage": {}, "received": [], "missed": [], "frozen": 0.0}

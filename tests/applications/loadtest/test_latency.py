@@ -7,13 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.loadtest.latency import (
-    PERCENTILES,
-    Observations,
-    latencies_to_answer,
-    measure,
-    percentiles,
-)
+from catstream.applications.loadtest.latency import PERCENTILES, Observations, latencies_to_answer, measure, percentiles
 
 TRUTH = np.tile((10.0, 10.0, 20.0, 20.0), (10, 1))
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.applications.loadtest.latency import UsageReading
 from catstream.applications.loadtest.load_report import to_json, write_report
 from catstream.applications.loadtest.load_test import LoadTest, Result
 from catstream.applications.loadtest.plan import Limit
@@ -59,7 +58,7 @@ def test_every_stream_and_process_has_its_row(result, tmp_path):
     run = result(
         [0.01] * 50,
         [0.02] * 50,
-        usage={"detector 0": [UsageReading(100.5, 0.5, 10**8)], "detector 1": [UsageReading(100.5, 0.7, 10**8)]},
+        usage={"detector 0": [(0.5, 10**8)], "detector 1": [(0.7, 10**8)]},
         errors=["stream 1: <it> died"],
     )
     page = write_report(tmp_path / "report.html", LoadTest([], False, [run])).read_text()

@@ -39,14 +39,14 @@ def is_start_server(process):
 
 def test_usage_shows_which_process_is_busy(sleeper):
     usage, busy = Usage(), psutil.Process().pid
-    usage.read(0.0, {"busy": [busy], "idle": [sleeper.pid]})
+    usage.read({"busy": [busy], "idle": [sleeper.pid]})
     deadline = time.process_time() + 0.3
     while time.process_time() < deadline:
         pass
-    usage.read(1.0, {"busy": [busy], "idle": [sleeper.pid]})
-    assert usage.readings["idle"][0].cores < usage.readings["busy"][0].cores
-    assert usage.readings[REST][0].cores >= 0
-    assert 0 < usage.readings["idle"][0].memory < usage.readings["busy"][0].memory
+    usage.read({"busy": [busy], "idle": [sleeper.pid]})
+    assert usage.readings["idle"][0][0] < usage.readings["busy"][0][0]
+    assert usage.readings[REST][0][0] >= 0
+    assert 0 < usage.readings["idle"][0][1] < usage.readings["busy"][0][1]
 
 
 def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
