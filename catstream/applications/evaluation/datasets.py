@@ -84,13 +84,7 @@ class Sequence:
 
 
 def find_sequences(path: str | Path) -> list[Sequence]:
-    """Return the sequence in a folder, or the sequences in its subfolders, in natural order.
-
-    Raises
-    ------
-    VideoError
-        If there is no sequence, or a ground truth file cannot be read.
-    """
+    """Return the sequence in a folder, or the sequences in its subfolders, in natural order."""
     path = Path(path)
     sequences = _sequences(path)
     if not sequences and path.is_dir():
@@ -176,13 +170,9 @@ def _polygons(table: Float64) -> Float64:
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """A change of the first box, relative to its size; the default leaves it as it is.
+    """A change of the first box: shifts of its centre in widths and heights, and factors of its sides.
 
-    name     part of the name of the run; empty for the box of the ground truth
-    right    shift of the centre, in widths
-    down     shift of the centre, in heights
-    wider    factor of the width
-    higher   factor of the height
+    name  part of the name of the run; empty for the box of the ground truth, which is not changed
 
     >>> Variation("right", right=0.1).applied(Box(10, 20, 30, 40))
     Box(x=13.0, y=20.0, w=30.0, h=40.0)
@@ -202,11 +192,7 @@ class Variation:
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """The frame and the box that a run starts with.
-
-    frame      row of the ground truth
-    variation  change of the box in this row
-    """
+    """The frame and the box that a run starts with: a row of the ground truth, and a change of its box."""
 
     frame: int = 0
     variation: Variation = Variation()
@@ -231,9 +217,7 @@ class Start:
         return changed if size is None else _startable(changed, *size)
 
 
-#: The first frame, with the box of the ground truth.
 FIRST = Start()
-
 #: Chooses the starts of a sequence.
 Starts = Callable[[Sequence], list[Start]]
 
@@ -266,8 +250,8 @@ def one_pass(sequence: Sequence) -> list[Start]:
 def temporal(count: int) -> Starts:
     """Choose `count` evenly spaced start frames.
 
-    If the object is absent in one, or its box is one that tracking cannot start with, for example with its centre
-    outside the frame, the next frame is used. Reads a frame of each sequence.
+    If the object is absent in one, or tracking cannot start with its box, the next frame is used. It reads a frame of
+    each sequence.
     """
 
     def starts(sequence: Sequence) -> list[Start]:
@@ -284,10 +268,9 @@ def spatial(sequence: Sequence) -> list[Start]:
 
 
 def jittered(count: int) -> Starts:
-    """Choose `count` first boxes in the first frame with the object.
+    """Choose `count` boxes in the first frame with the object: that of the ground truth, and random changes of it.
 
-    The first is that of the ground truth. The centre and the sides of the others are changed by up to 2 % of the sides;
-    the changes are random, and the same in each sequence and on each machine.
+    The changes are at most 2 % of the sides, and the same in each sequence and on each machine.
     """
     variations = [Variation(), *map(_jitter, range(1, count))]
 
@@ -336,13 +319,7 @@ def _startable(box: Box, width: int, height: int) -> Box:
 
 
 def read_attributes(file: Path) -> dict[str, list[str]]:
-    """Read attributes of sequences, for example occlusion, from a JSON file {sequence: [attribute]}.
-
-    Raises
-    ------
-    SettingsError
-        If it cannot be read, or has another form.
-    """
+    """Read attributes of sequences, for example occlusion, from a JSON file {sequence: [attribute]}."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
     except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:

@@ -99,11 +99,6 @@ def evaluate(
     Returns
     -------
     runs in order of sequence, tracker and start
-
-    Raises
-    ------
-    CatstreamError
-        If a tracker is unknown, two sequences have the same name, or `output` has runs with other settings.
     """
     trackers = list(dict.fromkeys(trackers))
     folder, models = (None if path is None else Path(path) for path in (output, peer_models))

@@ -165,19 +165,10 @@ def _has_first_box(run: EvaluationRun) -> bool:
 def provenance(settings: Settings, words: Words[str] | None = None) -> dict[str, object]:
     """Return the provenance of figures as a JSON object, without host name and folder names.
 
-    Parameters
-    ----------
-    settings : settings that all figures have in common
-    words : words of the command; None for the command that started this process
+    The commit is that of the checkout, with -dirty if files were changed, and None if catstream runs from elsewhere;
+    the settings are those that differ from the default.
 
-    Returns
-    -------
-    version    version of catstream
-    commit     commit of the checkout, with -dirty if files were changed; None if catstream runs from elsewhere
-    date       today, UTC
-    command    the command; absolute paths are shortened to their last part
-    settings   settings that differ from the default
-    machine    see `machine`
+    words : words of the command; None for the command that started this process
     """
     given = [Path(sys.argv[0]).name, *sys.argv[1:]] if words is None else words
     return {

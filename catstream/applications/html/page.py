@@ -126,17 +126,10 @@ SHARES = Axis("", 1.0, tuple((tenth / 10, f"{tenth / 10:.1f}") for tenth in rang
 
 
 def plot(title: str, x: Axis, y: Axis, curves: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> str:
-    """Draw a line plot.
+    """Draw a line plot, and return the `<svg>` element.
 
-    Parameters
-    ----------
-    title : title above the plot
     x, y : axes; values outside their range are clipped
     curves : label -> x and y values, float64 (k,) both; NaN makes a gap, and a curve may be empty
-
-    Returns
-    -------
-    an `<svg>` element; axes and text have the text colour of the page
     """
     legend, rows = _legend(list(curves))
     top, tall = _TOP + _ROW * rows, _HEIGHT - _TOP - _BOTTOM
@@ -194,12 +187,7 @@ def _stroke(number: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A span of time in a lane.
-
-    begin, end  in seconds
-    text        shown if the pointer is over it
-    strength    opacity, from 0 to 1
-    """
+    """A span of seconds in a lane; the text is shown if the pointer is over it, the strength is the opacity, 0 to 1."""
 
     begin: float
     end: float
@@ -208,13 +196,7 @@ class Bar:
 
 
 def timeline(seconds: float, lanes: Mapping[str, Iterable[Bar]], colours: Mapping[str, str]) -> str:
-    """Draw a timeline from 0 to `seconds`, with a lane of bars for each name.
-
-    Parameters
-    ----------
-    lanes : name -> bars, from the top
-    colours : name -> colour of its bars
-    """
+    """Draw a timeline from 0 to `seconds`, with a lane of bars for each name, from the top."""
     seconds = max(seconds, 1e-3)
     drawn = []
     for name, bars in lanes.items():

@@ -73,11 +73,7 @@ def render(plan: Plan, images: int, done: Callable[[int], None] = lambda _: None
 class Camera:
     """A process that sends the video, so that frames are sent on time regardless of other work; a context manager.
 
-    Attributes
-    ----------
-    video : the images
     urls : URL of each stream
-    pid : id of the process
     """
 
     def __init__(self, video: Video, streams: int) -> None:
@@ -138,10 +134,7 @@ def _send_video(pipe: Connection, files: list[bytes], size: tuple[int, int], str
 class Stream(threading.Thread):
     """Runs a pipeline until `stop` is called: consumes its tracks and supervises its processes.
 
-    Attributes
-    ----------
-    endpoint : endpoint of the pipeline, once it is `ready`
-    ready : event that is set when the processes are started or the pipeline has failed
+    ready : event that is set when the processes are started, so that `endpoint` is known, or the pipeline has failed
     error : the error of a failed pipeline, else None
     totals : as in `Pipeline`, set at the end
     """
@@ -194,14 +187,7 @@ class Subscribers:
     """Subscribers to the tracks of one pipeline; a context manager.
 
     They run with idle priority, and the fast ones read twenty times per second, so that they take little processor time
-    from the pipeline.
-
-    Parameters
-    ----------
-    endpoint, keys : endpoint and client keys of the pipeline
-    readers : total number of subscribers
-    slow : number of subscribers that read two messages per second
-    frozen : number of subscribers that are stopped by `freeze`
+    from the pipeline. `slow` of the `readers` read two messages per second, and `frozen` are stopped by `freeze`.
     """
 
     def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0, keys: str = "") -> None:
