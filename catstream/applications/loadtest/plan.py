@@ -21,7 +21,7 @@ class Plan:
     """The parameters of one run.
 
     streams           number of pipelines, each of three processes
-    objects           number of objects that each pipeline tracks, those of `catstream demo`
+    objects           number of objects that each pipeline tracks
     subscribers       number of subscribers to the tracks of each stream
     slow_subscribers  number of those that are slow; half of these are frozen instead
     rate              frames per second of each stream, whether or not the pipeline keeps up
