@@ -166,7 +166,8 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
                     progress.update(task, description=file.path.name, number=number, frame=frame, sightings=found)
             except VideoError as error:
                 result.problems.append(str(error))
-            log.end(result)
+            with INTERRUPTS.deferred():
+                log.end(result)
 
 
 def _print(results: list[FileResult], report: Path) -> None:

@@ -11,15 +11,7 @@ from time import monotonic
 
 import numpy as np
 
-from catstream.applications.loadtest.latency import (
-    REST,
-    Measures,
-    Observations,
-    Usage,
-    measure,
-    observed,
-    summary,
-)
+from catstream.applications.loadtest.latency import REST, Measures, Observations, Usage, measure, observed, summary
 from catstream.applications.loadtest.load import Camera, Stream, Subscribers, render
 from catstream.applications.loadtest.plan import Limit, Plan, violations
 from catstream.errors import ServiceError
