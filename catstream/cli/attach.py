@@ -178,17 +178,13 @@ def _collect_reports(endpoint: str, keys: str, seconds: float) -> tuple[str, dic
     """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
     deadline = time.monotonic() + seconds
     reports: dict[str, list[Health]] = {}
-    with subscribe(endpoint, "health", keys=keys) as health:
-        while len(reports) < len(_PROCESSES) or len(reports["detector"]) < 2:
-            health.timeout = max(0.0, deadline - time.monotonic())
-            try:
-                report = next(health, None)
-            except SilenceError:
-                break
-            if report is None:  # the pipeline has just ended
-                break
+    with subscribe(endpoint, "health", timeout=seconds, keys=keys) as health, suppress(SilenceError):
+        for report in health:
             reports.setdefault(report.process, []).append(report)
-        return health.endpoint, reports
+            if len(reports) == len(_PROCESSES) and len(reports["detector"]) > 1:
+                break
+            health.timeout = max(0.0, deadline - time.monotonic())
+    return health.endpoint, reports
 
 
 def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:

@@ -10,7 +10,8 @@ from catstream.applications.loadtest.latency import PERCENTILES, percentiles
 from catstream.errors import SettingsError
 from catstream.messages.names import check_count, counted
 from catstream.settings import Settings
-from catstream.video import crowd, demo
+from catstream.video import crowd
+from catstream.video.sprite import SIZE
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.load_test import Result
@@ -36,7 +37,7 @@ class Plan:
     slow_subscribers: int = 0
     rate: float = 25.0
     duration: float = 10.0
-    size: tuple[int, int] = demo.SIZE
+    size: tuple[int, int] = SIZE
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
