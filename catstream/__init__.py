@@ -17,8 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from catstream.applications.finding.search import find
-    from catstream.applications.finding.sightings import Sighting
+    from catstream.applications.finding.find import Sighting, find
     from catstream.box import Box
     from catstream.client.control import Control, control
     from catstream.client.subscription import Subscription, subscribe
@@ -62,12 +61,12 @@ _HOMES = {
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "settings",
-    "Sighting": "applications.finding.sightings",
+    "Sighting": "applications.finding.find",
     "Subscription": "client.subscription",
     "Track": "messages.kinds",
     "Tracker": "tracker",
     "control": "client.control",
-    "find": "applications.finding.search",
+    "find": "applications.finding.find",
     "merge": "run.learned",
     "subscribe": "client.subscription",
 }

@@ -9,8 +9,8 @@ import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
+from catstream.cli.common import INTERRUPTS
 from catstream.cli.export import with_table
-from catstream.cli.interrupts import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.messages.names import counted, listed
 from catstream.services.options import with_overwrite

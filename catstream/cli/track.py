@@ -14,10 +14,8 @@ import click
 from rich.console import Console
 
 from catstream.box import Box
+from catstream.cli.common import INTERRUPTS, RunProgress, messages, stopped
 from catstream.cli.export import with_table
-from catstream.cli.interrupts import INTERRUPTS, stopped
-from catstream.cli.output import messages
-from catstream.cli.progress import RunProgress
 from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.errors import require_extra
 from catstream.messages.names import UNNAMED, doubtful, listed
@@ -308,5 +306,5 @@ class _Run:
                     self._progress.show(progress, tracks)
 
     def _print_summary(self) -> None:
-        output = [] if self._files.output is None else [str(self._files.output)]
-        self._console.print(self._progress.summary([*output, *self._pipeline.results.write]))
+        output = [] if self._files.output is None else [self._files.output]
+        self._console.print(self._progress.summary([*output, *map(Path, self._pipeline.results.write)]))

@@ -8,7 +8,7 @@ from contextlib import closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,26 +34,23 @@ _COLUMNS = {
 _BATCH = 65536  # rows in memory at once
 
 
-class ObjectRows(NamedTuple):
-    """The results of one object, a row for each frame from the first one on.
+def write_layout(
+    layout: str, folder: Path, name: str, boxes: Float64, confidence: Float64 | None, seconds: Float64 | None
+) -> None:
+    """Write the files of one object in one of the `LAYOUTS`; raises OSError if that is not possible.
 
-    boxes       float64 (frames, 4), x, y, w, h in pixels; NaN if there is none
-    confidence  float64 (frames,); None to write no file
-    seconds     float64 (frames,), processing time; None to write no file
+    Parameters
+    ----------
+    boxes : float64 (frames, 4), x, y, w, h in pixels; NaN if there is none
+    confidence : float64 (frames,); None to write no such file
+    seconds : float64 (frames,), processing time; None to write no such file
     """
-
-    boxes: Float64
-    confidence: Float64 | None = None
-    seconds: Float64 | None = None
-
-
-def write_layout(layout: str, folder: Path, name: str, rows: ObjectRows) -> None:
-    """Write the files of an object in one of the `LAYOUTS`; raises OSError if that is not possible."""
-    for pattern, values, form in zip(LAYOUTS[layout], rows, ("%.4f", "%.6f", "%.8f"), strict=True):
-        if values is not None:
+    values = (boxes, confidence, seconds)
+    for pattern, column, form in zip(LAYOUTS[layout], values, ("%.4f", "%.6f", "%.8f"), strict=True):
+        if column is not None:
             file = folder / pattern.format(name)
             file.parent.mkdir(parents=True, exist_ok=True)
-            np.savetxt(file, values, fmt=form, delimiter=",")
+            np.savetxt(file, column, fmt=form, delimiter=",")
 
 
 def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
@@ -122,9 +119,8 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, na
         table[list(found), :5] = list(found.values())
         table[list(times), 5] = list(times.values())
         seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
-        write_layout(
-            layout, folder, f"{name}-{thing}" if thing else name, ObjectRows(table[:, :4], table[:, 4], seconds)
-        )
+        whole = f"{name}-{thing}" if thing else name
+        write_layout(layout, folder, whole, table[:, :4], table[:, 4], seconds)
 
 
 write_otb = partial(_write_objects, "otb")

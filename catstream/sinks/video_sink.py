@@ -9,7 +9,7 @@ from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, Sink, TrackedFrame
 from catstream.video.annotate import draw, drawn_size, preview_image
-from catstream.video.frames import RATE, Frame
+from catstream.video.frames import RATE
 from catstream.video.palette import Colours
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
@@ -23,10 +23,7 @@ def open_video(place: str, origin: Origin) -> Sink:
 
 
 class SourceVideo:
-    """An MP4 of the frames that have a track, with the tracks drawn in; it gets its name when it is closed.
-
-    The tracks of a frame may be written one after the other.
-    """
+    """An MP4 of the frames that have a track, with their tracks drawn in; it gets its name when it is closed."""
 
     last = -1  # when a run is resumed, the video is drawn again from the first frame
 
@@ -35,8 +32,6 @@ class SourceVideo:
         self._frames = open_source(
             origin.source or "", part=origin.part, image_rate=origin.image_rate, skip_damaged=True, resize=True
         )
-        self._frame: Frame | None = None  # the last one that has a track, which is not in the video yet
-        self._tracks: list[Track] = []
         self._colours = Colours()
         try:
             self._video = VideoWriter(place, self._frames.rate, drawn_size(self._frames.size))
@@ -45,33 +40,17 @@ class SourceVideo:
             raise
 
     def write(self, frame: TrackedFrame) -> None:
-        """Draw tracks over their frame."""
-        if self._frame is None or frame.number != self._frame.number:
-            self._draw()
-            self._frame = self._read(frame.number)
-        self._tracks.extend(frame.tracks)
+        """Draw the tracks of a frame over it."""
+        image = next((each.image for each in self._frames if each.number == frame.number), None)
+        if image is None:
+            raise VideoError(f"the source has no frame {frame.number}: give the one that the pipeline tracks")
+        self._colours.keep(track.object for track in frame.tracks)
+        self._video.write(draw(image, frame.tracks, self._colours), frame.tracks[0].time)
 
     def close(self) -> None:
         """Finish the video."""
-        try:
-            self._draw()
-        finally:
-            self._frames.close()
-            self._video.close()
-
-    def _draw(self) -> None:
-        """Add the last frame that has a track to the video."""
-        frame, tracks = self._frame, self._tracks
-        self._frame, self._tracks = None, []
-        if frame is not None:
-            self._colours.keep(track.object for track in tracks)
-            self._video.write(draw(frame.image, tracks, self._colours), tracks[0].time)
-
-    def _read(self, number: int) -> Frame:
-        for frame in self._frames:
-            if frame.number == number:
-                return frame
-        raise VideoError(f"the source has no frame {number}: give the one that the pipeline tracks")
+        self._frames.close()
+        self._video.close()
 
 
 class PictureVideo:
