@@ -140,15 +140,17 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
         assert (subscription.missed, subscription.missed_before) == (missed, 0)
 
 
-@pytest.mark.parametrize("channel", ["features", "health", "previews"])
-def test_a_channel_whose_messages_are_about_all_objects_has_none_of_one_object(endpoint, channel):
-    with pytest.raises(ServiceError, match="about all objects: subscribe to samples, models, tracks for one object"):
-        catstream.subscribe(str(endpoint), channel, object="anna")
-
-
-def test_one_object_is_asked_for_by_a_valid_name(endpoint):
-    with pytest.raises(ObjectError, match="'an na' is not a name"):
-        catstream.subscribe(str(endpoint), "tracks", object="an na")
+@pytest.mark.parametrize(
+    ("channel", "name", "words"),
+    [
+        *((channel, "anna", "about all objects: subscribe to samples, models") for channel in ("features", "health")),
+        ("tracks", "an na", "'an na' is not a name"),
+        *((channel, None, "expected one of the channels") for channel in ("training", "results", "frames")),
+    ],
+)
+def test_what_cannot_be_subscribed_to_is_an_error(endpoint, channel, name, words):
+    with pytest.raises((ServiceError, ObjectError), match=words):
+        catstream.subscribe(str(endpoint), channel, object=name)
 
 
 @pytest.fixture
@@ -249,11 +251,17 @@ def test_silence_is_an_error_after_the_timeout_and_iteration_may_continue(endpoi
         assert next(subscription).seq == 2
 
 
-def test_async_for_gives_the_same(endpoint, tracks):
+def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
     async def read(subscription):
         return [message.seq async for message in subscription]
 
     async def both():
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(anext(subscription), 0.05)
+        subscription.timeout = 0.05
+        with pytest.raises(SilenceError):
+            await anext(subscription)
+        subscription.timeout = 20
         reading = asyncio.create_task(read(subscription))
         for seq in range(2, 40):
             tracks.send(track(seq))
@@ -264,27 +272,6 @@ def test_async_for_gives_the_same(endpoint, tracks):
     with attached(endpoint, tracks) as subscription:
         assert asyncio.run(both()) == list(range(2, 40))
         assert subscription.missed == 2
-
-
-def test_a_waiting_task_can_be_cancelled_and_times_out(endpoint, tracks):
-    async def waits():
-        with pytest.raises(asyncio.TimeoutError):
-            await asyncio.wait_for(anext(subscription), 0.05)
-        subscription.timeout = 0.05
-        with pytest.raises(SilenceError):
-            await anext(subscription)
-        tracks.send(track(2))
-        subscription.timeout = 20
-        return await anext(subscription)
-
-    with attached(endpoint, tracks) as subscription:
-        assert asyncio.run(waits()).seq == 2
-
-
-@pytest.mark.parametrize("channel", ["training", "results", "frames"])
-def test_subscribing_to_a_channel_with_one_receiver_is_an_error(endpoint, channel):
-    with pytest.raises(ServiceError, match="expected one of the channels samples, models, tracks, health"):
-        catstream.subscribe(str(endpoint), channel)
 
 
 def test_a_subscriber_that_receives_only_the_end_has_missed_all(endpoint, tracks, until):
