@@ -43,7 +43,7 @@ from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.run.state import restore
 from catstream.settings import Settings
-from catstream.video import demo
+from catstream.video import rendered
 from catstream.video.live_demo import first_box
 
 NAME = "faults"
@@ -80,7 +80,7 @@ class Trial:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cs-")))
         os.environ["XDG_STATE_HOME"] = str(folder)
         self.link = self._open_store(stack)
-        demo.write(folder, FILM, (320, 240))
+        rendered.write(folder, FILM, (320, 240))
         self.film = folder / "demo.mp4"
         self.box = Box(*np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",", max_rows=1).tolist())
         self.calm = fingerprint(undisturbed(str(self.film), {"": self.box})[1])

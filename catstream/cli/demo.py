@@ -66,7 +66,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
 def _one(output: Path, frames: int | None, render_only: bool) -> None:
     """The demo with one object."""
     from catstream.applications.evaluation.metrics import score
-    from catstream.video.demo import FRAMES, write
+    from catstream.video.rendered import FRAMES, write
 
     frames = frames or FRAMES
     video, boxes = _rendered(frames, lambda done: write(output, frames, done=done))

@@ -137,7 +137,7 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
     from catstream.applications.summaries.images import describe
     from catstream.applications.summaries.selection import RowSelection
     from catstream.applications.summaries.sheet import WIDTH, sheet_of_images
-    from catstream.video.image import jpeg
+    from catstream.video.frames import jpeg
 
     collection, selection = Collection(path), RowSelection[tuple[Origin, bytes]](count)
     with line_of(console) as progress, one_thread():

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.video.annotate import draw, drawn_size
+from catstream.settings import RunSettings
+from catstream.video.annotate import Colours, draw, drawn_size
 from catstream.video.frames import RATE, Frame, without_password
-from catstream.video.palette import Colours
 from catstream.video.source import is_live, open_source
 from catstream.video.writer import VideoWriter
 
@@ -37,13 +37,15 @@ class VideoSink:
                 "record it, and give the file"
             )
         # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
-        self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True, resize=True)
+        self._frames = open_source(
+            source, part=part, settings=RunSettings(image_rate=image_rate, skip_damaged=True, resize=True)
+        )
         self._frame: Frame | None = None  # the last one that has a track, which is not in the video yet
         self._tracks: list[Track] = []
         self._colours = Colours()
         try:
             size = drawn_size(self._frames.size)
-            self._video = VideoWriter(path, self._frames.rate, size, sound=self._frames.sound)
+            self._video = VideoWriter(path, self._frames.rate, size, pixel_aspect=self._frames.pixel_aspect)
         except VideoError:
             self._frames.close()
             raise

@@ -1,9 +1,10 @@
-"""Draws tracks over their frames, for people to look at."""
+"""Draws tracks over their frames, for people to look at, and gives each object a colour."""
 
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -12,8 +13,13 @@ import numpy as np
 from catstream.box import Box
 from catstream.messages.kinds import Preview, Track
 from catstream.messages.names import UNNAMED
-from catstream.video.image import jpeg
-from catstream.video.palette import Colours, rgb
+from catstream.video.frames import jpeg
+
+#: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture,
+#: draw each beside a dark line, so that it is visible on a light ground too.
+PALETTE = (
+    "#ff922b", "#3586ff", "#fedd38", "#e123c2", "#bae0b4", "#fd0304", "#76c6fe", "#5a8667", "#b7a59c",
+)  # fmt: skip
 
 #: Blue, green, red.
 _Point = tuple[float, float]
@@ -26,6 +32,37 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Height of the line of text below an image that is 640 pixels wide, and the smallest factor by which it is scaled.
 _TEXT_HEIGHT, _MIN_UNIT = 26, 0.75
+
+
+class Colours:
+    """Gives each object a colour, which does not change until the object is dropped.
+
+    An object gets the first of the colours that the fewest objects have.
+
+    Examples
+    --------
+    >>> colours = Colours()
+    >>> [colours.of(name) for name in ("anna", "ben", "anna")]
+    ['#ff922b', '#3586ff', '#ff922b']
+    >>> colours.keep(["ben"])
+    >>> colours.of("carl")
+    '#ff922b'
+    """
+
+    def __init__(self) -> None:
+        self._colours: dict[str, str] = {}
+
+    def of(self, name: str) -> str:
+        """Return the colour of an object as #rrggbb."""
+        if name not in self._colours:
+            used = Counter(self._colours.values())
+            self._colours[name] = min(PALETTE, key=lambda colour: used[colour])
+        return self._colours[name]
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Drop all objects except these; their colours may be given again."""
+        kept = set(names)
+        self._colours = {name: colour for name, colour in self._colours.items() if name in kept}
 
 
 def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.ndarray:
@@ -143,7 +180,8 @@ def _scaled(track: Track, scale: float) -> Track:
 
 
 def _bgr(colour: str) -> _Colour:
-    red, green, blue = rgb(colour)
+    """Return blue, green and red of a colour #rrggbb."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
     return blue, green, red
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.video.sprite import SIZE, VISIBLE, Lake, Sprite, cut_out_dahlia, load_photograph, resized
+from catstream.video.rendered import SIZE, VISIBLE, Lake, Sprite, cut_out_dahlia, load_photograph, resized
 from catstream.video.writer import VideoWriter
 
 #: Number of frames, and frames per second.

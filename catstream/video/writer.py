@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from catstream.errors import VideoError
-from catstream.video.sound import Sound
 
 #: Steps of the video's time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100
@@ -32,7 +31,7 @@ class VideoWriter:
     path : file to write
     rate : frames per second, on average
     size : (width, height) of the frames in pixels
-    sound : video file whose sound is copied, None for no sound
+    pixel_aspect : width of a pixel divided by its height
 
     Raises
     ------
@@ -40,7 +39,9 @@ class VideoWriter:
         From the constructor if the file cannot be written; later if a write fails.
     """
 
-    def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
+    def __init__(
+        self, path: str | Path, rate: float, size: tuple[int, int], *, pixel_aspect: Fraction = Fraction(1)
+    ) -> None:
         import av  # imported here because only the writing of videos needs it
 
         self.path = Path(path)
@@ -69,7 +70,7 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         # Both encoders subsample colour by 2x2 pixels, so an odd side is padded by one pixel.
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
-        self._sound = Sound(sound, self._container)
+        self._stream.codec_context.sample_aspect_ratio = pixel_aspect
 
     def write(self, image: np.ndarray, time: float | None = None) -> None:
         """Add a frame.
@@ -91,7 +92,6 @@ class VideoWriter:
         frame = av.VideoFrame.from_ndarray(even, format="bgr24")
         frame.pts, frame.time_base = self._last_tick, self._stream.codec_context.time_base
         with self._reporting_errors():
-            self._sound.copy(self._first_time, time)
             self._container.mux(self._stream.encode(frame))
         self.frames += 1
 
@@ -105,7 +105,6 @@ class VideoWriter:
                 if self.frames:
                     self._part.replace(self.path)
         finally:
-            self._sound.close()
             with contextlib.suppress(OSError):  # the disk may have become read-only
                 self._part.unlink(missing_ok=True)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from catstream.messages.kinds import Health, Model, State, Track
-from catstream.video.palette import Colours
+from catstream.video.annotate import Colours
 
 
 @dataclass(slots=True)

@@ -12,8 +12,7 @@ from starlette.exceptions import HTTPException
 
 from catstream.client.registry import Registry, address_of
 from catstream.messages.kinds import FleetStatus, Preview, StreamStatus
-from catstream.video.annotate import draw_boxes
-from catstream.video.palette import Colours
+from catstream.video.annotate import Colours, draw_boxes
 from catstream.web.dashboard import FleetDashboard
 from catstream.web.feed import Feed, PipelineFeed
 from catstream.web.recent import Recent

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import VideoError
-from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame, Source
+from catstream.video.frames import Frame, Source, read_ahead
 
 
 class Numbers(Source):

@@ -12,8 +12,7 @@ import pytest
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
-from catstream.video.annotate import draw, drawn_size, thumbnail
-from catstream.video.palette import Colours, rgb
+from catstream.video.annotate import Colours, draw, drawn_size, rgb, thumbnail
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 

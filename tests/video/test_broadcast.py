@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from catstream.video.broadcast import Broadcast, Schedule
-from catstream.video.image import jpeg
+from catstream.video.frames import jpeg
 from catstream.video.source import open_source
 
 SIZE = (64, 48)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from catstream.video.demo import FRAMES, render, write
+from catstream.video.rendered import FRAMES, render, write
 from catstream.video.source import open_source
 
 

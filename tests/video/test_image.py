@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import FrameError
-from catstream.video.image import as_bgr
+from catstream.video.frames import as_bgr
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from catstream.errors import VideoError
-from catstream.video import demo, live_demo
+from catstream.video import live_demo, rendered
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
 
@@ -34,7 +34,7 @@ def test_it_begins_with_its_first_image_whenever_it_is_read(clock):
     with open_source(SMALL) as source:
         clock.now += 3600
         first = next(source)
-    image, _ = next(demo.render(1, (64, 64), seed=1, begin=60))
+    image, _ = next(rendered.render(1, (64, 64), seed=1, begin=60))
     assert (first.number, first.time, source.counters) == (0, 0.0, {"skipped": 0})
     assert np.array_equal(first.image, image)
 

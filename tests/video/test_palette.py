@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from catstream.applications.html.plots import COLOURS
-from catstream.video.palette import PALETTE, Colours, rgb
+from catstream.video.annotate import PALETTE, Colours, rgb
 
 #: Linear red, green, blue as people of each kind of vision see them (Machado and others, 2009, severity 1).
 VISIONS = {

@@ -10,7 +10,7 @@ import pytest
 
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.video.demo import RATE, render
+from catstream.video.rendered import RATE, render
 from catstream.video.writer import VideoWriter
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server

@@ -12,8 +12,7 @@ from typing import Literal
 
 from catstream.errors import VideoError
 from catstream.settings import RunSettings
-from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame, without_password
+from catstream.video.frames import Frame, read_ahead, without_password
 from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
 
 _log = logging.getLogger(__name__)
@@ -58,7 +57,7 @@ class File:
             If a video cannot be opened, or at its damage, after the frames before it.
         """
         if self.kind == "video":
-            with open_source(self.path, start, skip_damaged=settings.skip_damaged) as source:
+            with open_source(self.path, start, settings=settings) as source:
                 opened(source.rate, source.frames)
                 with closing(read_ahead(source)) as frames:
                     yield from ((frame, "") for frame in frames)

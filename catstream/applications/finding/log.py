@@ -18,7 +18,7 @@ from catstream.applications.finding.sightings import FileResult, Sighting
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages.storage import writing
-from catstream.video.image import jpeg
+from catstream.video.frames import jpeg
 
 _KIND = "catstream find 2"  # and the version of the lines
 _GAP_SECONDS = 1.0  # longest time between two sightings of an interval, if steps are short

@@ -11,7 +11,7 @@ from catstream.applications.finding.sightings import FileResult, Interval
 from catstream.applications.html.page import figure, table, write_page
 from catstream.applications.html.timeline import Bar, clock, legend, timeline
 from catstream.messages.names import counted
-from catstream.video.palette import Colours
+from catstream.video.annotate import Colours
 
 _PICTURES = 24  # of each object, at most
 _TIMELINES = 200  # files with the most sightings, if there are more

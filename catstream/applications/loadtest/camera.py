@@ -20,9 +20,9 @@ from catstream.messages.names import UNNAMED
 from catstream.numerics.arrays import Float64
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN, sigint_blocked
-from catstream.video import crowd, demo
+from catstream.video import crowd, rendered
 from catstream.video.broadcast import Broadcast, Schedule
-from catstream.video.image import jpeg
+from catstream.video.frames import jpeg
 
 _QUALITY = 90  # of JPEG, as network cameras use it
 
@@ -47,7 +47,7 @@ def render(plan: Plan, images: int, done: Callable[[int], None] = lambda _: None
     files, truth = [], []
     shown: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
     if plan.objects == 1:
-        shown = ((image, {UNNAMED: box}) for image, box in demo.render(images, plan.size))
+        shown = ((image, {UNNAMED: box}) for image, box in rendered.render(images, plan.size))
     else:
         shown = crowd.render(plan.objects, images, plan.size)
     for image, boxes in shown:
@@ -87,7 +87,7 @@ class Camera:
 
     def show_still(self) -> None:
         """Send the first image repeatedly, at the frame rate of the video."""
-        self.play(Schedule(monotonic(), demo.RATE, frames=1))
+        self.play(Schedule(monotonic(), rendered.RATE, frames=1))
 
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Send the video by a schedule; return the schedule of each stream."""

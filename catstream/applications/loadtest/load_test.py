@@ -9,7 +9,7 @@ from catstream.applications.loadtest.camera import Camera, render
 from catstream.applications.loadtest.limits import Limit, violations
 from catstream.applications.loadtest.plan import Plan
 from catstream.applications.loadtest.run import Report, Result, run
-from catstream.video import demo
+from catstream.video import rendered
 
 _LEAST, _MOST = 0.5, 1000.0  # frames per second
 _PRECISION = 0.05  # maximum relative error of the highest rate
@@ -65,7 +65,7 @@ def run_load_test(
     report : function that is called with the progress
     done : function that is called after each run
     """
-    load_test, images = LoadTest(limits, find), demo.FRAMES if find else min(plan.frames, demo.FRAMES)
+    load_test, images = LoadTest(limits, find), rendered.FRAMES if find else min(plan.frames, rendered.FRAMES)
 
     def holds(rate: float) -> bool:
         result = run(replace(plan, rate=rate), camera, report)

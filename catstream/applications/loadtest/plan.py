@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from catstream.errors import SettingsError
 from catstream.messages.names import check_count, counted
 from catstream.settings import Settings
-from catstream.video import crowd, demo
+from catstream.video import crowd, rendered
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Plan:
     slow_subscribers: int = 0
     rate: float = 25.0
     duration: float = 10.0
-    size: tuple[int, int] = demo.SIZE
+    size: tuple[int, int] = rendered.SIZE
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
