@@ -7,7 +7,6 @@ from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.settings import RunSettings
 from catstream.video.annotate import Colours, draw, drawn_size
 from catstream.video.frames import RATE, Frame, without_password
 from catstream.video.source import is_live, open_source
@@ -37,9 +36,7 @@ class VideoSink:
                 "record it, and give the file"
             )
         # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
-        self._frames = open_source(
-            source, part=part, settings=RunSettings(image_rate=image_rate, skip_damaged=True, resize=True)
-        )
+        self._frames = open_source(source, part=part, image_rate=image_rate, skip_damaged=True, resize=True)
         self._frame: Frame | None = None  # the last one that has a track, which is not in the video yet
         self._tracks: list[Track] = []
         self._colours = Colours()

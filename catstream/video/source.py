@@ -28,9 +28,10 @@ import os
 import re
 import sys
 from collections.abc import Callable, Generator, Iterator
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 import cv2
@@ -134,6 +135,7 @@ def open_source(
     since: float | None = None,
     idle: Callable[[], bool] | None = None,
     settings: RunSettings | None = None,
+    **single: Any,
 ) -> Source:
     """Open the source that `text` names; the docstring of the module lists the kinds.
 
@@ -148,6 +150,7 @@ def open_source(
         ends. With it, opening a live source never fails: iteration waits for the first frame for any length of time,
         and the size is known with that frame
     settings : the settings of a run, of which `image_rate`, `skip_damaged` and `resize` are used
+    single : single ones of them by name, in the place of those in `settings`
 
     Raises
     ------
@@ -155,7 +158,7 @@ def open_source(
         If the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the frames
         before it.
     """
-    settings = settings or RunSettings()
+    settings = replace(settings or RunSettings(), **single)
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if part.stop is not None and part.stop <= (part.start or 0):
@@ -356,16 +359,18 @@ class _Video:
             self.container.close()
             raise VideoError(f"there is no video in {str(path)!r}: {_EXPECTED}")
         self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
-        # A stream without a container, as raw H.264, states its rate itself, and has no time stamps.
-        self._has_times = not self.container.format.flags & av.format.Flags.no_timestamps.value
-        stated = self.stream.average_rate if self._has_times else None
-        self.rate = float(stated or self.stream.guessed_rate or RATE)
+        # A stream without a container, as raw H.264, has no time stamps, but may state its rate. An AVI has the times
+        # of decoding only, and FFmpeg gives them to pictures that are in another order.
+        has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
+        self._is_avi = self.container.format.name == "avi"
+        self._clock = ("dts" if self._is_avi else "pts") if has_times else ""
+        self.rate = float((has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
 
     def count(self) -> int | None:
         """Return the number of frames: the stated one, or else that of the packets."""
         # The header of an AVI counts packets without data, which repeat the frame before, too.
-        if self.stream.frames and self.container.format.name != "avi":
-            return self.stream.frames
+        if self.stream.frames and not self._is_avi:
+            return int(self.stream.frames)
         video = _Video(self.path, self.settings)
         with video.container:
             if self.path.stat().st_size > _MAX_COUNTED_BYTES:
@@ -377,9 +382,7 @@ class _Video:
         zero, time, shape, upright, rest = None, -1.0, None, UprightConverter(), wanted[start:]
         with self.container:
             for number, frame in enumerate(self._decoded()):
-                # An AVI has the times of decoding only, and FFmpeg gives them to pictures that are in another order.
-                ticks = frame.dts if self.container.format.name == "avi" else frame.pts
-                ticks = ticks if self._has_times else None
+                ticks = getattr(frame, self._clock) if self._clock else None
                 zero = ticks if zero is None else zero
                 stated = number / self.rate if ticks is None else float((ticks - (zero or 0)) * self.stream.time_base)
                 # Where files were joined, the time stamps begin again, but time goes on.
@@ -402,12 +405,13 @@ class _Video:
             if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
                 self.damaged += 1
                 continue
-            frames, problem, waits_for_key = [], packet if isinstance(packet, str) else "", False
+            frames: list[VideoFrame] = []
+            problem, waits_for_key = packet if isinstance(packet, str) else "", False
             try:
                 frames = [] if problem else decoder.decode(packet)
             except av.FFmpegError as error:
                 problem = ffmpeg_reason(error)
-            if problem:  # the decoder still holds frames before it
+            if problem and self.settings.skip_damaged:  # the decoder still holds frames before it
                 with contextlib.suppress(av.FFmpegError):
                     frames = decoder.decode(None)
             for frame in frames:
@@ -425,7 +429,7 @@ class _Video:
                 self.damaged, waits_for_key = self.damaged + 1, True
                 decoder.flush_buffers()
 
-    def _packets(self) -> Iterator[Packet | str | None]:
+    def _packets(self) -> Iterator[Packet[Any] | str | None]:
         """Yield the packets that hold data, the reason of each error of the container, and None at the end."""
         import av
 

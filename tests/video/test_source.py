@@ -6,6 +6,7 @@ import os
 import struct
 import tempfile
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from catstream.errors import VideoError
 from catstream.video.frames import Source
 from catstream.video.source import open_source
 
-CODECS = {".mp4": "libx264", ".mkv": "libx264", ".ts": "libx264", ".avi": "mjpeg", ".mpg": "mpeg2video"}
+H264 = dict.fromkeys((".mp4", ".mkv", ".ts", ".mov", ".h264", ".flv", ".MTS"), "libx264")
+CODECS = {**H264, ".avi": "mjpeg", ".mpg": "mpeg2video", ".wmv": "wmv2"}
 
 
 @cache
@@ -38,26 +40,47 @@ def number_of(image: np.ndarray) -> int:
 
 
 @cache
-def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotation: int) -> bytes:
-    """A file of numbered frames, which many tests read."""
+def encoded(
+    suffix: str,
+    frames: int = 100,
+    options: tuple[tuple[str, str], ...] = (),
+    rotation: int = 0,
+    times: tuple[float, ...] = (),
+    sound: float = 0.0,
+    title: str = "",
+) -> bytes:
+    """A file of numbered frames, which many tests read.
+
+    options  of the container, and with the prefix v: of the codec
+    times    time stamps of the frames in seconds; empty for 25 frames per second
+    sound    seconds of a sound track
+    """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"a{suffix}")
+        path, codec = Path(folder, f"a{suffix}"), CODECS[suffix]
         # The same bytes in each run: Matroska has random identifiers, x264's macroblock tree is chaotic.
-        muxing = {
-            "fflags": "bitexact",
-            "cluster_time_limit": "400",
-            **dict(options),
-        }  # a long Matroska has many clusters
+        muxing = {"fflags": "bitexact", "cluster_time_limit": "400"}  # a long Matroska has many clusters
+        coding = {"preset": "superfast"} if codec == "libx264" else {}
+        for key, value in options:
+            (coding if key.startswith("v:") else muxing)[key.removeprefix("v:")] = value
         with av.open(str(path), "w", options=muxing) as container:
-            quick = {"preset": "superfast"} if CODECS[suffix] == "libx264" else {}
-            stream: Any = container.add_stream(CODECS[suffix], rate=25, options=quick)
+            container.metadata["title"] = title
+            stream: Any = container.add_stream(codec, rate=25, options=coding)
             stream.width, stream.height = 160, 120
-            stream.pix_fmt = "yuvj420p" if suffix == ".avi" else "yuv420p"
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            tone: Any = container.add_stream("aac", rate=16000, layout="mono") if sound else None
             if rotation:
                 stream.set_display_rotation(rotation)
             for number in range(frames):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+                frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24")
+                if times:
+                    frame.pts, frame.time_base = round(1000 * times[number]), Fraction(1, 1000)
+                    stream.codec_context.time_base = frame.time_base
+                container.mux(stream.encode(frame))
             container.mux(stream.encode(None))
+            if sound:
+                samples = av.AudioFrame.from_ndarray(np.zeros((1, round(16000 * sound)), np.float32), "fltp", "mono")
+                samples.sample_rate = 16000
+                container.mux([*tone.encode(samples), *tone.encode(None)])
         return path.read_bytes()
 
 
@@ -65,12 +88,12 @@ def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotat
 def video(tmp_path: Path) -> Callable[..., Path]:
     """Writes a video of numbered frames; the ending of its name says which kind."""
 
-    def write(name: str, frames: int = 100, options: dict[str, str] | None = None, rotation: int = 0) -> Path:
+    def write(name: str, frames: int = 100, options: dict[str, str] | None = None, **others: Any) -> Path:
         path = tmp_path / name
         codec = CODECS[path.suffix]
         if codec not in av.codecs_available:
             pytest.skip(f"this FFmpeg cannot write {codec}")
-        path.write_bytes(encoded(path.suffix, frames, frozenset((options or {}).items()), rotation))
+        path.write_bytes(encoded(path.suffix, frames, tuple((options or {}).items()), **others))
         return path
 
     return write
@@ -158,34 +181,147 @@ def test_frames_of_a_part_keep_their_time_stamps(video, name, part):
 
 
 def test_damage_after_a_part_is_no_error(video):
-    path = video("a.mpg")
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    path = damaged(video("a.mpg"), 0.5)
     good, _ = broken(path)
     assert numbers(open_source(path, part=slice(5, len(good)))) == good[5:]
 
 
 @KINDS
 @pytest.mark.parametrize("share", [0.31, 0.6, 0.83])
-def test_a_truncated_video_returns_its_good_frames_and_then_an_error_with_the_frame_number(video, name, share):
+def test_a_truncated_video_returns_its_good_frames_in_order(video, name, share):
     path = video(name, options={"movflags": "faststart"} if name.endswith("mp4") else None)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * share)])
+    found = numbers(open_source(path, skip_damaged=True))
+    assert found == sorted(set(found))
+    assert found[:3] == [0, 1, 2]
+    assert found[-1] < 99
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mpg"])
+def test_what_ffmpeg_cannot_decode_is_an_error_after_the_frames_before_it(video, name):
+    path = damaged(video(name), 0.5)
     good, message = broken(path)
     assert good == list(range(len(good)))
-    assert 2 < len(good) < 100
-    assert f"frame {len(good)} " in message or f"after frame {len(good) - 1}:" in message
-    with open_source(path, skip_damaged=True) as source:
-        read = len(list(source)) + source.counters.get("damaged", 0)
-    if path.suffix in (".mp4", ".mkv"):  # which state how long they were
-        assert read == pytest.approx(100, abs=1)
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.mpg"])
-def test_damage_in_the_middle_is_an_error_after_the_frames_before_it(video, name):
-    good, message = broken(damaged(video(name), 0.5))
-    assert good == list(range(len(good)))
     assert 20 < len(good) < 80
-    assert "is damaged at frame" in message
+    assert f"{str(path)!r} is damaged at frame {len(good)} (" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.mpg"])
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_with_skip_damaged_reading_goes_on_at_the_next_key_frame_and_frames_keep_their_times(video, name, share):
+    path = damaged(video(name, options={"v:g": "10"}), share)
+    with open_source(path, skip_damaged=True) as source:
+        found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
+        lost = source.counters.get("damaged", 0)
+    shown = [number for _, _, number in found]
+    assert [number for number, _, _ in found] == list(range(len(found)))
+    assert shown == sorted(set(shown))
+    assert (shown[0], shown[-1]) == (0, 99)
+    assert lost <= 100 - len(shown) + 1 < 40  # a container may pass over a damaged place without a word
+    if path.suffix != ".avi":  # which counts frames in the place of times
+        assert [time for _, time, _ in found] == pytest.approx([number / 25 for number in shown], abs=0.002)
+    with open_source(path, 20, skip_damaged=True) as source:
+        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[20:]
+
+
+def laced_matroska(path: Path) -> Path:
+    """A Matroska file of 50 JPEGs, with blocks of sound that hold 8 frames each, as mkvmerge writes them."""
+
+    def element(name: str, content: bytes) -> bytes:
+        return bytes.fromhex(name) + struct.pack(">Q", len(content) | 1 << 56) + content
+
+    def number(name: str, value: int) -> bytes:
+        return element(name, value.to_bytes(4))
+
+    def track(index: int, kind: int, codec: bytes, content: bytes) -> bytes:
+        numbers = number("D7", index) + number("73C5", index) + number("83", kind)
+        return element("AE", numbers + element("86", codec) + content)
+
+    picture = track(1, 1, b"V_MJPEG", element("E0", number("B0", 160) + number("BA", 120)))
+    tone = element("B5", struct.pack(">d", 48000.0)) + number("9F", 2) + number("6264", 16)
+    tracks = picture + track(2, 2, b"A_PCM/INT/LIT", element("E1", tone))
+    clusters = b""
+    for count in range(50):
+        jpeg = cv2.imencode(".jpg", numbered(count))[1].tobytes()
+        blocks = element("A3", b"\x81\0\0\x80" + jpeg) + element("A3", b"\x82\0\0\x84\x07" + bytes(7680))
+        clusters += element("1F43B675", number("E7", 40 * count) + blocks)
+    head = element("1A45DFA3", element("4282", b"matroska"))
+    info = element("1549A966", number("2AD7B1", 1000000))
+    path.write_bytes(head + element("18538067", info + element("1654AE6B", tracks) + clusters))
+    return path
+
+
+#: Whole files that something is unusual about: the name, and what `video` is given for it.
+LATE = tuple(5 + number / 25 for number in range(60))
+WHOLE: dict[str, tuple[str, dict[str, Any]]] = {
+    "sound outlasts the picture": ("a.mp4", {"sound": 9.0}),
+    "the video begins late": ("a.mkv", {"times": LATE}),
+    "frames that repeat the last one": ("a.avi", {"times": tuple(n / 25 if n < 30 else n / 25 + 1 for n in range(60))}),
+    "B-frames in an AVI": ("b.avi", {"options": {"v:bf": "3"}}),
+    "a title that is not UTF-8": ("a.mkv", {"title": "XXXXXXXX"}),
+    "a name that is not UTF-8": (os.fsdecode(b"caf\xe9.mp4"), {}),
+    "a suffix of a camcorder": ("00001.MTS", {}),
+}
+
+
+@pytest.mark.parametrize(("name", "others"), WHOLE.values(), ids=WHOLE)
+def test_a_whole_file_is_read_to_its_last_frame_and_its_times_grow(video, name, others, monkeypatch):
+    if name == "b.avi":
+        monkeypatch.setitem(CODECS, ".avi", "libx264")
+    path = video(name, 60, **others)
+    path.write_bytes(path.read_bytes().replace(b"XXXXXXXX", "обработ".encode("cp1251") + b"!"))
+    for skip in (False, True):
+        with open_source(path, skip_damaged=skip) as source:
+            frames = list(source)
+            assert not source.counters
+            assert source.frames == 60
+        assert [number_of(frame.image) for frame in frames] == list(range(60))
+        wanted = np.subtract(others.get("times", LATE), others.get("times", LATE)[0])
+        assert [frame.time for frame in frames] == pytest.approx(wanted, abs=0.002)
+
+
+def test_a_matroska_file_with_laced_sound_is_whole(tmp_path):
+    assert numbers(open_source(laced_matroska(tmp_path / "a.mkv"))) == list(range(50))
+
+
+@pytest.mark.parametrize("name", ["joined.ts", "list.m3u8"])
+def test_joined_segments_are_read_to_the_end_and_time_goes_on(video, tmp_path, name):
+    part = video("part.ts", 30, options={"v:bf": "2"})
+    (tmp_path / "joined.ts").write_bytes(3 * part.read_bytes())
+    (tmp_path / "list.m3u8").write_text(
+        "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:2\n"
+        + "#EXT-X-DISCONTINUITY\n".join(3 * ["#EXTINF:1.2,\npart.ts\n"])
+        + "#EXT-X-ENDLIST\n"
+    )
+    with open_source(tmp_path / name) as source:
+        found = [(number_of(frame.image), frame.time) for frame in source]
+    assert [number for number, _ in found] == 3 * list(range(30))
+    assert [time for _, time in found] == pytest.approx([number / 25 for number in range(90)], abs=0.002)
+
+
+def test_a_stream_without_a_container_has_the_rate_that_it_states(video):
+    path = video("a.h264", 20, options={"v:x264-params": "fps=50/1:force-cfr=1"})
+    with open_source(path) as source:
+        assert source.rate == pytest.approx(50)
+        assert [frame.time for frame in source] == pytest.approx([number / 50 for number in range(20)])
+
+
+def test_a_video_that_changes_its_size_ends_there_or_is_scaled(video, tmp_path):
+    large = tmp_path / "large.ts"
+    with av.open(str(large), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for number in range(30, 40):
+            image = cv2.resize(numbered(number), (320, 240))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode(None))
+    path = video("a.ts", 30)
+    path.write_bytes(path.read_bytes() + large.read_bytes())
+    good, message = broken(path)
+    assert (good, "(frame 30) is 320x240, the first 160x120" in message) == (list(range(30)), True)
+    assert numbers(open_source(path, resize=True)) == list(range(40))
 
 
 def test_a_video_without_its_index_is_an_error(video):
@@ -271,25 +407,6 @@ def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
     assert found == list(enumerate(wanted))[2:]
 
 
-@KINDS
-@pytest.mark.parametrize("share", [0.3, 0.7])
-def test_damage_is_skipped_if_requested_and_frames_keep_their_time_stamps(video, name, share):
-    path = damaged(video(name), share)
-    with open_source(path, skip_damaged=True) as source:
-        found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
-        lost = source.counters.get("damaged", 0)  # a container may pass over a damaged place without a word
-    shown = [number for _, _, number in found]
-    assert [number for number, _, _ in found] == list(range(len(found)))
-    assert shown == sorted(set(shown))
-    assert shown[0] == 0
-    assert shown[-1] == 99
-    assert lost <= 100 - len(shown) < 40
-    if path.suffix != ".avi":  # which keeps no times
-        assert [time for _, time, _ in found] == pytest.approx([number / 25 for number in shown], abs=0.002)
-    with open_source(path, 20, skip_damaged=True) as source:
-        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[20:]
-
-
 @pytest.mark.parametrize("part", [slice(-1, None), slice(None, -1), slice(0, 9, 0), slice(9, 0, -1)], ids=str)
 def test_a_part_with_a_negative_step_is_an_error(images, part):
     with pytest.raises(VideoError, match="frames count from 0"):
@@ -330,6 +447,19 @@ def test_an_image_of_more_pixels_than_opencv_reads_is_an_error(tmp_path):
     (tmp_path / "0.bmp").write_bytes(blank)
     with pytest.raises(VideoError, match=r"cannot read the image .*0\.bmp"):
         open_source(tmp_path)
+
+
+def test_a_jpeg_that_is_cut_off_is_an_error_that_names_it(images):
+    folder = images("walk", ["0.jpg", "1.jpg", "2.jpg"])
+    (folder / "2.jpg").write_bytes((folder / "2.jpg").read_bytes()[:-500])
+    good, message = broken(folder)
+    assert good == [0, 1]
+    assert "2.jpg' (frame 2): replace or remove it" in message
+
+
+def test_a_folder_of_images_may_have_a_name_that_is_not_utf_8(images):
+    folder = images("walk", 3)
+    assert numbers(open_source(folder.rename(folder.with_name(os.fsdecode(b"caf\xe9"))))) == [0, 1, 2]
 
 
 def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):

@@ -10,7 +10,6 @@ import numpy as np
 
 from catstream.applications.finding.files import find_files
 from catstream.errors import VideoError
-from catstream.settings import RunSettings
 from catstream.video.source import IMAGES, open_source, read_image
 
 
@@ -66,7 +65,7 @@ class Collection:
                 self.skipped.append(reason)
 
     def _frames(self, path: Path, name: str) -> Iterator[tuple[Origin, np.ndarray]]:
-        with open_source(path, settings=RunSettings(skip_damaged=True)) as source:
+        with open_source(path, skip_damaged=True) as source:
             for frame in source:
                 yield Origin(name, frame.number, frame.time), frame.image
             if damaged := source.counters.get("damaged"):

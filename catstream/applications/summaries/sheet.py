@@ -16,7 +16,6 @@ from catstream.applications.summaries.selection import Selection
 from catstream.applications.summaries.taught import TaughtFrame
 from catstream.errors import VideoError
 from catstream.messages.storage import write_atomically, writing
-from catstream.settings import RunSettings
 from catstream.video.annotate import thumbnail
 from catstream.video.frames import without_password
 from catstream.video.source import is_live, open_source
@@ -129,7 +128,7 @@ def pictures_of(frames: list[TaughtFrame], source: str, image_rate: float) -> di
         raise VideoError(f"{without_password(source)!r} is a live source, and its frames were not kept")
     found: dict[int, bytes] = {}
     waiting = sorted(frames, key=lambda frame: -frame.time)
-    with open_source(source, settings=RunSettings(image_rate=image_rate, skip_damaged=True, resize=True)) as images:
+    with open_source(source, image_rate=image_rate, skip_damaged=True, resize=True) as images:
         for image in images:
             while waiting and waiting[-1].time < image.time - _TOLERANCE_SECONDS:
                 waiting.pop()
