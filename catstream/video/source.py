@@ -29,7 +29,8 @@ import re
 import sys
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
-from functools import cached_property, partial
+from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -58,7 +59,7 @@ _FOLDERS = ("img", "imgs", "color", "rgb")
 _EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
 _LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+|demo:.*")
 
-#: After this many consecutive errors of the container, without a packet between them, the file is treated as ended.
+#: After so many errors of the container without a packet between them, a file is treated as ended.
 _MAX_FAILURES = 3
 
 #: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
@@ -66,46 +67,31 @@ _MAX_COUNTED_BYTES = 1 << 30
 
 
 class _FileSource(Source):
-    """A video file or a set of images. No frame is skipped; the constructor decodes the first frame.
+    """The frames of a `part` of a file or of images, from number `start` on. The constructor decodes the first one."""
 
-    Parameters
-    ----------
-    frames : the frames of `part`, starting with number `start` within the part
-    total : function that returns the number of frames of the whole source, or None if it is unknown
-    rate : frames per second of the whole source
-    video : the file that is read, if it is a video
-    """
-
-    def __init__(
-        self,
-        name: str,
-        frames: Generator[Frame],
-        total: Callable[[], int | None],
-        part: slice,
-        start: int,
-        rate: float,
-        video: _Video | None = None,
-    ) -> None:
-        self._frames, self._total, self._part, self._video = frames, total, part, video
-        self._first: Frame | None = next(frames, None)
+    def __init__(self, name: str, reader: _Images | _Video, part: slice, start: int) -> None:
+        self._reader, self._part = reader, part
+        wanted = range(sys.maxsize)[part]
+        self._frames = reader.frames(wanted, start)
+        self._first: Frame | None = next(self._frames, None)
         if self._first is None:
-            number = range(sys.maxsize)[part][start:].start
             raise VideoError(
-                f"{name} has {total() or 'no'} frames, numbered from 0, and none from frame {number} on: "
-                "give an earlier first frame, or another source"
+                f"{name} has {reader.count() or 'no'} frames, numbered from 0, and none from frame "
+                f"{wanted[start:].start} on: give an earlier first frame, or another source"
             )
         height, width = self._first.image.shape[:2]
-        super().__init__(name, rate / (part.step or 1), (width, height))
+        super().__init__(name, reader.rate / (part.step or 1), (width, height))
+        self.pixel_aspect = reader.pixel_aspect
 
     @cached_property
     def frames(self) -> int | None:
-        total = self._total()
+        total = self._reader.count()
         return len(range(total)[self._part]) if total else None
 
     @property
     def counters(self) -> dict[str, float]:
         """`damaged`: number of packets, which is that of their frames, that were left out."""
-        return {"damaged": self._video.damaged} if self._video is not None and self._video.damaged else {}
+        return {"damaged": self._reader.damaged} if self._reader.damaged else {}
 
     def __next__(self) -> Frame:
         if self._first is not None:
@@ -178,33 +164,39 @@ def open_source(
             "standard input is not a source, because a restarted process cannot read it again: "
             "write the video to a file, or serve it as a stream"
         )
-    path = Path(source_text(text))
-    images = partial(_open_images, part=part, start=start, settings=settings)
-    video = partial(_open_video, part=part, start=start, settings=settings)
     try:
-        if path.is_dir():
-            return _open_folder(path, images, video)
-        if path.is_file():
-            return video(path)
-        if re.search(r"%0?\d*d|[*?\[]", path.name):
-            return images(path.parent.resolve().name, image_files(path))
+        name, reader = _opened(Path(source_text(text)), settings)
     except OSError as error:
         raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_EXPECTED}") from None
+    return _FileSource(name, reader, part, start)
+
+
+def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
+    """Open a file, a folder or a pattern; return its name for results, and what reads it."""
+    if path.is_dir():
+        name = path.resolve().name
+        for folder in (*(path / inner for inner in _FOLDERS), path):
+            if folder.is_dir() and _visible(folder, IMAGES):
+                return name, _Images(image_files(folder), settings)
+        videos = _visible(path, VIDEOS)
+        if len(videos) == 1:
+            return videos[0].stem, _Video(videos[0], settings)
+        content = f"{len(videos)} videos" if videos else "neither images nor a video"
+        raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
+    if path.is_file():
+        return path.stem, _Video(path, settings)
+    if re.search(r"%0?\d*d|[*?\[]", path.name):
+        return path.parent.resolve().name, _Images(image_files(path), settings)
     if path.exists():
         raise VideoError(
-            f"{str(text)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
+            f"{str(path)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
             "write the video to a file, or serve it as a stream"
         )
-    raise VideoError(f"there is no video or folder {str(text)!r}: {_EXPECTED}")
+    raise VideoError(f"there is no video or folder {str(path)!r}: {_EXPECTED}")
 
 
 def source_text(source: object) -> str:
-    """The text of a source that a program has given; of a file:// address its path.
-
-    Raises
-    ------
-    VideoError
-        If it is neither a path, an address nor a number, or if the address names another machine.
+    """The text of a source that a program has given; of a file:// address of this machine its path.
 
     >>> source_text("file:///videos/a%20walk.mp4"), source_text(Path("walk.mp4")), source_text(0)
     ('/videos/a walk.mp4', 'walk.mp4', '0')
@@ -224,13 +216,7 @@ def source_text(source: object) -> str:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the image files in a folder, or those that match a pattern (%05d, *), in natural order.
-
-    Raises
-    ------
-    VideoError
-        If there are no images.
-    """
+    """Return the image files in a folder, or those that match a pattern (%05d, *), in natural order, at least one."""
     if path.is_dir():
         files = _visible(path, IMAGES)
     elif number := re.search(r"%0?(\d*)d", path.name):
@@ -256,37 +242,33 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _open_folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
-    name = path.resolve().name
-    for folder in (*(path / inner for inner in _FOLDERS), path):
-        if folder.is_dir() and _visible(folder, IMAGES):
-            return images(name, image_files(folder))
-    videos = _visible(path, VIDEOS)
-    if len(videos) == 1:
-        return video(videos[0])
-    content = f"{len(videos)} videos" if videos else "neither images nor a video"
-    raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
+class _Images:
+    """Image files that are read as frames."""
 
+    damaged, pixel_aspect = 0, Fraction(1)
 
-def _open_images(name: str, files: list[Path], *, part: slice, start: int, settings: RunSettings) -> Source:
-    frames = _read_images(files, range(len(files))[part], start, settings)
-    return _FileSource(name, frames, lambda: len(files), part, start, settings.image_rate)
+    def __init__(self, files: list[Path], settings: RunSettings) -> None:
+        self.files, self.settings, self.rate = files, settings, settings.image_rate
 
+    def count(self) -> int:
+        return len(self.files)
 
-def _read_images(files: list[Path], wanted: range, start: int, settings: RunSettings) -> Generator[Frame]:
-    def read(number: int) -> np.ndarray:
-        image = read_image(files[number])
+    def frames(self, wanted: range, start: int) -> Generator[Frame]:
+        """Yield the frames with these numbers, from the one at index `start` on."""
+        numbers, resize = range(len(self.files))[wanted.start : wanted.stop : wanted.step], self.settings.resize
+        # The size is that of the first image of the run, if it is resumed too.
+        shape = self._read(numbers[0]).shape if resize and start and numbers else None
+        for index, number in enumerate(numbers[start:], start):
+            image = self._read(number)
+            shape = shape or image.shape
+            yield Frame(index, number / self.rate, _of_one_size(image, shape, resize, self.files[number], number))
+
+    def _read(self, number: int) -> np.ndarray:
+        image = read_image(self.files[number])
         if image is None:
-            raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
+            name = str(self.files[number])
+            raise VideoError(f"cannot read the image {name!r} (frame {number}): replace or remove it")
         return image
-
-    # The size is that of the first image of the run, if it is resumed too.
-    shape = read(wanted[0]).shape if settings.resize and start and wanted else None
-    for count, number in enumerate(wanted[start:], start):
-        image = read(number)
-        shape = shape or image.shape
-        image = _of_one_size(image, shape, settings.resize, files[number], number)
-        yield Frame(count, number / settings.image_rate, image)
 
 
 def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: Path, number: int) -> np.ndarray:
@@ -327,22 +309,8 @@ def prepare() -> None:
     import av.video.reformatter  # noqa: F401
 
 
-def _open_video(path: Path, *, part: slice, start: int, settings: RunSettings) -> Source:
-    video = _Video(path, settings)
-    source = _FileSource(
-        path.stem, video.frames(range(sys.maxsize)[part], start), video.count, part, start, video.rate, video
-    )
-    source.pixel_aspect = video.stream.sample_aspect_ratio or source.pixel_aspect
-    return source
-
-
 class _Video:
-    """A video file that is read once.
-
-    stream   its stream of pictures
-    rate     frames per second
-    damaged  number of packets that were left out
-    """
+    """A video file that is read once. `damaged` is the number of packets that were left out."""
 
     def __init__(self, path: Path, settings: RunSettings) -> None:
         import av  # imported here because it takes 0.1 s and folders do not need it
@@ -363,6 +331,7 @@ class _Video:
         # of decoding only, and FFmpeg gives them to pictures that are in another order.
         has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
         self._is_avi = self.container.format.name == "avi"
+        self.pixel_aspect = self.stream.sample_aspect_ratio or Fraction(1)
         self._clock = ("dts" if self._is_avi else "pts") if has_times else ""
         self.rate = float((has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
 
