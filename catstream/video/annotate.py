@@ -26,7 +26,7 @@ _Point = tuple[float, float]
 _Colour = tuple[int, int, int]
 
 _COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
-_WHITE, _GREY, _DARK, _BLACK = (245, 245, 245), (110, 110, 110), (32, 32, 32), (17, 17, 17)
+_WHITE, _DARK, _BLACK = (245, 245, 245), (32, 32, 32), (17, 17, 17)
 _ORANGE = (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -68,8 +68,8 @@ class Colours:
 def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.ndarray:
     """Draw the boxes over a copy of a frame, and a line of text below it.
 
-    An object that is alone and has no name is drawn in the colour of its state; its state, score and model version are
-    below the frame. Other objects have a colour each and their names at their boxes; their scores are below the frame.
+    An object that is alone and has no name is drawn in the colour of its state. Other objects have a colour each and
+    their names at their boxes. Their scores are below the frame.
 
     Parameters
     ----------
@@ -95,10 +95,7 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
     for track, colour in drawn:  # over all boxes
         if track.box is not None:
             _draw_name(picture, track, colour, unit)
-    if is_alone:
-        _draw_text(canvas[height:], *drawn[0], unit)
-    else:
-        _draw_scores(canvas[height:], drawn, unit)
+    _draw_scores(canvas[height:], drawn, unit)
     return canvas
 
 
@@ -237,17 +234,16 @@ def _write(canvas: np.ndarray, text: str, left: int, unit: float) -> None:
 
 def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
     """Write the name and score of each object, with a ring in place of the disc if it is absent, and the frame number;
-    if there is not enough room, the number of objects that are left out."""
-    height, width = canvas.shape[:2]
+    if there is not enough room, the number of objects that are left out. An object without a name has its state."""
+    width = canvas.shape[1]
     canvas[:] = _DARK
-    middle = height // 2
-    gap, left = round(12 * unit), round(8 * unit)
+    middle, gap, left = canvas.shape[0] // 2, round(12 * unit), round(8 * unit)
     end = f"frame {drawn[0][0].frame}"
     right = width - _text_width(end, unit) - gap
     if right > left:
         _write(canvas, end, right, unit)
     for count, (track, colour) in enumerate(drawn):
-        text, rest = f"{_plain(track.object)} {track.score:.2f}".strip(), f"+{len(drawn) - count}"
+        text, rest = f"{_plain(track.object) or track.state} {track.score:.2f}", f"+{len(drawn) - count}"
         is_last = count == len(drawn) - 1
         if left + gap + _text_width(text, unit) + (0 if is_last else gap + _text_width(rest, unit)) > right - gap:
             if left + _text_width(rest, unit) < right:
@@ -257,25 +253,3 @@ def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], uni
         cv2.circle(canvas, (left + round(4 * unit), middle), round(4 * unit), colour, disc, cv2.LINE_AA)
         _write(canvas, text, left + gap, unit)
         left += 2 * gap + _text_width(text, unit)
-
-
-def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
-    """Draw the state, the score as a bar and a number, the model version and the frame number; in a narrow image only
-    the first of these."""
-    height, width = canvas.shape[:2]
-    canvas[:] = _DARK
-    middle = height // 2
-    cv2.circle(canvas, (round(14 * unit), middle), round(5 * unit), colour, cv2.FILLED, cv2.LINE_AA)
-    _write(canvas, track.state, round(26 * unit), unit)
-    bar, right, half, score = round(132 * unit), round(222 * unit), max(2, round(3 * unit)), f"{track.score:.2f}"
-    number = right + round(8 * unit)
-    if number + _text_width(score, unit) > width:
-        return
-    filled = bar + round((right - bar) * min(max(track.score, 0.0), 1.0))
-    cv2.rectangle(canvas, (bar, middle - half), (right, middle + half), _GREY, cv2.FILLED)
-    cv2.rectangle(canvas, (bar, middle - half), (filled, middle + half), colour, cv2.FILLED)
-    _write(canvas, score, number, unit)
-    end = f"model {track.model_version}   frame {track.frame}"
-    start = width - _text_width(end, unit) - round(10 * unit)
-    if start > number + _text_width(score, unit):
-        _write(canvas, end, start, unit)
