@@ -13,6 +13,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from catstream.applications.loadtest import crowd
+from catstream.applications.loadtest.broadcast import Broadcast, Schedule
 from catstream.applications.loadtest.plan import Plan
 from catstream.box import Box
 from catstream.errors import ServiceError
@@ -20,8 +22,7 @@ from catstream.messages.names import UNNAMED
 from catstream.numerics.arrays import Float64
 from catstream.services.loop import die_with
 from catstream.services.start import SPAWN, sigint_blocked
-from catstream.video import crowd, rendered
-from catstream.video.broadcast import Broadcast, Schedule
+from catstream.video import rendered
 from catstream.video.frames import jpeg
 
 _QUALITY = 90  # of JPEG, as network cameras use it

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from catstream.applications.evaluation.metrics import overlaps
+from catstream.applications.loadtest.broadcast import Schedule
 from catstream.applications.loadtest.observer import Observations
 from catstream.numerics.arrays import Float64
-from catstream.video.broadcast import Schedule
 
 #: The percentiles of latencies that are reported, by name.
 PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from catstream.applications.loadtest import crowd
 from catstream.errors import SettingsError
 from catstream.messages.names import check_count, counted
 from catstream.settings import Settings
-from catstream.video import crowd, rendered
+from catstream.video import rendered
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from time import monotonic
 
 import numpy as np
 
+from catstream.applications.loadtest.broadcast import Schedule
 from catstream.applications.loadtest.camera import Camera
 from catstream.applications.loadtest.measures import Measures, measure
 from catstream.applications.loadtest.observer import Observations, observed
@@ -20,7 +21,6 @@ from catstream.applications.loadtest.subscribers import Subscribers
 from catstream.applications.loadtest.usage import REST, Usage, UsageReading, summary
 from catstream.errors import ServiceError
 from catstream.numerics.arrays import Float64
-from catstream.video.broadcast import Schedule
 
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
