@@ -61,9 +61,7 @@ class LiveSource(Source):
 
     live = True
 
-    def __init__(
-        self, text: str, start: int = 0, *, since: float | None = None, idle: Callable[[], bool] | None = None
-    ) -> None:
+    def __init__(self, text: str, start: int, *, since: float | None, idle: Callable[[], bool] | None) -> None:
         super().__init__(_name(text), RATE, (0, 0))
         self.skipped = self.reopened = 0
         self._text, self._address = text, without_password(text)

@@ -22,7 +22,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.video import rendered
-from catstream.video.frames import RATE, Frame, Source
+from catstream.video.frames import Frame, Source
 
 #: Sources that begin with this are live demos.
 PREFIX = "demo:"
@@ -50,24 +50,12 @@ def first_box(text: str) -> Box:
 
 
 class LiveDemo(Source):
-    """The newest frame of the demo video at each iteration. `catstream.video.source.open_source` opens one.
-
-    Raises
-    ------
-    VideoError
-        From the constructor, if the text names no live demo.
-    """
+    """The newest frame of the demo video at each iteration. `catstream.video.source.open_source` opens one."""
 
     live = True
 
     def __init__(
-        self,
-        text: str,
-        start: int = 0,
-        rate: float = RATE,
-        *,
-        since: float | None = None,
-        idle: Callable[[], bool] | None = None,
+        self, text: str, start: int, rate: float, *, since: float | None, idle: Callable[[], bool] | None
     ) -> None:
         self._seed = _seed(text)
         super().__init__(f"demo-{self._seed}", rate, _SIZE)

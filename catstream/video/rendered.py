@@ -87,9 +87,7 @@ _PAGODA = np.array(
 )  # fmt: skip
 
 
-def render(
-    frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0
-) -> Iterator[tuple[np.ndarray, Box | None]]:
+def render(frames: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Iterator[tuple[np.ndarray, Box | None]]:
     """Yield the first images of a `Demo` in order, each with the box of the dahlia; the parameters are those of it."""
     yield from map(Demo(size, seed).image, range(frames))
 
@@ -102,20 +100,8 @@ def write(
 ) -> tuple[Path, list[Box | None]]:
     """Render into a folder: demo.mp4 and groundtruth_rect.txt, as `catstream evaluate` reads them.
 
-    Parameters
-    ----------
-    folder : folder to write to; it is made if it does not exist
-    frames, size : as in `render`
-    done : function that is called with the number of frames written so far
-
-    Returns
-    -------
-    path of the video, and the box of the object in each frame, None if it is absent
-
-    Raises
-    ------
-    VideoError
-        If the folder cannot be written to.
+    `done` is called with the number of frames written so far. Returns the path of the video, and the box of the object
+    in each frame, None if it is absent. Raises VideoError if the folder cannot be written to.
     """
     path, truth = folder / "demo.mp4", []
     with VideoWriter(path, RATE, size) as video:
@@ -181,10 +167,7 @@ def _interpolate(keys: np.ndarray) -> np.ndarray:
 
 
 def load_photograph(name: str) -> np.ndarray:
-    """Load a photograph that scikit-learn ships as float32 BGR.
-
-    The file is read without an import of scikit-learn, which takes seconds and whose own loader needs Pillow.
-    """
+    """Load a photograph that scikit-learn ships as float32 BGR, without its import, which takes seconds."""
     package = find_spec("sklearn")
     if package is None or package.origin is None:
         raise ImportError("scikit-learn is a dependency of catstream and not installed: pip install scikit-learn")
@@ -208,10 +191,8 @@ class Sprite:
     def turned(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
         """Return the affine map from the sprite to the picture, float64 (2, 3).
 
-        Parameters
-        ----------
-        place : x and y of the centre in the scene, size of the whole sprite in pixels, angle in degrees
-        view : map from the scene to the picture, a shift
+        `place` has x and y of the centre in the scene, the size of the whole sprite in pixels, and the angle in
+        degrees; `view` maps the scene to the picture, by a shift.
         """
         (x, y, diameter, angle), side = place, self.mask.shape[0]
         turn = cv2.getRotationMatrix2D((side / 2, side / 2), angle, diameter / side)
@@ -224,12 +205,9 @@ class Sprite:
         return Box(*map(float, (*low, *(high - low))))
 
     def paint(self, image: np.ndarray, turn: np.ndarray, free: np.ndarray) -> float:
-        """Paint the unoccluded part of the object; return the visible share of the object.
+        """Paint the part of the object that nothing occludes into an image, float32 (h, w, 3); return its share.
 
-        Parameters
-        ----------
-        image : float32 (h, w, 3), is changed
-        free : float32 (h, w), 1 for pixels in which nothing occludes the object
+        `free`, float32 (h, w), is 1 for pixels in which nothing occludes the object.
         """
         height, width = image.shape[:2]
         low, high = self._limits(turn)
@@ -251,13 +229,7 @@ class Sprite:
 
 
 class Lake:
-    """The picture of the lake over which sprites move, and the sensor noise of the camera.
-
-    Parameters
-    ----------
-    zoom : enlargement of the photograph
-    rng : random numbers of the noise
-    """
+    """The picture of the lake, enlarged, over which sprites move, and the sensor noise of the camera."""
 
     def __init__(self, zoom: float, rng: np.random.Generator) -> None:
         photograph = load_photograph("china")

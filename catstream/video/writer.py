@@ -23,8 +23,8 @@ _LARGE_PIXELS = 1920 * 1200
 class VideoWriter:
     """Writes an MP4; a context manager, which leaves no file if an error or Ctrl-C ends its block.
 
-    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed, and gets its final
-    name then. If no frame was written, or writing failed, no file is left: an MP4 without its index cannot be read.
+    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed. If no frame was
+    written, or writing failed, no file is left: an MP4 without its index cannot be read.
 
     Parameters
     ----------

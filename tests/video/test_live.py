@@ -129,7 +129,9 @@ def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_pa
         server.daemon_threads = True
         threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
         with open_source(f"http://127.0.0.1:{server.server_port}/a.ts") as source:
+            began = time.monotonic()
             until(lambda: source.reopened)
+            assert time.monotonic() - began < 20, "the sound lasts longer"
         server.shutdown()
     assert "(no frame arrives)" in caplog.text
 
