@@ -114,9 +114,9 @@ def images(tmp_path: Path) -> Callable[..., Path]:
 
     def write(folder: str, names: list[str] | int) -> Path:
         path = tmp_path / folder
-        path.mkdir(parents=True)
         for number, name in enumerate([f"{k}.png" for k in range(names)] if isinstance(names, int) else names):
-            cv2.imwrite(str(path / name), numbered(number))
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            (path / name).write_bytes(cv2.imencode(Path(name).suffix, numbered(number))[1].tobytes())
         return path
 
     return write
@@ -355,47 +355,65 @@ def test_a_closed_source_has_no_frames(video):
 
 # --- images ------------------------------------------------------------------------------------------
 
+SEVEN = [f"{number:05d}.png" for number in range(7)]
+LATIN = os.fsdecode(b"caf\xe9")
+#: Names of images, what is opened, and the numbers of the images that are read.
+OPENED = {
+    "in natural order": ([f"{number}.png" for number in range(12)], "walk", list(range(12))),
+    **{pattern: (SEVEN, f"walk/{pattern}", list(range(7))) for pattern in ("%05d.png", "%d.png", "*.png", "000??.png")},
+    "a class of letters": (SEVEN, "walk/0000[2-4].png", [2, 3, 4]),
+    "names that match": (["left1.png", "left2.png", "right1.png", "right2.png"], "walk/right%d.png", [2, 3]),
+    **{
+        inner: ([f"{inner}/1.jpg", f"{inner}/2.jpg", "else/3.jpg"], "walk", [0, 1]) for inner in ("img", "color", "rgb")
+    },
+    "without hidden files": ([".0000.png", "0001.png"], "walk", [1]),
+    "digits that are not decimal": (["²2.png", "²10.png"], "walk", [0, 1]),
+    "names that are not UTF-8": ([f"{LATIN}/1{LATIN}.png", f"{LATIN}/2{LATIN}.png"], f"walk/{LATIN}", [0, 1]),
+}
 
-def test_images_of_a_folder_are_read_in_natural_order(images):
-    folder = images("walk", 12)
-    source = open_source(folder)
-    assert (source.name, source.frames, source.size) == ("walk", 12, (160, 120))
-    assert numbers(source) == list(range(12))
 
-
-@pytest.mark.parametrize("pattern", ["%05d.png", "%d.png", "*.png", "000??.png", "0000[0-9].png"])
-def test_patterns_of_both_kinds(images, pattern):
-    folder = images("walk", [f"{number:05d}.png" for number in range(7)])
+@pytest.mark.parametrize(("names", "opened", "wanted"), OPENED.values(), ids=OPENED)
+def test_the_images_of_a_folder_or_a_pattern_are_read_in_order(images, names, opened, wanted):
+    folder = images("walk", names)
     (folder / "note.txt").write_text("not an image")
-    source = open_source(folder / pattern)
-    assert source.name == "walk"
-    assert numbers(source) == list(range(7))
+    with open_source(folder.parent / opened, image_rate=10.0) as source:
+        assert (source.frames, source.size, source.rate) == (len(wanted), (160, 120), 10)
+        assert source.name == (LATIN if LATIN in opened else "walk")
+        frames = list(source)
+        assert list(source) == []
+    assert [number_of(frame.image) for frame in frames] == wanted
+    assert [frame.time for frame in frames] == pytest.approx([number / 10 for number in range(len(wanted))])
 
 
-def test_a_pattern_selects_only_the_names_that_match_it(images):
-    folder = images("walk", ["left1.png", "left2.png", "right1.png", "right2.png"])
-    assert numbers(open_source(folder / "right%d.png")) == [2, 3]
+def test_a_folder_opens_by_its_only_video(video, tmp_path):
+    path = video("a.MTS", frames=2)
+    for name in ("._a.avi", "._cover.jpg", "groundtruth_rect.txt"):
+        (tmp_path / name).write_bytes(b"no video")
+    assert numbers(open_source(tmp_path)) == numbers(open_source(path.as_uri())) == [0, 1]
+    video("b.avi", frames=1)
+    with pytest.raises(VideoError, match="2 videos"):
+        open_source(tmp_path)
 
 
-@pytest.mark.parametrize("inner", ["img", "imgs", "color", "rgb"])
-def test_a_sequence_folder_opens_by_its_images(images, inner):
-    images(f"walk/{inner}", ["0001.jpg", "0002.jpg"])
-    source = open_source(images("walk/else", []).parent)
-    assert source.name == "walk"
-    assert numbers(source) == [0, 1]
+HUGE = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
+UNREADABLE = {
+    "of another size": (cv2.imencode(".png", numbered(3, width=150))[1].tobytes(), ["150x120", "160x120", "--resize"]),
+    "a text": (b"nothing", ["cannot read the image", "(frame 3): replace or remove it"]),
+    "empty": (b"", ["cannot read the image"]),
+    "a JPEG that is cut off": (cv2.imencode(".jpg", numbered(3))[1].tobytes()[:-500], ["cannot read the image"]),
+    "of more pixels than OpenCV reads": (HUGE, ["cannot read the image"]),
+    "of floats": (cv2.imencode(".tiff", np.zeros((20, 30, 3), np.float32))[1].tobytes(), ["cannot read the image"]),
+}
 
 
-def test_a_sequence_folder_opens_by_its_only_video(video, tmp_path):
-    folder = tmp_path / "walk"
-    folder.mkdir()
-    video("a.avi", frames=3).rename(folder / "a.avi")
-    (folder / "groundtruth_rect.txt").write_text("1,2,3,4\n" * 3)
-    assert numbers(open_source(folder)) == [0, 1, 2]
-
-
-def test_hidden_files_are_not_frames(images):
-    folder = images("walk", [".0000.png", "0001.png"])
-    assert numbers(open_source(folder)) == [1]
+@pytest.mark.parametrize(("content", "words"), UNREADABLE.values(), ids=UNREADABLE)
+def test_the_first_image_that_cannot_be_used_is_named(images, capfd, content, words):
+    folder = images("walk", 5)
+    (folder / "3.png").write_bytes(content)
+    good, message = broken(folder)
+    assert good == [0, 1, 2]
+    assert all(word in message for word in ["3.png", *words])
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("part", [slice(None), *PARTS], ids=str)
@@ -413,53 +431,10 @@ def test_a_part_with_a_negative_step_is_an_error(images, part):
         open_source(images("walk", ["0.png"]), part=part)
 
 
-def test_a_part_without_frames_is_an_error_with_the_number_of_frames(images):
-    with pytest.raises(VideoError, match="has 9 frames, numbered from 0, and none from frame 9 on: give an earlier"):
-        open_source(images("walk", 9), part=slice(9, 20))
-
-
 @pytest.mark.parametrize("part", [slice(5, 5), slice(7, 5), slice(0)], ids=str)
 def test_a_part_that_ends_before_it_starts_is_an_error_about_the_end(images, part):
     with pytest.raises(VideoError, match=f"before {part.stop}: give an end after the start"):
         open_source(images("walk", 9), part=part)
-
-
-def test_a_folder_of_images_has_the_rate_that_is_given(images):
-    folder = images("walk", 3)
-    with open_source(folder, image_rate=10.0) as source:
-        assert source.rate == 10
-        assert [frame.time for frame in source] == [0.0, 0.1, 0.2]
-
-
-def test_hidden_files_do_not_hide_the_only_video(video, tmp_path):
-    video("a.avi", frames=2)
-    for name in ("._a.avi", "._cover.jpg"):  # as macOS writes them
-        (tmp_path / name).write_bytes(b"no video")
-    assert numbers(open_source(tmp_path)) == [0, 1]
-
-
-def test_a_digit_that_is_no_decimal_one_is_a_letter(images):
-    assert numbers(open_source(images("walk", ["²2.png", "²10.png"]))) == [0, 1]
-
-
-def test_an_image_of_more_pixels_than_opencv_reads_is_an_error(tmp_path):
-    blank = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
-    (tmp_path / "0.bmp").write_bytes(blank)
-    with pytest.raises(VideoError, match=r"cannot read the image .*0\.bmp"):
-        open_source(tmp_path)
-
-
-def test_a_jpeg_that_is_cut_off_is_an_error_that_names_it(images):
-    folder = images("walk", ["0.jpg", "1.jpg", "2.jpg"])
-    (folder / "2.jpg").write_bytes((folder / "2.jpg").read_bytes()[:-500])
-    good, message = broken(folder)
-    assert good == [0, 1]
-    assert "2.jpg' (frame 2): replace or remove it" in message
-
-
-def test_a_folder_of_images_may_have_a_name_that_is_not_utf_8(images):
-    folder = images("walk", 3)
-    assert numbers(open_source(folder.rename(folder.with_name(os.fsdecode(b"caf\xe9"))))) == [0, 1, 2]
 
 
 def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):
@@ -480,18 +455,6 @@ def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):
         assert numbers(source) == [7]
 
 
-def test_a_file_address_names_a_file_of_this_machine(images):
-    folder = images("a walk", ["0.png", "1.png"])
-    assert numbers(open_source(folder.as_uri())) == [0, 1]
-
-
-def test_opencv_prints_no_warning_for_an_unreadable_image(tmp_path, capfd):
-    cv2.imwrite(str(tmp_path / "0.tiff"), np.zeros((20, 30, 3), np.float32))
-    with pytest.raises(VideoError, match=r"cannot read the image .*0\.tiff"):
-        open_source(tmp_path)
-    assert capfd.readouterr().err == ""
-
-
 def test_grey_images_are_expanded(tmp_path):
     cv2.imwrite(str(tmp_path / "0.png"), np.full((20, 30), 77, np.uint8))
     with open_source(tmp_path) as source:
@@ -499,22 +462,6 @@ def test_grey_images_are_expanded(tmp_path):
     assert image.shape == (20, 30, 3)
     assert image.dtype == np.uint8
     assert (image == 77).all()
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (cv2.imencode(".png", numbered(3, width=150))[1].tobytes(), ["150x120", "160x120"]),
-        (b"nothing", ["cannot read the image"]),
-    ],
-    ids=["of another size", "unreadable"],
-)
-def test_the_first_image_that_cannot_be_used_is_named(images, content, words):
-    folder = images("walk", 5)
-    (folder / "3.png").write_bytes(content)
-    good, message = broken(folder)
-    assert good == [0, 1, 2]
-    assert all(word in message for word in ["3.png", *words])
 
 
 def test_images_before_the_first_frame_are_not_read(images):
@@ -555,10 +502,3 @@ def test_what_is_no_source_is_an_error_that_names_the_alternatives(tmp_path, mon
     os.mkfifo(tmp_path / "pipe.mpg")
     with pytest.raises(VideoError, match=message):
         open_source(place)
-
-
-def test_a_folder_with_two_videos_is_an_error(video, tmp_path):
-    video("a.avi", frames=1)
-    video("b.avi", frames=1)
-    with pytest.raises(VideoError, match="2 videos"):
-        open_source(tmp_path)
