@@ -369,34 +369,39 @@ class _Video:
         """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next key frame."""
         import av
 
-        decoder, good, waits_for_key = self.stream.codec_context, 0, False
+        decoder, skip, good = self.stream.codec_context, self.settings.skip_damaged, 0
+        waits_for_key = is_spoilt = False  # of the packets after an error, and of the frames after a damaged one
         for packet in self._packets():
             if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
                 self.damaged += 1
                 continue
             frames: list[VideoFrame] = []
-            problem, waits_for_key = packet if isinstance(packet, str) else "", False
+            problem = packet if isinstance(packet, str) else ""
             try:
                 frames = [] if problem else decoder.decode(packet)
             except av.FFmpegError as error:
                 problem = ffmpeg_reason(error)
-            if problem and self.settings.skip_damaged:  # the decoder still holds frames before it
-                with contextlib.suppress(av.FFmpegError):
+            waits_for_key = bool(problem)
+            if problem and skip:
+                self.damaged += 1
+                with contextlib.suppress(av.FFmpegError):  # the decoder still holds frames before it
                     frames = decoder.decode(None)
+                decoder.flush_buffers()
             for frame in frames:
-                if frame.is_corrupt:
-                    problem = problem or "its picture is damaged"
+                is_spoilt = frame.is_corrupt or (is_spoilt and not frame.key_frame)
+                if is_spoilt and not skip:
+                    problem = "its picture is damaged"
                     break
-                yield frame
-                good += 1
-            if problem and not self.settings.skip_damaged:
+                if is_spoilt:
+                    self.damaged += 1
+                else:
+                    yield frame
+                    good += 1
+            if problem and not skip:
                 raise VideoError(
                     f"{str(self.path)!r} is damaged at frame {good} ({problem}): "
                     "--skip-damaged (run.skip_damaged=true) continues at the next key frame"
                 )
-            if problem:
-                self.damaged, waits_for_key = self.damaged + 1, True
-                decoder.flush_buffers()
 
     def _packets(self) -> Iterator[Packet[Any] | str | None]:
         """Yield the packets that hold data, the reason of each error of the container, and None at the end."""

@@ -301,6 +301,17 @@ def test_joined_segments_are_read_to_the_end_and_time_goes_on(video, tmp_path, n
     assert [time for _, time in found] == pytest.approx([number / 25 for number in range(90)], abs=0.002)
 
 
+def test_the_whole_segment_after_a_torn_one_is_read(video):
+    path = video("a.ts", 30, options={"v:bf": "2"})
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 376 * 188] + whole)
+    with open_source(path, skip_damaged=True) as source:
+        found = [number_of(frame.image) for frame in source]
+        assert 0 < source.counters["damaged"] < 4
+    assert found[-30:] == list(range(30))
+    assert len(found) > 40
+
+
 def test_a_stream_without_a_container_has_the_rate_that_it_states(video):
     path = video("a.h264", 20, options={"v:x264-params": "fps=50/1:force-cfr=1"})
     with open_source(path) as source:
