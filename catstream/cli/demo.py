@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from catstream.cli.output import line_of, messages
+from catstream.cli.common import line_of, messages
 from catstream.cli.track import track
 from catstream.services.options import PATH
 
@@ -44,7 +44,7 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
 
         click.echo(first_box(live))
         return
-    from catstream.applications.evaluation.metrics import score
+    from catstream.applications.evaluation.scores import score
     from catstream.video.rendered import write
 
     with line_of(messages()) as bar:
