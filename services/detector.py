@@ -38,8 +38,7 @@ from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
 from catstream.services.timing import CLOSE_SECONDS, MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
 from catstream.video import source
-from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame, Source, without_password
+from catstream.video.frames import Frame, Source, read_ahead, without_password
 from catstream.video.source import is_live, open_source
 from catstream.wire.channels import CONTROL, MODELS
 from catstream.wire.commands import Responder
@@ -202,9 +201,7 @@ class DetectorLoop:
                 part=job.part,
                 since=job.since,
                 idle=self._idle,
-                image_rate=settings.run.image_rate,
-                skip_damaged=settings.run.skip_damaged,
-                resize=settings.run.resize,
+                settings=settings.run,
             )
         )
         if not self._source.live:

@@ -44,6 +44,7 @@ IMPORTERS = {
         "catstream/detection",
         "catstream/paper",
         "catstream/video",
+        "catstream/applications/loadtest/crowd.py",
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
         "services/detector.py",
@@ -51,13 +52,13 @@ IMPORTERS = {
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/compiler.py"],
     "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
-    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
+    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/objects.py"],
     "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
-    "av": ["catstream/video"],
+    "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
     "zmq": [
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",

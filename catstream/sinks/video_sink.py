@@ -8,9 +8,8 @@ from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, Sink, TrackedFrame
-from catstream.video.annotate import draw, drawn_size, preview_image
+from catstream.video.annotate import Colours, draw, drawn_size, preview_image
 from catstream.video.frames import RATE
-from catstream.video.palette import Colours
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 
@@ -34,7 +33,8 @@ class SourceVideo:
         )
         self._colours = Colours()
         try:
-            self._video = VideoWriter(place, self._frames.rate, drawn_size(self._frames.size))
+            aspect = self._frames.pixel_aspect
+            self._video = VideoWriter(place, self._frames.rate, drawn_size(self._frames.size), pixel_aspect=aspect)
         except VideoError:
             self._frames.close()
             raise

@@ -22,7 +22,7 @@ from catstream.messages.kinds import ObjectPosition, Position, Track
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
 from catstream.sinks.run_files import RunFiles, places_of
 from catstream.sinks.track_log import read_frames
-from catstream.video.demo import write
+from catstream.video.rendered import write
 from catstream.video.source import open_source
 
 BOX = Box(10.0, 20.0, 30.5, 40.0)

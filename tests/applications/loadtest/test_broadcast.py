@@ -10,8 +10,8 @@ import urllib.request
 import numpy as np
 import pytest
 
-from catstream.video.broadcast import Broadcast, Schedule
-from catstream.video.image import jpeg
+from catstream.applications.loadtest.broadcast import Broadcast, Schedule
+from catstream.video.frames import jpeg
 from catstream.video.source import open_source
 
 SIZE = (64, 48)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.video.crowd import NAMES, SIZE, render, write
+from catstream.applications.loadtest.crowd import NAMES, SIZE, render
 
 
 def test_the_same_arguments_give_the_same_pixels():
@@ -30,11 +30,3 @@ def test_some_objects_leave_and_come_back():
     assert seen[0]
     assert seen[-1]
     assert not all(seen)
-
-
-def test_the_truth_is_written_for_motchallenge(tmp_path):
-    video, truth = write(tmp_path, 2, 3)
-    rows = np.loadtxt(tmp_path / "groundtruth.txt", delimiter=",")
-    assert video.exists()
-    assert rows.shape == (6, 9)
-    assert rows[1, 2:6] == pytest.approx(truth[0]["ben"], abs=1e-3)

@@ -1,12 +1,15 @@
-"""What is taken as an image, and what is not."""
+"""What is taken as an image, and what is not; and reading ahead."""
 
 from __future__ import annotations
+
+import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
 
-from catstream.errors import FrameError
-from catstream.video.image import as_bgr
+from catstream.errors import FrameError, VideoError
+from catstream.video.frames import Frame, Source, as_bgr, read_ahead
 
 
 @pytest.fixture
@@ -71,3 +74,47 @@ def test_an_array_that_is_no_image_is_one_line_of_error_with_a_remedy(image, tol
     with pytest.raises(FrameError, match=told) as error:
         as_bgr(image)
     assert "\n" not in str(error.value)
+
+
+class Numbers(Source):
+    """So many frames, then what is wrong with the next one."""
+
+    def __init__(self, count, problem=None):
+        super().__init__("numbers", 25.0, (8, 8))
+        self.read, self.readers = 0, set()
+        self._count, self._problem = count, problem
+
+    def __next__(self):
+        self.readers.add(threading.current_thread().name)
+        if self.read == self._count:
+            raise self._problem or StopIteration
+        self.read += 1
+        return Frame(self.read - 1, 0.0, np.zeros((8, 8, 3), np.uint8))
+
+    def close(self):
+        pass
+
+
+def test_frames_are_yielded_in_order_from_another_thread():
+    source = Numbers(5)
+    assert [frame.number for frame in read_ahead(source)] == [0, 1, 2, 3, 4]
+    assert len(source.readers) == 1
+    assert threading.current_thread().name not in source.readers
+
+
+def test_an_error_of_the_source_is_raised_after_the_frames_before_it():
+    frames = read_ahead(Numbers(2, VideoError("it breaks at frame 2")))
+    assert [next(frames).number, next(frames).number] == [0, 1]
+    with pytest.raises(VideoError, match="frame 2"):
+        next(frames)
+
+
+def test_at_most_one_frame_is_read_ahead_and_the_thread_ends_with_the_generator():
+    source = Numbers(50)
+    with closing(read_ahead(source)) as frames:
+        for frame in frames:
+            assert source.read <= frame.number + 2
+            if frame.number == 7:
+                break
+    (reader,) = source.readers
+    assert reader not in {thread.name for thread in threading.enumerate()}

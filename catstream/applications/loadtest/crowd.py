@@ -1,4 +1,4 @@
-"""Renders a test video of several objects with exact ground truth, from two photographs that scikit-learn ships.
+"""Renders a video of several objects with exact ground truth, from two photographs that scikit-learn ships.
 
 Dahlias of several colours and pieces of the photographs move over a picture of a lake while the camera pans. They turn,
 change their size, cross and occlude one another, and some of them leave the picture and come back. Objects 1 and 5,
@@ -7,19 +7,14 @@ change their size, cross and occlude one another, and some of them leave the pic
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from catstream.box import Box
-from catstream.video.sprite import SIZE, VISIBLE, Lake, Sprite, cut_out_dahlia, load_photograph, resized
-from catstream.video.writer import VideoWriter
-
-#: Number of frames, and frames per second.
-FRAMES, RATE = 300, 25.0
+from catstream.video.rendered import SIZE, VISIBLE, Lake, Sprite, cut_out_dahlia, load_photograph, resized
 
 #: Names of the objects, in the order in which they are painted: a later one is in front.
 NAMES = (
@@ -36,7 +31,7 @@ _PIECES = ((160, 150), (500, 320))  # corners of pieces of the photograph of the
 
 
 def render(
-    count: int, frames: int = FRAMES, size: tuple[int, int] = SIZE, seed: int = 0
+    count: int, frames: int, size: tuple[int, int] = SIZE, seed: int = 0
 ) -> Iterator[tuple[np.ndarray, dict[str, Box | None]]]:
     """Yield the images in order, each with the box of every object by name.
 
@@ -56,46 +51,6 @@ def render(
     scene = _Scene(count, frames, seed)
     for number in range(frames):
         yield resized(*scene.render(number), size)
-
-
-def write(
-    folder: Path,
-    count: int,
-    frames: int = FRAMES,
-    size: tuple[int, int] = SIZE,
-    done: Callable[[int], None] = lambda _: None,
-) -> tuple[Path, list[dict[str, Box | None]]]:
-    """Render into a folder: crowd.mp4, and groundtruth.txt with the columns of MOTChallenge; pixels count from 0.
-
-    Parameters
-    ----------
-    folder : folder to write to; it is made if it does not exist
-    count, frames, size : as in `render`
-    done : function that is called with the number of frames written so far
-
-    Returns
-    -------
-    path of the video, and the boxes of the objects in each frame
-
-    Raises
-    ------
-    VideoError
-        If the folder cannot be written to.
-    """
-    path, truth = folder / "crowd.mp4", []
-    with VideoWriter(path, RATE, size) as video:
-        for image, boxes in render(count, frames, size):
-            video.write(image)
-            truth.append(boxes)
-            done(len(truth))
-    lines = [
-        f"{frame + 1},{number + 1},{box.x:.3f},{box.y:.3f},{box.w:.3f},{box.h:.3f},1,1,1\n"
-        for frame, boxes in enumerate(truth)
-        for number, box in enumerate(boxes.values())
-        if box is not None
-    ]
-    (folder / "groundtruth.txt").write_text("".join(lines), encoding="ascii")
-    return path, truth
 
 
 class _Scene:
