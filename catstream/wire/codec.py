@@ -67,13 +67,7 @@ class _Envelope(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
 
 
 def encode(message: object, run: str = "") -> bytes:
-    """A message of a run as bytes.
-
-    Raises
-    ------
-    ProtocolError
-        If it breaks its schema.
-    """
+    """A message of a run as bytes; ProtocolError if it breaks its schema."""
     check_message(message)
     kind = type(message)
     data = _ENCODER.encode((VERSION, kind.__name__.lower(), getattr(message, "object", ""), run, message))
@@ -82,13 +76,7 @@ def encode(message: object, run: str = "") -> bytes:
 
 
 def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
-    """The message in `data`, one of `kinds`. Its arrays are read-only.
-
-    Raises
-    ------
-    ProtocolError
-        If it is anything else; the error has the expected and the received kind.
-    """
+    """The message in `data`, one of `kinds`, with read-only arrays; ProtocolError if it is anything else."""
     return decode_with_run(data, *kinds)[0]
 
 
@@ -131,13 +119,7 @@ def topic_of(data: bytes | memoryview) -> Topic:
 
 
 def decode_json(data: bytes, kind: type[Message]) -> Message:
-    """A message without arrays, from a JSON object of its fields.
-
-    Raises
-    ------
-    ProtocolError
-        If it is not JSON, or not the fields of a message of this kind within their limits.
-    """
+    """A message without arrays, from a JSON object of its fields; ProtocolError if it is anything else."""
     try:
         return msgspec.json.decode(data, type=kind)
     except _ERRORS as error:

@@ -39,12 +39,7 @@ Answer = TypeVar("Answer", bound=_HasId)
 
 
 class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
-    """Sends questions and receives their answers; it connects.
-
-    Parameters
-    ----------
-    channel : its first kind of message is the question, its second one the answer
-    """
+    """Sends questions, the channel's first kind of message, and receives answers, its second; it connects."""
 
     def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
@@ -97,7 +92,6 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
     Parameters
     ----------
-    channel : its first kind of message is the question, its second one the answer
     longest : bytes of a question at most
     """
 

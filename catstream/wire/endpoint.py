@@ -63,10 +63,7 @@ class Endpoint:
     def parse(cls, text: str, keys: str | Keys = "") -> Endpoint:
         """Read the settings `endpoint` and `keys`; the keys may have been loaded already.
 
-        Raises
-        ------
-        ServiceError
-            If one of them is not valid, or other machines can reach the host and there are no keys.
+        ServiceError if one of them is not valid, or if other machines can reach the host and there are no keys.
         """
         if not text:
             raise ServiceError("this process needs the endpoint of its pipeline: --set run.endpoint=FOLDER")
@@ -159,13 +156,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes.
-
-    Raises
-    ------
-    ServiceError
-        If no folder for temporary files can be written to.
-    """
+    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes."""
     if not (homes := _homes()):
         raise ServiceError("no folder for temporary files can be written to: set TMPDIR to one")
     for path, text in _notes(homes[:1], f"{_PREFIX}*/{_OWNER}"):
@@ -189,11 +180,6 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
     default : the private folder of the process, used if `text` is empty; `running` and `fleets` find the endpoint by it
     source : of the pipeline's frames, without a password, by which a user tells several pipelines apart
     fleet : name of the fleet whose controller has this endpoint; empty for a pipeline
-
-    Raises
-    ------
-    ServiceError
-        If another pipeline uses the folder, or other users may write to it, or a file of the keys is damaged.
     """
     endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
@@ -273,10 +259,7 @@ def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
         already is returned
     source : of a pipeline of this user, as it was given, or its file name
 
-    Raises
-    ------
-    ServiceError
-        If there is none, or more than one.
+    ServiceError if there is none, or more than one.
     """
     if isinstance(text, Endpoint):
         return text
