@@ -23,7 +23,7 @@ from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.likeness import Likeness
-from catstream.detection.objects import Detectors, prepare
+from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, FrameError, MissingFileError, ObjectError, ProtocolError, ServiceError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
@@ -158,7 +158,6 @@ class MultiTracker:
             raise ObjectError("there is no object to follow: give a box for at least one name")
         check_count(len(boxes), self.settings.run.objects_most)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
-        prepare(self.settings)  # a library is held to one thread if it is there when a call begins
         with one_thread():
             pyramid = Pyramid(image)
             given = detectors.begin_all(boxes, pyramid, time)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 
-from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.messages import storage
@@ -33,8 +32,7 @@ from catstream.wire.newest import Publisher
 
 
 def prepare() -> None:
-    """Import everything that a reduction and a checkpoint need."""
-    reduce.prepare()
+    """Import everything that a checkpoint needs."""
     storage.prepare()
 
 

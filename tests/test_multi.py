@@ -11,7 +11,7 @@ from catstream.box import Box
 from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.multi import MultiTracker
-from catstream.numerics import parallel
+from catstream.numerics import threads
 from catstream.settings import Settings
 from catstream.tracker import Tracker
 
@@ -81,10 +81,10 @@ def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames, together)
 
 def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, together, monkeypatch):
     for cores in (1, 4):
-        monkeypatch.setattr(parallel, "_cores", lambda cores=cores: cores)
-        parallel._pool.cache_clear()
+        monkeypatch.setattr(threads, "_cores", lambda cores=cores: cores)
+        threads._pool.cache_clear()
         assert followed(frames, STEPS) == together
-    parallel._pool.cache_clear()
+    threads._pool.cache_clear()
 
 
 #: In which frame an object begins, and in which it is forgotten, if it is.

@@ -13,7 +13,7 @@ from catstream.errors import ObjectError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Features, Model, Track, Tracks
 from catstream.messages.names import check_count, check_name, errors_about, listed
-from catstream.numerics.parallel import in_parallel
+from catstream.numerics.threads import in_parallel
 from catstream.settings import Settings
 
 
@@ -29,6 +29,8 @@ class Detectors:
     """
 
     def __init__(self, settings: Settings) -> None:
+        if settings.teaching.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
+            import catstream.paper.scm  # noqa: F401
         self.settings = settings
         self.seq = 0
         self.detectors: dict[str, Detector] = {}
@@ -138,11 +140,3 @@ class Detectors:
         """Use a model for its object from now on, see `Detector.adopt`; one of a forgotten object is dropped."""
         if (detector := self.detectors.get(model.object)) is not None:
             detector.adopt(model)
-
-
-def prepare(settings: Settings) -> None:
-    """Import what `Detectors.begin` needs, if that takes long."""
-    if settings.teaching.bootstrap == "scm":
-        from catstream.paper import scm
-
-        scm.prepare()
