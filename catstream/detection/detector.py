@@ -21,7 +21,6 @@ from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
-from catstream.messages.storage import Arrays, Metadata
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -196,17 +195,6 @@ class Detector:
         context = self.settings.search.context
         window = Window.around(box, context)
         return DetectorState(began, "confident", window, window, Window.around(first, context))
-
-    def scm_state(self) -> tuple[Arrays, Metadata | None]:
-        """Arrays and metadata of the paper's first tracker, for `resume_scm`; none if it is not in use."""
-        return ({}, None) if self._scm is None else self._scm.state()
-
-    def resume_scm(self, arrays: Arrays, metadata: Metadata | None) -> None:
-        """Continue the paper's first tracker of another detector; call it after `resume`."""
-        if metadata is not None:
-            from catstream.paper.scm import SparseCollaborativeModel
-
-            self._scm = SparseCollaborativeModel.resumed(arrays, metadata)
 
     def _known(self) -> DetectorState:
         if self.state is None:

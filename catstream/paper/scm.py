@@ -25,7 +25,6 @@ from sklearn.linear_model import Lasso
 from catstream.box import Box
 from catstream.features.kernels import sparse_codes
 from catstream.features.pyramid import Pyramid
-from catstream.messages.storage import Arrays, Metadata
 from catstream.numerics.threads import FILTERS
 
 _SIDE = 32  # of a template, in pixels
@@ -58,39 +57,6 @@ class SparseCollaborativeModel:
         positives = self._cuts(grey, self._beside(_POSITIVES, 0.0, 0.02))
         self._discriminative = _Discriminative.trained(positives, self._background(grey))
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
-
-    def state(self) -> tuple[Arrays, Metadata]:
-        """Arrays and metadata from which `resumed` continues."""
-        judged, made = self._discriminative, self._generative
-        arrays = {
-            "scm.state": self._state,
-            "scm.positives": judged.positives,
-            "scm.templates": judged.templates,
-            "scm.selected": judged.selected,
-            "scm.atoms": made.atoms,
-            "scm.first": made.first,
-            "scm.histogram": made.histogram,
-        }
-        chance = self._rng.bit_generator.state
-        return arrays, {"box": self._first, "frames": self._frames, "particles": self._particles, "rng": chance}
-
-    @classmethod
-    def resumed(cls, arrays: Arrays, metadata: Metadata) -> SparseCollaborativeModel:
-        """Continue where `state` was called, bit for bit; KeyError, TypeError or ValueError if they do not fit."""
-        self = cls.__new__(cls)
-        self._first, self._frames, self._particles = (
-            Box(*metadata["box"]),
-            int(metadata["frames"]),
-            int(metadata["particles"]),
-        )
-        self._rng = np.random.default_rng()
-        self._rng.bit_generator.state = metadata["rng"]
-        self._state = arrays["scm.state"]
-        self._discriminative = _Discriminative(
-            *(arrays[f"scm.{name}"] for name in ("positives", "templates", "selected"))
-        )
-        self._generative = _Generative(*(arrays[f"scm.{name}"] for name in ("atoms", "first", "histogram")))
-        return self
 
     def follow(self, image: np.ndarray) -> tuple[float, Box]:
         """Find the object in the next frame, of the size of the first.
