@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.detection import belief, extent, motion, search, teacher
+from catstream.detection import belief, extent, search, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
@@ -145,9 +145,9 @@ class Detector:
         """
         state = self._known()
         window = Window.around(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
-        self.state = motion.observed(
+        self.state = belief.observed(
             replace(
-                motion.expected(state),
+                belief.expected(state),
                 level="confident",
                 trusted=True,
                 window=window,
@@ -229,7 +229,7 @@ def looked(
     -------
     the state with the place that was expected, and the detection
     """
-    state = motion.expected(state)
+    state = belief.expected(state)
     if state.first_window is None and likeness is not None:
         return search.seek(frame, state, seq, model, likeness, settings)
     return state, search.find(frame, state, seq, model, settings)
@@ -248,7 +248,7 @@ def settled(state: DetectorState, found: Detection, size: tuple[int, int], setti
         return state
     window = extent.followed(state.window, found.window, policy.resize).with_centre_in(*size)
     confident = window if policy.resize else state.confident_window
-    return motion.observed(replace(state, window=window, confident_window=confident))
+    return belief.observed(replace(state, window=window, confident_window=confident))
 
 
 def taught(

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from catstream.compression.node import sample, share, spread
 from catstream.compression.reduce import reduce
-from catstream.compression.sampling import sample, share, spread
 from catstream.compression.tree import CoresetTree
 
 SIZE = 16

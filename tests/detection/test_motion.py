@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.detection.motion import at_rest, measured, predicted
+from catstream.detection.belief import at_rest, measured, predicted
 from catstream.messages.kinds import Motion
 
 
