@@ -51,8 +51,8 @@ def across(record: Record) -> Iterator[Table]:
 
 
 def recognised(record: Record) -> Iterator[Table]:
-    """Select all tables but the last one, which has a row for each object."""
-    for number in range(len(record["tables"]) - 1):
+    """Select the tables over all objects."""
+    for number in range(3):
         yield from select(number)(record)
 
 
@@ -101,12 +101,6 @@ def _titled(record: Record, titles: Mapping[str, str]) -> Iterator[Table]:
     for number, table in enumerate(record["tables"]):
         if table["title"] in titles:
             yield from select(number, without=titles[table["title"]])(record)
-
-
-def forks(record: Record) -> Iterator[Table]:
-    """Select the sequences that flip or are lost, and the frames at which they do."""
-    yield from select(0, without=r"\S+  ")(record)
-    yield from select(1, columns=(*_FORK, "taught frames", "their overlap"))(record)
 
 
 def robustness(record: Record) -> Iterator[Table]:
@@ -256,8 +250,8 @@ _MORE_HEAD = """
     The tables of several objects, summaries, saved models and fleets, and of frequent directions in place of the
     coreset tree, written by `make results` from the records in `benchmarks/results`."""
 _ROBUSTNESS = """
-    How much the accuracy depends on the start, on the first box and on the components of the tracker, and where runs
-    lose the object. Written by `make results` from the records in `benchmarks/results`."""
+    How much the accuracy depends on the start, on the first box and on the components of the tracker. Written by `make
+    results` from the records in `benchmarks/results`."""
 _OBJECTS = """
     The rendered video of `catstream demo --objects 8`, tracked with one to eight of its objects. All share the decoded
     frame and its pyramid; each has a detector, coreset trees and models of its own. The search uses threads where
@@ -275,14 +269,6 @@ _STARTS = """
     than half of the frames in its last quarter have an overlap above 0.5. The check sequences are not used to choose
     anything. The table of attributes has the runs of OPE; [Evaluate on your own
     video](../docs/how-to/evaluate.md#6-see-what-is-difficult) defines them."""
-_FORKS = """
-    Each sequence is followed from seven first boxes that differ by at most 2 %. It flips if the success of these runs
-    differs by more than 0.25, and it is lost if all are below 0.5; other sequences are not listed. Each failing run of
-    a sequence that flips is compared with the best run: they part in the first of five successive frames in which their
-    boxes overlap by at most 0.3. A sequence that is lost is compared with the ground truth. The lead is the difference
-    of score between the two highest peaks of the local search; the size is a multiple of that of the ground truth. The
-    last columns are the frames that were taught among the ten before, and the mean overlap of the box in these with the
-    ground truth."""
 _SUMMARIES = """
     The energy ||A P||^2 / ||A||^2 that k selected images keep of a collection, computed with all rows. `catstream`
     reads the images once, and keeps 128 rows as a sketch and at most 256 candidates. The greedy choice has all rows at
@@ -334,8 +320,8 @@ _FOUND = """
     wrong, and a false alarm is a sighting in a frame without the object. The second table has the objects of the check
     list. Template matching and ORB know the first frame. In the paper's setting, a
     rendered object is learned in 76 frames before a plain background, and searched before other backgrounds, turned,
-    scaled and in other lights. A plain scan scores every window by each model. The
-    machine was busy: only the ratios of times count. See [the how-to](../docs/how-to/find.md)."""
+    scaled and in other lights. The machine was busy: only the ratios of times count. See [the
+    how-to](../docs/how-to/find.md)."""
 _INGREDIENTS = """
     The loss of AUC without one component, on the tuning sequences with three first boxes each; the largest losses. A
     loss of less than two standard errors may be chance."""
@@ -365,7 +351,6 @@ _LIMITS = """
     [A plot](../docs/images/soak.png) shows the memory over the million messages of `soak.py`."""
 _PEERS = "Beside OpenCV's trackers"
 _SIZES = "Frames/s against the size of the image"
-_FORK = ("run", "compared with", "frame", "score", "lead", "size", "level", "its score", "its lead", "its size")
 _SOAK = ("messages", "rows", "us a message", "trees MB", "law MB", "resident MB", "disk MB")
 
 SECTIONS = (
@@ -417,7 +402,6 @@ DETAILS = (
         (
             Shown("speed", speeds),
             Shown("throughput", select(without=".* full ")),
-            Shown("kernels", select(without=".*(256|500|least-squares|one-class|shades|windows)")),
             Shown("wire", select()),
             Shown("subscribers", select(without="0 ")),
         ),
@@ -448,7 +432,6 @@ ROBUSTNESS = (
         _STARTS,
         (Shown("robustness", robustness), Shown("shifts", select(0))),
     ),
-    Section("Forks", _FORKS, (Shown("forks", forks),)),
     Section("Ablation", _INGREDIENTS, (Shown("ablation", strongest(9)),)),
 )
 
