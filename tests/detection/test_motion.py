@@ -69,13 +69,6 @@ def test_a_jump_is_a_new_start_at_rest(motion):
     np.testing.assert_array_equal(estimate, at_rest((40, 40), motion))
 
 
-def test_nothing_is_changed_in_place(motion):
-    estimate = moving(motion)
-    before = estimate.copy()
-    measured(predicted(estimate, motion), motion, (283, 139))
-    np.testing.assert_array_equal(estimate, before)
-
-
 def test_it_is_the_kalman_filter_of_the_textbook(motion, rng):
     estimate = moving(motion, 5)
     F, H, Q, R = np.eye(4) + np.eye(4, k=2), np.eye(2, 4), motion.process, motion.observation
