@@ -35,11 +35,7 @@ LEVELS = [
 IMPORTERS = {
     "numpy": ["catstream", "services"],
     "scipy": [
-        *(
-            "catstream/numerics/ridge.py",
-            "catstream/compression/reduce.py",
-            "catstream/applications/evaluation/multiple.py",
-        ),
+        *("catstream/numerics/ridge.py", "catstream/compression/reduce.py"),
         "catstream/numerics/threads.py",  # its BLAS is limited, too
     ],
     "cv2": [
@@ -77,10 +73,11 @@ IMPORTERS = {
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
         *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
-        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
+        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
+        *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
     ],
-    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
-    "psutil": ["catstream/applications/loadtest/usage.py"],
+    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/runs.py"],
+    "psutil": ["catstream/applications/loadtest/latency.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py"],
