@@ -39,14 +39,12 @@ def limit_process() -> None:
 
 
 class _Limit:
-    """Limits linear algebra to one thread as long as any call needs it: a BLAS has one number for the whole process."""
+    """Limits each BLAS to one thread as long as any call needs it: it has one number for the whole process."""
 
     def __init__(self) -> None:
         self._lock, self._calls = threading.Lock(), 0
 
     def __enter__(self) -> None:
-        import scipy.linalg  # noqa: F401  brings a BLAS beside that of numpy: loaded later, it would have all threads
-
         with self._lock:
             if not self._calls:
                 self._set = self._controller().limit(limits=1)
@@ -62,9 +60,7 @@ class _Limit:
     @staticmethod
     def _controller() -> ThreadpoolController:
         """The libraries of this process, of which this thread may set the numbers from now on."""
-        from threadpoolctl import get_cached_controller
-
-        controller = get_cached_controller()
+        controller = _libraries("blas")
         for library in controller.lib_controllers:
             if library.internal_api == "openblas":  # by itself, one thread of a program keeps the right to set it
                 library.clear_controlling_thread(force=True)
@@ -74,12 +70,20 @@ class _Limit:
 _limit = _Limit()
 
 
+def _libraries(kind: str) -> ThreadpoolController:
+    """The libraries of a kind that are loaded in this process: "blas" or "openmp"."""
+    import scipy.linalg  # noqa: F401  brings a BLAS beside that of numpy: loaded later, it would have all threads
+    from threadpoolctl import get_cached_controller
+
+    return get_cached_controller().select(user_api=kind)
+
+
 @contextmanager
 def one_thread(*, opencv: bool = False) -> Iterator[None]:
     """Run linear algebra on one thread inside a `with`, or inside the function that it decorates.
 
     It may be nested and used by several threads at once: the last one to leave restores the number of threads.
-    Meanwhile, linear algebra in other threads of the process runs on one thread, too. It costs 20 microseconds.
+    Meanwhile, linear algebra in other threads of the process runs on one thread, too. It costs some tens of microseconds.
 
     Parameters
     ----------
@@ -97,7 +101,7 @@ def one_thread(*, opencv: bool = False) -> Iterator[None]:
         threads = cv2.getNumThreads()
         cv2.setNumThreads(1)
     try:
-        with _limit:
+        with _limit, _libraries("openmp").limit(limits=1):  # OpenMP has a number for each calling thread
             yield
     finally:
         if opencv:
@@ -117,7 +121,12 @@ def in_parallel(function: Callable[[_Item], _Result], items: Iterable[_Item]) ->
     waiting = list(items)
     if len(waiting) < 2 or _cores() < 2:
         return [function(item) for item in waiting]
-    calls = [_pool().submit(function, item) for item in waiting]
+
+    def limited(item: _Item) -> _Result:
+        with one_thread():
+            return function(item)
+
+    calls = [_pool().submit(limited, item) for item in waiting]
     for call in calls:
         call.exception()  # waits
     return [call.result() for call in calls]
