@@ -83,7 +83,7 @@ def one_thread(*, opencv: bool = False) -> Iterator[None]:
     """Run linear algebra on one thread inside a `with`, or inside the function that it decorates.
 
     It may be nested and used by several threads at once: the last one to leave restores the number of threads.
-    Meanwhile, linear algebra in other threads of the process runs on one thread, too. It costs some tens of microseconds.
+    Meanwhile, linear algebra in other threads of the process runs on one thread, too. It costs about 30 microseconds.
 
     Parameters
     ----------
