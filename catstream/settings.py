@@ -72,9 +72,9 @@ class RunSettings(_Group):
         _about("Frames of a file by which the detector may be ahead of learning (0: as lockstep).", ge=0, le=65536),
     ] = 25
     seed: Annotated[int, _about("Seed of all random numbers.", ge=0)] = 0
-    image_rate: Annotated[float, _about("Frames per second of a folder or a pattern of images.", ge=1e-9, le=1000)] = (
-        25.0
-    )
+    image_rate: Annotated[
+        float, _about("Frames per second of a folder or a pattern of images, and of a live demo.", ge=1e-9, le=1000)
+    ] = 25.0
     skip_damaged: Annotated[
         bool, _about("Continue after a damaged place in a video file. Without it, the run ends there.")
     ] = False

@@ -39,7 +39,7 @@ from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.services.start import SPAWN
 from catstream.tracker import Tracker
-from catstream.video import demo
+from catstream.video import rendered
 from catstream.video.source import open_source
 
 Found = list[tuple[float, Box]]
@@ -269,7 +269,7 @@ def _each(answers: dict[str, dict[str, list[Answer]]]) -> Table:
 def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
     """Learned before a plain background, searched before others and in other lights."""
     rng = np.random.default_rng(0)
-    image, box = next(demo.render(1))
+    image, box = next(rendered.render(1))
     assert box is not None
     flower = cut(image, box)
     plain = [np.full((240, 320, 3), 190, np.uint8) for _ in range(learning)]
