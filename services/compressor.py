@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 
-from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.messages.kinds import End, Features
@@ -28,8 +27,7 @@ from catstream.wire.newest import Publisher
 
 
 def prepare() -> None:
-    """Import everything that a reduction and a checkpoint need."""
-    reduce.prepare()
+    """Everything is imported above."""
 
 
 def main(process: Process) -> None:

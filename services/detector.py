@@ -19,13 +19,11 @@ from typing import Any
 
 import cv2
 
-from catstream.detection import objects
 from catstream.detection.detector import Detector, Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Command, End, Features, Model, Position, Tracks
-from catstream.numerics import ridge
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED
 from catstream.services import actions, core
@@ -62,7 +60,6 @@ _log = logging.getLogger(__name__)
 
 def prepare() -> None:
     """Import everything that tracking needs, and limit OpenCV to the thread that calls it."""
-    ridge.prepare()
     source.prepare()
     cv2.setNumThreads(1)
 
@@ -94,7 +91,6 @@ class DetectorLoop:
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
         settings, job = process.settings, process.job
-        objects.prepare(settings)
         self._process, self._began = process, time.monotonic()
         self._models_of_job = ModelFiles(job.state / SEARCHED if job.state is not None else None)
         desired = _desired(process, self._models_of_job)

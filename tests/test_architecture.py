@@ -50,8 +50,7 @@ IMPORTERS = {
         "services/detector.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
-    "numba": ["catstream/features/compiler.py"],
-    "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
+    "numba": ["catstream/features/kernels.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/objects.py"],
@@ -86,11 +85,8 @@ IMPORTERS = {
 
 #: Libraries that take long to import: inside the function that needs them.
 SLOW = {
-    "sklearn",
     "mcap",
     "av",
-    "scipy",
-    "filterpy",
     "pyarrow",
     "ray",
     "obstore",
@@ -194,7 +190,7 @@ def test_slow_libraries_are_imported_by_the_functions_that_use_them():
 
 @pytest.mark.parametrize("name", ["compressor", "trainer"])
 def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
-    unused = SLOW | {"asyncio", "cv2", "llvmlite", "numba"}
+    unused = SLOW | {"asyncio", "cv2", "numba", "sklearn"}
     check = f"import sys, catstream.services.{name}; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")
