@@ -22,7 +22,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import ObjectFeatures, Track
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
-from catstream.services.start import SPAWN
+from catstream.services.process import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

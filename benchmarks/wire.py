@@ -17,7 +17,7 @@ from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import End, Features, Position
 from catstream.messages.names import UNNAMED
-from catstream.services.start import SPAWN
+from catstream.services.process import SPAWN
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES

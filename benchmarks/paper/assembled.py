@@ -23,7 +23,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.names import UNNAMED
 from catstream.numerics.threads import one_thread
 from catstream.paper.scm import SparseCollaborativeModel
-from catstream.services.start import SPAWN
+from catstream.services.process import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

@@ -42,7 +42,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import non_maximum_suppression
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
-from catstream.services.start import SPAWN
+from catstream.services.process import SPAWN
 from catstream.tracker import Tracker
 from catstream.video import demo
 from catstream.video.source import open_source

@@ -81,6 +81,7 @@ def group() -> None:
 
 def main() -> None:
     """Run the command line. The exit code is 1 after an error, which is one line, and `INTERRUPTED` after Ctrl-C."""
+    os.environ.setdefault("PYTHONSAFEPATH", "1")  # processes import nothing from the current folder
     INTERRUPTS.install()
     if sys.stdout is None:  # it was closed before the start (>&-): what is printed is dropped
         sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")

@@ -93,7 +93,6 @@ class _Request:
             model=self.models or None,
             part=self.part,
             state=self.state,
-            record=self.record,
             resume=self.resume,
             results=Results(  # absolute, to resume from any folder
                 output=self.output and self.output.absolute(),

@@ -37,26 +37,19 @@ from catstream.fleet.timing import (
     TURN_SECONDS,
 )
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
-from catstream.services.start_server import share_start_server, start_server
+from catstream.services.start_server import start_server
 from catstream.video.frames import without_password
 from catstream.wire.keys import Client, allowed, ensure
 
 #: Contents of saved models, by stream and object.
 Models = dict[tuple[str, str], bytes]
 
-_INIT = 1  # process that becomes the parent of those whose parent has ended
 _log = logging.getLogger(__name__)
 
 
 def warm() -> None:
-    """Let this process share the start server of its node, and start it if there is none.
-
-    It has imported what the processes of a stream need, so that a stream is quickly there whose node has died. It ends
-    with the node: the process that starts those of Ray.
-    """
+    """Start the start server of this process, so that a stream is quickly there whose node has died."""
     os.environ["OMP_NUM_THREADS"] = "1"  # Ray sets the cores of an actor: there would be a server for each number
-    if (node := os.getppid()) != _INIT:  # otherwise the node has just died, and a shared server would never end
-        share_start_server(node)
     start_server()
 
 

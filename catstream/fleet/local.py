@@ -33,7 +33,6 @@ from catstream.fleet.timing import (
     RETURN_SECONDS,
 )
 from catstream.messages.storage import is_locked, lock, write_atomically
-from catstream.services import start
 from catstream.wire.endpoint import private_folder
 
 _ENDED = (0, 1)  # exit codes after SIGTERM: 1 if Ray has handled it
@@ -116,11 +115,9 @@ class LocalCluster:
             write_atomically(self.folder / "token", secrets.token_hex(32).encode(), mode=0o600)
         (self.folder / "address").unlink(missing_ok=True)
         cores = math.ceil(len(os.sched_getaffinity(0)) / nodes) if cores is None else cores
-        command = start.python_command(
-            "from catstream.fleet.local import main; main()",
-            *(str(self.folder), str(nodes), str(cores), "detached" if detach else "attached"),
-        )
-        others = {name: value for name, value in start.environment().items() if not name.startswith("RAY_")}
+        command = [sys.executable, "-P", "-c", "from catstream.fleet.local import main; main()"]
+        command += [str(self.folder), str(nodes), str(cores), "detached" if detach else "attached"]
+        others = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
         with (self.folder / "log").open("wb") as log:
             process = subprocess.Popen(
                 command,

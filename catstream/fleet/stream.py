@@ -48,7 +48,6 @@ from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
 from catstream.run.state import files, restore, skip
-from catstream.services.process_title import process_fields
 from catstream.video.frames import without_password
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder
@@ -463,7 +462,8 @@ def _processor_seconds(pids: list[int]) -> float:
     seconds = 0.0
     for pid in pids:
         with suppress(OSError):  # it has ended
-            seconds += sum(map(int, process_fields(pid)[_TIMES])) / _TICKS
+            fields = ["", "", "", *Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()]
+            seconds += sum(map(int, fields[_TIMES])) / _TICKS
     return seconds
 
 

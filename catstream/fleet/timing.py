@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from catstream.messages.storage import ABANDONED_SECONDS
-from catstream.services.timing import SHUTDOWN_SECONDS
+from catstream.services.supervisor import SHUTDOWN_SECONDS
 from catstream.wire.timing import RETRY_SECONDS
 
 # The controller.

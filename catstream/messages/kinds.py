@@ -166,54 +166,24 @@ class Features:
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
-    """Acknowledges the messages of an acknowledged channel, receiver -> sender.
-
-    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
-    taken     all messages up to this one have been processed by the receiver
-    versions  version of the newest Sample of each object that has one, by name
-    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
-    """
-
-    seq: int
-    taken: int
-    versions: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
-    unsaved: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectPosition:
-    """The part of `Position` for one object.
-
-    box       box in which it was last found
-    version   version of its newest Sample, 0 before the first
-    detector  its detector state of message `seq`, None if it had none
-    """
-
-    box: Box | None = None
-    version: int = 0
-    detector: DetectorState | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Position:
-    """The position at which a stream continues: the answer of a receiver to each new connection.
+    """How far the receiver of an acknowledged channel is, receiver -> sender.
 
-    seq      the last message that is stored, 0 in a new stream: the sender continues with the next one
-    frame    number of its frame
-    objects  the part of each object of that message, by name; empty in a new stream
-    unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops its copies
+    taken     all messages up to this one have been processed
+    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    versions  version of the newest Sample of each object that has one, by name
+    again     whether the sender has to send all messages after `taken` again, as they may be lost
+    states    for a sender that was restarted: the state of each object's detector after the message that it asked for, or
+              after the nearest one that is known, by name
     """
 
     seq: int = 0
-    frame: int = 0
-    objects: Annotated[dict[str, ObjectPosition], ByObject()] = field(default_factory=dict)
+    taken: int = 0
     unsaved: int = 0
-
-    @property
-    def versions(self) -> dict[str, int]:
-        """Version of the newest Sample of each object that has one, by name."""
-        return {name: each.version for name, each in self.objects.items() if each.version}
+    versions: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
+    again: bool = False
+    states: Annotated[dict[str, DetectorState], ByObject()] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages.kinds import ObjectPosition, Position, Track
+from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED
 from catstream.messages.storage import is_writable, name_fits, nearest, writing
 from catstream.sinks import results
@@ -102,17 +101,11 @@ class RunFiles:
             with writing(self.output, VideoError):
                 self.output.mkdir(parents=True, exist_ok=True)
 
-    def position(self) -> Position | None:
-        """Return the position of the last frame that the files hold; None if no file holds all tracks."""
+    def position(self) -> int | None:
+        """Return `seq` of the last frame that the files hold; None if no file holds all tracks."""
         if not self._logs():
             return None
-        frames = 0
-        boxes: dict[str, Box | None] = {}
-        objects: list[str] = []
-        for tracks in self._earlier():
-            frames, objects = tracks[0].frame + 1, [track.object for track in tracks]
-            boxes |= {track.object: track.box for track in tracks if track.box is not None}
-        return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
+        return max((tracks[0].frame + 1 for tracks in self._earlier()), default=0)
 
     def names(self) -> list[str]:
         """Return the names of the objects in the files, in the order in which they appeared."""

@@ -29,7 +29,7 @@ import numpy as np
 
 from catstream.errors import ProtocolError
 from catstream.messages.checks import check_message
-from catstream.messages.kinds import Position, Stored
+from catstream.messages.kinds import Position
 from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT
 from catstream.wire.channels import CHANNELS, REGISTRY
 
@@ -43,7 +43,7 @@ _LONGEST_TOPIC = 512  # bytes
 #: Kinds of message, by their name on the wire: those of the channels, and the replies on acknowledged channels.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kinds in (*(channel.messages for channel in (*CHANNELS.values(), REGISTRY)), (Position, Stored))
+    for kinds in (*(channel.messages for channel in (*CHANNELS.values(), REGISTRY)), (Position,))
     for kind in kinds
 }
 

@@ -14,8 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 from catstream.errors import ServiceError
-from catstream.services.loop import die_with
-from catstream.services.start import SPAWN, sigint_blocked
+from catstream.services.process import SPAWN, die_with, sigint_blocked
 
 _Result = TypeVar("_Result")
 

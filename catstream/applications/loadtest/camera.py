@@ -18,8 +18,7 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages.names import UNNAMED
 from catstream.numerics.arrays import Float64
-from catstream.services.loop import die_with
-from catstream.services.start import SPAWN, sigint_blocked
+from catstream.services.process import SPAWN, die_with, sigint_blocked
 from catstream.video import crowd, demo
 from catstream.video.broadcast import Broadcast, Schedule
 from catstream.video.image import jpeg

@@ -10,8 +10,7 @@ from time import monotonic, sleep
 from typing import Any, Self
 
 from catstream.messages.kinds import End
-from catstream.services.loop import die_with
-from catstream.services.start import SPAWN, sigint_blocked
+from catstream.services.process import SPAWN, die_with, sigint_blocked
 from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import GapCounter, Subscriber
