@@ -8,6 +8,7 @@ itself is the owner of the run, which receives every track.
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import socket
@@ -213,7 +214,7 @@ class Arena:
                     raise ServiceError(f"frame {len(self.tracks) - 1} is missing, frame {message.frame} came instead")
             else:
                 self.end = message
-            self._children["detector"].watchdog.read = message.seq
+            self._children["detector"].watchdog.read = math.inf if self.end is not None else message.seq
         elif monotonic() - self._last_received > _PATIENCE_SECONDS:
             raise ServiceError(
                 f"no track arrived for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}"

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -143,7 +144,7 @@ class DetectorLoop:
     # Before the first frame
 
     def resume(self) -> bool:
-        """Continue after the last frame that compressor and owner have; returns False if the process is to end first."""
+        """Continue after the last frame that compressor and owner have; returns whether no signal came first."""
         process, features = self._process, self._outputs.features
         after = process.watchdog.after if process.job.owned else NO_OWNER
         models: dict[str, Model] = {}
@@ -393,7 +394,7 @@ class DetectorLoop:
         totals.pop("lost_seconds", None)  # this one is of the moment
         end = End(seq + 1, reason, failed, totals)
         sent = False
-        while results is not None and process.watchdog.read <= seq:
+        while results is not None and process.watchdog.read < math.inf:
             sent = sent or results.send(end, TURN_SECONDS)
             sleep(_LOOK_SECONDS)
             self._serve()

@@ -99,12 +99,15 @@ class Watchdog:
         self._cells[2] = self._cells[3] = seq
 
     @property
-    def read(self) -> int:
-        """Number of the last frame that the owner of the run has read: a detector is not too far ahead of it."""
-        return int(self._cells[3])
+    def read(self) -> float:
+        """Number of the last frame that the owner of the run has read, infinite once it has received the end.
+
+        A detector is not too far ahead of it.
+        """
+        return self._cells[3]
 
     @read.setter
-    def read(self, seq: int) -> None:
+    def read(self, seq: float) -> None:
         self._cells[3] = seq
 
     def close(self) -> None:

@@ -9,8 +9,8 @@ server; all pipelines of the program share it, and it ends with the program, how
        │ <── exit code ──────────── │ <─────────────────────── exit ─ │
 
 A request is a packet of JSON on a Unix socket, with the descriptors of the log, of the watchdog, and of a socket for
-the two answers. The server has one thread: a fork copies only the thread that calls it. The kernel kills its processes if
-the server ends; they are then restarted like any that died, by a new server.
+the two answers. The server has one thread: a fork copies only the thread that calls it. The kernel kills its processes
+if the server ends; they are then restarted like any that died, by a new server.
 """
 
 from __future__ import annotations
@@ -167,6 +167,7 @@ def start_server() -> StartServer:
     global _server
     with _lock:
         if _server is None or not _server.runs():
+            close_start_server()
             _server = StartServer()
         return _server
 
@@ -230,7 +231,6 @@ def main(descriptor: int, program: int) -> None:
             gc.freeze()  # a later collection leaves the memory alone that all processes share
             parent = os.getpid()
             if not (pid := os.fork()):
-                requests.close()
                 _run(request, parent, log, watchdog)
             os.close(log)
             os.close(watchdog)
@@ -255,6 +255,10 @@ def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.dup2(log, sys.stderr.fileno())
+        for descriptor in [int(each.name) for each in Path("/proc/self/fd").iterdir()]:
+            if descriptor > sys.stderr.fileno() and descriptor != watchdog:
+                with suppress(OSError):  # the one of the listing
+                    os.close(descriptor)
         with suppress(OSError):  # it was removed
             os.chdir(request["folder"])
         gc.enable()

@@ -37,6 +37,8 @@ APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is
 SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end before they are killed
 EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stream was received
 
+ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
+
 _LAST_LINE = 2000  # bytes at the end of a log in which the last line is searched for
 _STEP = 65536  # bytes of a log that are read at once; a longer line is left out
 
@@ -102,11 +104,6 @@ class Child:
     def code(self) -> int | None:
         """Exit code of the process, None if it runs or is to be started."""
         return self.process.poll() if self.process is not None else None
-
-    @property
-    def finished(self) -> bool:
-        """Whether the process ended normally, or because the source broke."""
-        return self.code in (0, SOURCE_FAILED)
 
     def start(self, after: int) -> None:
         """Start the process; the owner of the run has the frames up to message `after`."""
@@ -202,7 +199,7 @@ class Supervisor:
         return sum(len(child.restarts) for child in self._children.values())
 
     def next_frame(self, seconds: float = math.inf) -> dict[str, Track] | None:
-        """Wait for the next frame; the track of each object by name, none if the time is over, None after the last frame.
+        """Wait for the next frame: the track of each object by name; none if the time is over, None after the last one.
 
         Raises
         ------
@@ -215,7 +212,8 @@ class Supervisor:
             self._changed.wait_for(lambda: self._frames or self._over, None if seconds == math.inf else seconds)
             if self._frames and not self._ending.is_set():
                 tracks = self._frames.popleft()
-                self._children["detector"].watchdog.read = tracks.seq
+                if self.end is None:
+                    self._children["detector"].watchdog.read = tracks.seq
                 return tracks.tracks
             if not self._over:
                 return {}
@@ -249,7 +247,7 @@ class Supervisor:
                         self._turn()
                         if self.end is not None:
                             deadline = min(deadline, time.monotonic() + EXIT_SECONDS)
-                            if self._children["detector"].finished:
+                            if self._children["detector"].code in ENDED:
                                 break
                     self._receive_health()
                 except Exception as error:
@@ -270,7 +268,7 @@ class Supervisor:
         message = self._results.receive(TURN_SECONDS)
         if isinstance(message, End):
             self.end = message
-            self._children["detector"].watchdog.read = message.seq
+            self._children["detector"].watchdog.read = math.inf
         elif message is not None:
             with self._changed:
                 self._frames.append(message)
@@ -293,15 +291,16 @@ class Supervisor:
     def _check_children(self, now: float, seconds: float) -> None:
         """Restart the processes that died, and kill those that hang; ServiceError if a restart is useless."""
         for child in self._children.values():
+            code = child.code
             if child.process is None:
                 if now >= child.due:
                     child.start(self._results.last)
-            elif child.finished:
+            elif code in ENDED:
                 # Only this one was asked to end, or the detector died after it sent its end and has to repeat it.
                 child.silent += seconds
                 if child.silent > APART_SECONDS:
                     child.start(self._results.last)
-            elif (code := child.code) is not None:
+            elif code is not None:
                 self._restart(child, code, now)
             elif child.check(seconds):
                 _log.warning("the %s hangs, and is killed: it has stood still for %.0f s", child.name, child.silent)
