@@ -211,7 +211,7 @@ def _array(_: type, numbers: Any) -> Any:
     return np.array(numbers)
 
 
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist)
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: array.tolist())
 _DECODER = msgspec.msgpack.Decoder(list[tuple[int, dict[str, DetectorState]]], dec_hook=_array)
 
 

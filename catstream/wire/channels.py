@@ -78,6 +78,11 @@ class Channel(Generic[Message]):
     high_water_mark: int = 1000
 
     @property
+    def acknowledged(self) -> bool:
+        """Whether one process receives every message."""
+        return self.receiver is not None
+
+    @property
     def limit(self) -> int:
         """Bytes of the largest message."""
         return self.megabytes << 20
