@@ -84,8 +84,8 @@ IMPORTERS = {
     "psutil": ["catstream/applications/loadtest/usage.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
-    "uvicorn": ["catstream/web/server.py", "catstream/web/connections.py"],
-    "prometheus_client": ["catstream/web/metrics.py"],
+    "uvicorn": ["catstream/web/server.py"],
+    "prometheus_client": ["catstream/web/prometheus.py"],
     "rich": ["catstream/cli"],
 }
 

@@ -10,13 +10,24 @@ import pytest
 import catstream
 from catstream.fleet import timing as fleet
 from catstream.services import timing as services
-from catstream.web import timing as web
+from catstream.web import app, dashboard, feed, server
 from catstream.wire import timing as wire
 
 CATSTREAM = Path(catstream.__file__).parent
 DOCS = CATSTREAM.parent / "docs"
 
-ORDER = [*wire.ORDER, *services.ORDER, *web.ORDER, *fleet.ORDER]
+WEB = (
+    (
+        app.UPDATE_SECONDS,
+        server.SHUTDOWN_SECONDS,
+        "the server closes a page before it is told of its end",
+    ),
+    (dashboard.POINT_SECONDS, dashboard.RATE_SECONDS, "a chart of frames per second leaves out frames"),
+    (wire.CHECK_SECONDS, feed.SILENCE_SECONDS, "a pipeline that rejects the keys counts as silent"),
+    (wire.DRAIN_SECONDS, feed.DRAIN_SECONDS, "the last messages are dropped before their subscriptions have ended"),
+    (app.RETRY_SECONDS, feed.IDLE_SECONDS, "the feed of a stream is closed while its page connects again"),
+)
+ORDER = [*wire.ORDER, *services.ORDER, *WEB, *fleet.ORDER]
 #: The files whose time limits are in one table, and what a time limit looks like there.
 LIMITS = {
     "wire": (
@@ -27,7 +38,6 @@ LIMITS = {
         [*Path(services.__file__).parent.glob("*.py")],
         r"^\s*\w*(?:_SECONDS|_PERIOD)(?:: \w+)? = [0-9.(]|(?:receive|wait|sleep)\([0-9]*[.1-9]",
     ),
-    "web": ([*CATSTREAM.glob("web/*.py")], r"^\s*\w*(?:_SECONDS|_pause)(?:: \w+)? = [0-9.]"),
     "fleet": (
         [*CATSTREAM.glob("fleet/*.py"), CATSTREAM / "cli" / "fleet.py"],
         r"^_?\w*(?:_SECONDS|_PAUSE)\b[^=\n]* = [0-9.({]|(?:wait|sleep|timeout=)\(?[0-9]*[.1-9]|_ms\": \"[0-9]",
@@ -46,7 +56,7 @@ def test_every_time_limit_is_in_the_table(files, limit):
 
 
 def test_the_docs_say_after_which_time_a_process_is_silent_and_a_stream_is_started_again():
-    assert f"within {web.SILENCE_SECONDS:g} s" in (DOCS / "how-to" / "view.md").read_text()
+    assert f"within {feed.SILENCE_SECONDS:g} s" in (DOCS / "how-to" / "view.md").read_text()
     pause = f"a pause of {fleet.FIRST_PAUSE_SECONDS:g} s to {fleet.LONGEST_PAUSE_SECONDS:g} s"
     assert pause in (DOCS / "how-to" / "fleet.md").read_text()
 

@@ -18,7 +18,7 @@ from catstream.cli.files import check_file
 from catstream.cli.interrupts import INTERRUPTS, stopped
 from catstream.cli.output import messages
 from catstream.cli.progress import RunProgress
-from catstream.cli.serving import PORT, Address, AddressType, with_token
+from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.errors import RecordingError, ServiceError, require_extra
 from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.pipeline import Pipeline
