@@ -50,7 +50,7 @@ IMPORTERS = {
         "catstream/applications/summaries/images.py",
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
-        "services/detector.py",
+        "services/detector_process.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/compiler.py"],
@@ -67,6 +67,7 @@ IMPORTERS = {
         "catstream/wire/context.py",
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",
+        "catstream/wire/results.py",
         "catstream/wire/newest.py",
         "catstream/wire/commands.py",
         "catstream/wire/monitor.py",
@@ -77,8 +78,8 @@ IMPORTERS = {
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
-        *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
-        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
+        *("services/decisions.py", "catstream/compression/forest.py"),
+        *("catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
     ],
     "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
     "psutil": ["catstream/applications/loadtest/usage.py"],
@@ -108,7 +109,7 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
     *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/fleet/desired.py"),
-    *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
+    *("services/decisions.py", "services/control_commands.py"),
 ]
 
 FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
@@ -201,7 +202,7 @@ def test_slow_libraries_are_imported_by_the_functions_that_use_them():
 @pytest.mark.parametrize("name", ["compressor", "trainer"])
 def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
     unused = SLOW | {"asyncio", "cv2", "llvmlite", "numba"}
-    check = f"import sys, catstream.services.{name}; sys.exit({unused!r} & sys.modules.keys() or 0)"
+    check = f"import sys, catstream.services.{name}_process; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")
 

@@ -174,8 +174,8 @@ class Position:
     unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
     versions  version of the newest Sample of each object that has one, by name
     again     whether the sender has to send all messages after `taken` again, as they may be lost
-    states    for a sender that was restarted: the state of each object's detector after the message that it asked for, or
-              after the nearest one that is known, by name
+    states    for a sender that was restarted: the state of each object's detector after the message that it asked for,
+              or after the nearest one that is known, by name
     """
 
     seq: int = 0

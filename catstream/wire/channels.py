@@ -17,8 +17,9 @@ The controller of a fleet has an endpoint of its own, with one channel:
 
     registry   questions about the streams of the fleet, and their answers
 
-The one receiver of a channel binds its address; if there are many, its sender does. The rest connect, in any order. `catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`),
-a peer that connects needs the role in the table.
+The one receiver of a channel binds its address; if there are many, its sender does. The rest connect, in any order.
+`catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`), a peer that
+connects needs the role in the table.
 """
 
 from __future__ import annotations
