@@ -9,7 +9,7 @@ import pytest
 
 import catstream
 from catstream.fleet import timing as fleet
-from catstream.services import timing as services
+from catstream.services import compressor_process, detector_process, process, supervisor
 from catstream.web import app, dashboard, feed, server
 from catstream.wire import timing as wire
 
@@ -27,17 +27,19 @@ WEB = (
     (wire.DRAIN_SECONDS, feed.DRAIN_SECONDS, "the last messages are dropped before their subscriptions have ended"),
     (app.RETRY_SECONDS, feed.IDLE_SECONDS, "the feed of a stream is closed while its page connects again"),
 )
-ORDER = [*wire.ORDER, *services.ORDER, *WEB, *fleet.ORDER]
+ATTEMPTS = 2**supervisor.RESTARTS
+DETECTOR_END = detector_process._FEATURES_END_SECONDS + detector_process._RESULTS_END_SECONDS
+SERVICES = (
+    (process.MESSAGE_SECONDS, process.RUNNING_SECONDS, "a process without messages counts as stuck"),
+    (process.HEALTH_SECONDS, wire.REPORT_SECONDS, "a client that waits for a health report receives none"),
+    (supervisor.STEP_SECONDS, process.RUNNING_SECONDS, "a process counts as stuck as its program was suspended once"),
+    (supervisor.RESTART_SECONDS * ATTEMPTS, supervisor.RECENT_SECONDS, "a process that dies is restarted for ever"),
+    (compressor_process._SENDER_SECONDS, supervisor.SHUTDOWN_SECONDS, "a compressor is killed while its end is sent"),
+    (DETECTOR_END, supervisor.SHUTDOWN_SECONDS, "a detector is killed while its end is stored"),
+)
+ORDER = [*wire.ORDER, *SERVICES, *WEB, *fleet.ORDER]
 #: The files whose time limits are in one table, and what a time limit looks like there.
 LIMITS = {
-    "wire": (
-        [*CATSTREAM.glob("wire/*.py"), *CATSTREAM.glob("client/*.py")],
-        r"^\s*\w*(?:_SECONDS|_MILLISECONDS|PATIENCE)(?:: \w+)? = [0-9.]|: float = [1-9]",
-    ),
-    "services": (
-        [*Path(services.__file__).parent.glob("*.py")],
-        r"^\s*\w*(?:_SECONDS|_PERIOD)(?:: \w+)? = [0-9.(]|(?:receive|wait|sleep)\([0-9]*[.1-9]",
-    ),
     "fleet": (
         [*CATSTREAM.glob("fleet/*.py"), CATSTREAM / "cli" / "fleet.py"],
         r"^_?\w*(?:_SECONDS|_PAUSE)\b[^=\n]* = [0-9.({]|(?:wait|sleep|timeout=)\(?[0-9]*[.1-9]|_ms\": \"[0-9]",

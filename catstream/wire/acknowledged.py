@@ -141,6 +141,7 @@ class Receiver(ChannelSocket[Message]):
     ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=size + 1)
         self.window, self._check, self._states = ReceiveWindow(position, size), check, states
+        self._size = size
         self._bind()
 
     def receive(self, seconds: float) -> Message | None:
@@ -161,6 +162,8 @@ class Receiver(ChannelSocket[Message]):
         delivered, reply = self.window.receive(peer, message.seq, monotonic(), last=last, size=len(data))
         if reply is not None:
             self._reply(peer, reply)
+        if not delivered and message.seq > self.window.taken + self._size + 1:  # more than a sender may have in flight
+            self._reject("sequence", f"message {message.seq} came after {self.window.taken}")
         return message if delivered else None
 
     def acknowledge(self, position: Position) -> None:

@@ -25,8 +25,7 @@ from catstream.messages.kinds import (
     Motion,
     NodeStatus,
     ObjectFeatures,
-    ObjectPosition,
-    Stored,
+    Position,
     StreamStatus,
     Summary,
     Track,
@@ -52,7 +51,7 @@ from catstream.wire.newest import Publisher
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
-PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, ObjectPosition, StreamStatus, Summary, TrainingRows]
+PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, StreamStatus, Summary, TrainingRows]
 MESSAGES = [*codec.KINDS.values(), *PARTS]
 PLAIN = {int: "integer", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
@@ -161,7 +160,7 @@ def test_the_limits_are_those_of_the_codec():
 
 def test_the_example_in_bytes_agrees_with_the_encoded_message():
     example = re.search(r"^```\n((?:[0-9a-f]{2}[ \n])+)```", PAGE, re.MULTILINE)[1]
-    assert bytes.fromhex(example) == codec.encode(Stored(5, 7, {"anna": 2}))
+    assert bytes.fromhex(example) == codec.encode(Position(5, 7, 0, {"anna": 2}))
     assert f"`{codec.opening(End).hex(' ')}` for `end`" in PAGE
     assert f"`{codec.opening(Track, 'anna').hex(' ')}` for" in PAGE
 
