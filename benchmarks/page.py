@@ -259,7 +259,7 @@ _ROBUSTNESS = """
     How much the accuracy depends on the start, on the first box and on the components of the tracker, and where runs
     lose the object. Written by `make results` from the records in `benchmarks/results`."""
 _OBJECTS = """
-    The rendered video of `catstream demo --objects 8`, tracked with one to eight of its objects. All share the decoded
+    A rendered video of eight objects, tracked with one to eight of its objects. All share the decoded
     frame and its pyramid; each has a detector, coreset trees and models of its own. The search uses threads where
     cores are free. See [decision 57](../docs/decisions/parameters.md)."""
 _REDUCTION = """

@@ -24,7 +24,7 @@ from catstream.errors import ServiceError
 from catstream.run.state import TREES
 from catstream.settings import Settings
 from catstream.sinks.formats import CsvSink
-from catstream.video.demo import write
+from catstream.video.rendered import write
 
 _REST = 200  # frames after the last kill: a fast pipeline continues until the kill takes effect
 TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "track"]

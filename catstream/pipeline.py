@@ -163,8 +163,7 @@ class Pipeline:
         if job.settings.run.lockstep and is_live(job.source):
             raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
-        image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
-        with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
+        with open_source(job.source, part=job.part, settings=job.settings.run) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
         check_boxes(job.boxes, *self.size)

@@ -34,8 +34,7 @@ from catstream.services.decisions import (
 )
 from catstream.services.outputs import ModelFiles, Outputs
 from catstream.services.process import LONG_SECONDS, TURN_SECONDS, Process
-from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame, Source, without_password
+from catstream.video.frames import Frame, Source, read_ahead, without_password
 from catstream.video.source import is_live, open_source
 from catstream.wire.channels import CONTROL, MODELS
 from catstream.wire.commands import Responder
@@ -177,8 +176,8 @@ class DetectorLoop:
         first = self.detectors.seq if live else max(self.detectors.seq - 1, 0)
         watchdog.allow(LONG_SECONDS + ((job.part.start or 0) + first * step) * _SKIP_SECONDS)
         watchdog.limit += (step - 1) * _SKIP_SECONDS
-        reading = {name: getattr(settings.run, name) for name in ("image_rate", "skip_damaged", "resize")}
-        source = open_source(job.source, first, part=job.part, since=job.since, idle=self._idle, **reading)
+        part, since = job.part, job.since
+        source = open_source(job.source, first, part=part, since=since, idle=self._idle, settings=settings.run)
         self._source = stack.enter_context(source)
         if live:
             self._source.size = job.size or self._source.size  # a camera may have another one than when the run began

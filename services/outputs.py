@@ -18,7 +18,7 @@ from catstream.messages.kinds import End, Features, Preview, Tracks
 from catstream.run.learned import Learned
 from catstream.services.decisions import DesiredObject
 from catstream.services.process import Process
-from catstream.video.image import jpeg
+from catstream.video.frames import jpeg
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES, PREVIEWS, TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint

@@ -7,13 +7,10 @@ import logging
 import mmap
 import os
 import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
-from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 from secrets import token_hex
 
@@ -39,9 +36,6 @@ MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a messa
 HEALTH_SECONDS = 1.0  #: between two health reports of a process
 RUNNING_SECONDS = 10.0  #: without a turn of its loop, after which a process counts as stuck
 LONG_SECONDS = 120.0  #: the same for a start, and for a step that takes long and was announced
-
-#: The start method for processes that run a function of this program: worker pools, subscribers of a load test.
-SPAWN = get_context("spawn")
 
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 _log = logging.getLogger(__name__)
@@ -228,26 +222,3 @@ def die_with(parent: int) -> None:
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # the parent ended before the call of prctl
         raise SystemExit(0)
-
-
-@contextmanager
-def sigint_blocked() -> Iterator[None]:
-    """Block SIGINT in the processes that are started inside a `with`: on Ctrl-C, their parent ends them in order.
-
-    A Ctrl-C that arrives inside is handled after it. The mask alone does not hold it back: the signal arrives in
-    another thread, and Python handles it in the main one. A process whose start is interrupted would wait for its
-    arguments.
-    """
-    resource_tracker.ensure_running()  # now, because its start unblocks the signal
-    received: list[int] = []
-    is_main = threading.current_thread() is threading.main_thread()  # the thread in which Python handles signals
-    handler = signal.signal(signal.SIGINT, lambda number, _: received.append(number)) if is_main else None
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        if is_main:
-            signal.signal(signal.SIGINT, handler)
-            if received:
-                signal.raise_signal(signal.SIGINT)

@@ -35,11 +35,7 @@ LEVELS = [
 IMPORTERS = {
     "numpy": ["catstream", "services"],
     "scipy": [
-        *(
-            "catstream/numerics/ridge.py",
-            "catstream/compression/reduce.py",
-            "catstream/applications/evaluation/multiple.py",
-        ),
+        *("catstream/numerics/ridge.py", "catstream/compression/reduce.py"),
         "catstream/numerics/threads.py",  # its BLAS is limited, too
     ],
     "cv2": [
@@ -47,6 +43,7 @@ IMPORTERS = {
         "catstream/detection",
         "catstream/paper",
         "catstream/video",
+        "catstream/applications/loadtest/crowd.py",
         "catstream/applications/summaries/images.py",
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
@@ -55,14 +52,14 @@ IMPORTERS = {
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/compiler.py"],
     "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
-    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
+    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/objects.py"],
     "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/made.py"],
     "supervision": ["catstream/sinks/adapters.py"],
-    "av": ["catstream/video"],
+    "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
     "zmq": [
         "catstream/wire/context.py",
         "catstream/wire/socket.py",
@@ -79,10 +76,11 @@ IMPORTERS = {
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
         *("services/decisions.py", "catstream/compression/forest.py"),
-        *("catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
+        *("catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
+        *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
     ],
-    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
-    "psutil": ["catstream/applications/loadtest/usage.py"],
+    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/runs.py"],
+    "psutil": ["catstream/applications/loadtest/latency.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py"],

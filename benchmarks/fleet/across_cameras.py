@@ -32,7 +32,7 @@ from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.fleet.merge import joined, merge_in_pairs
 from catstream.run.learned import Learned
 from catstream.settings import Settings
-from catstream.video.sprite import cut_out_dahlia, load_photograph
+from catstream.video.rendered import cut_out_dahlia, load_photograph
 from catstream.video.writer import VideoWriter
 
 _CAMERAS = 4

@@ -12,9 +12,9 @@ from unittest.mock import patch
 import numpy as np
 from accuracy import starts_of
 
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.datasets import Sequence, Start
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.starts import Start
+from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
@@ -23,7 +23,6 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.names import UNNAMED
 from catstream.numerics.threads import one_thread
 from catstream.paper.scm import SparseCollaborativeModel
-from catstream.services.process import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

@@ -33,18 +33,17 @@ from sequences import scratch, sequences
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.finding.files import File
+from catstream.applications.finding.find import File, Search
 from catstream.applications.finding.scan import Scan, Seen
-from catstream.applications.finding.search import Search
+from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import non_maximum_suppression
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
-from catstream.services.process import SPAWN
 from catstream.tracker import Tracker
-from catstream.video import demo
+from catstream.video import rendered
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 
@@ -276,7 +275,7 @@ def _each(answers: dict[str, dict[str, list[Answer]]]) -> Table:
 def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
     """Learned before a plain background, searched before others and in other lights."""
     rng = np.random.default_rng(0)
-    image, box = next(demo.render(1))
+    image, box = next(rendered.render(1))
     assert box is not None
     flower = cut(image, box)
     plain = [np.full((240, 320, 3), 190, np.uint8) for _ in range(learning)]
@@ -348,7 +347,7 @@ def _scans(options: argparse.Namespace, found: list[Sequence]) -> Table:
     picked = [sequence for sequence in found if sequence.name not in CHECK]
     picked = picked[:: max(1, len(picked) // 10)][:10]
     learned = [learn([next(iter(each.frames()))], Box(*each.boxes[0].tolist())) for each in picked]
-    frames = [image for image, _ in demo.render(2 if options.quick else 150)]
+    frames = [image for image, _ in rendered.render(2 if options.quick else 150)]
     rows = []
     for count in (1, 3) if options.quick else (1, 3, 10):
         models = [learned[number % len(learned)] for number in range(count)]

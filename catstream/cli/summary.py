@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from catstream.cli.files import check_file
-from catstream.cli.interrupts import INTERRUPTS
-from catstream.cli.output import line_of, messages
+from catstream.cli.common import INTERRUPTS, check_file, line_of, messages
 from catstream.errors import ObjectError, SettingsError, VideoError
 from catstream.messages.kinds import Features, Health
 from catstream.messages.names import boxes_by_name, listed, split_name
@@ -137,7 +135,7 @@ def _of_images(path: Path, count: int, console: Console) -> Sheet:
     from catstream.applications.summaries.images import describe
     from catstream.applications.summaries.selection import RowSelection
     from catstream.applications.summaries.sheet import WIDTH, sheet_of_images
-    from catstream.video.image import jpeg
+    from catstream.video.frames import jpeg
 
     collection, selection = Collection(path), RowSelection[tuple[Origin, bytes]](count)
     with line_of(console) as progress, one_thread():

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.video.annotate import draw, drawn_size
+from catstream.video.annotate import Colours, draw, drawn_size
 from catstream.video.frames import RATE, Frame, without_password
-from catstream.video.palette import Colours
 from catstream.video.source import is_live, open_source
 from catstream.video.writer import VideoWriter
 
@@ -43,7 +42,7 @@ class VideoSink:
         self._colours = Colours()
         try:
             size = drawn_size(self._frames.size)
-            self._video = VideoWriter(path, self._frames.rate, size, sound=self._frames.sound)
+            self._video = VideoWriter(path, self._frames.rate, size, pixel_aspect=self._frames.pixel_aspect)
         except VideoError:
             self._frames.close()
             raise

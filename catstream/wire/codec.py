@@ -40,12 +40,12 @@ VERSION = 4
 
 _LONGEST_TOPIC = 512  # bytes
 
-#: Kinds of message, by their name on the wire: those of the channels, and the replies on acknowledged channels.
+#: Kinds of message, by their name on the wire: those of the channels, and the reply on an acknowledged one.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind
-    for kinds in (*(channel.messages for channel in (*CHANNELS.values(), REGISTRY)), (Position,))
-    for kind in kinds
-}
+    for channel in (*CHANNELS.values(), REGISTRY)
+    for kind in channel.messages
+} | {"position": Position}
 
 
 def encode(message: object, run: str = "") -> bytes:

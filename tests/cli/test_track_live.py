@@ -16,7 +16,7 @@ import pytest
 from catstream.box import Box
 from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
-from catstream.video.demo import render
+from catstream.video.rendered import render
 
 PYTHON = Path("/usr/bin/python3")  # the one that Debian's packages are for
 SERVER = Path(__file__).with_name("rtsp_server.py")

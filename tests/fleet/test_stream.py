@@ -20,7 +20,7 @@ from catstream.run.state import position, skip
 from catstream.video.live_demo import first_box
 
 FRAMES = 60
-LIVE = "demo:1?rate=10"
+LIVE = "demo:1"
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from catstream.services.detector_process import DetectorLoop
 from catstream.services.outputs import ModelFiles
 from catstream.services.process import Process
 from catstream.settings import Settings
-from catstream.video.demo import render
+from catstream.video.rendered import render
 
 
 @pytest.fixture(scope="module")

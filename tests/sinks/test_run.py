@@ -22,7 +22,7 @@ from catstream.messages.kinds import Track
 from catstream.sinks.lines import LineFile
 from catstream.sinks.run import RunFiles
 from catstream.sinks.sink import STDOUT, open_files
-from catstream.video.demo import write
+from catstream.video.rendered import write
 from catstream.video.source import ALL_FRAMES, open_source
 
 NAMES = ["t.ndjson", "t.json", "t.csv", "t.txt", "t.sqlite", "t.parquet", "t.mp4"]

@@ -18,7 +18,7 @@ from catstream.errors import VideoError
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, WINDOW
 from catstream.numerics.threads import one_thread
-from catstream.video.image import as_bgr
+from catstream.video.frames import as_bgr
 from catstream.video.source import read_image
 
 _SIDE = WINDOW * CELL
