@@ -67,7 +67,7 @@ def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_se
 ):
     monkeypatch.chdir(tmp_path)
     started, watchdog, log = start()
-    until(lambda: watchdog.turns > 1)
+    until(lambda: watchdog.turns > 2)
     process = psutil.Process(started.pid)
     assert process.ppid() == server.pid
     assert process.cwd() == str(tmp_path)
@@ -85,13 +85,13 @@ def test_a_current_folder_that_was_removed_is_no_obstacle(start, until, tmp_path
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     _, watchdog, _ = start()
-    until(lambda: watchdog.turns > 1)
+    until(lambda: watchdog.turns > 2)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 4), (signal.SIGKILL, -signal.SIGKILL)])
 def test_how_a_process_has_ended_is_known(start, until, number, code):
     process, watchdog, _ = start()
-    until(lambda: watchdog.turns > 1)
+    until(lambda: watchdog.turns > 2)
     assert process.poll() is None
     process.send_signal(number)
     assert until(process.poll) == code
@@ -107,13 +107,13 @@ def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_
 
 def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(server, start, until):
     process, watchdog, _ = start()
-    until(lambda: watchdog.turns > 1)
+    until(lambda: watchdog.turns > 2)
     running = psutil.Process(process.pid)
     os.kill(server.pid, signal.SIGKILL)
     assert until(process.poll) == -signal.SIGKILL
     until(lambda: has_ended(running))
     again, watchdog, _ = start()
-    until(lambda: watchdog.turns > 1)
+    until(lambda: watchdog.turns > 2)
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
 
 
