@@ -384,7 +384,7 @@ class Pipeline:
         if self._resumed_job is not None and self._state is not None:
             with suppress(ProtocolError):  # the detector reports it, and starts with the objects of the job
                 desired = DesiredState.load(self._state / DESIRED)
-                waiting, paused = not desired.objects, desired.paused
+                waiting, paused = not desired.objects, paused or desired.paused
         return {"waiting": waiting, "paused": paused}
 
     @property

@@ -24,7 +24,8 @@ LEVELS = [
     {"paper"},
     {"detection", "compression", "training", "wire", "video"},
     {"run"},
-    {"multi", "client", "sinks"},
+    {"multi", "client"},
+    {"sinks"},
     {"tracker", "services", "web"},
     {"pipeline"},
     {"applications", "fleet"},
@@ -44,7 +45,6 @@ IMPORTERS = {
         "catstream/paper",
         "catstream/video",
         "catstream/applications/loadtest/crowd.py",
-        "catstream/applications/summaries/images.py",
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
         "services/detector_process.py",
@@ -57,8 +57,7 @@ IMPORTERS = {
     "obstore": ["catstream/fleet/objects.py"],
     "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
-    "pyarrow": ["catstream/sinks/made.py"],
-    "supervision": ["catstream/sinks/adapters.py"],
+    "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
     "zmq": [
         "catstream/wire/context.py",
@@ -71,7 +70,7 @@ IMPORTERS = {
         "catstream/wire/zap.py",
         "catstream/wire/keys.py",
     ],
-    "mcap": ["catstream/sinks/recording/container.py"],
+    "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
@@ -96,7 +95,6 @@ SLOW = {
     "scipy",
     "filterpy",
     "pyarrow",
-    "supervision",
     "ray",
     "obstore",
 }

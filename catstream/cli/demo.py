@@ -45,6 +45,7 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
         click.echo(first_box(live))
         return
     from catstream.applications.evaluation.scores import score
+    from catstream.sinks.track_log import read_frames
     from catstream.video.rendered import write
 
     with line_of(messages()) as bar:
@@ -57,7 +58,8 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
     arguments = [str(video), "--box", str(boxes[0]), "--output", str(tracks), "--video", "--overwrite"]
     track.main(arguments, prog_name="catstream track", standalone_mode=False)
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
-    found = np.loadtxt(tracks / "demo.txt", delimiter=",", ndmin=2)
+    tracked = [frame.tracks[0].box for frame, _ in read_frames(tracks / "demo.ndjson")]
+    found = np.array([box or (np.nan,) * 4 for box in tracked])
     absent, nothing = np.isnan(truth).any(axis=1), np.isnan(found).any(axis=1)
     click.echo(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
     if absent.any():

@@ -36,13 +36,13 @@ class Results:
 
     output      folder of the results files, None for none
     video       whether an annotated video is among the results files
-    write       further files of tracks
+    write       further destinations of tracks, see `catstream.sinks.destinations`
     models      files for what was learned of each object, by name; a file without a name is for the only object
     """
 
     output: Path | None = None
     video: bool = False
-    write: tuple[Path, ...] = ()
+    write: tuple[str, ...] = ()
     models: dict[str, Path] = field(default_factory=dict)
 
     def after(self, earlier: Results) -> Results:

@@ -112,15 +112,19 @@ def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) ->
     -------
     JPEG file, of the same size with and without tracks
     """
+    image = preview_image(preview, tracks, colours)
+    return preview.jpeg if image is None else jpeg(image)
+
+
+def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -> np.ndarray | None:
+    """The same as an image, uint8 (h, w, 3), blue green red; None if the preview cannot be decoded."""
     image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        return preview.jpeg
+        return None
     if not tracks:
-        image = np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
-    else:
-        scale = image.shape[1] / preview.width
-        image = draw(image, [_scaled(track, scale) for track in tracks], colours)
-    return jpeg(image)
+        return np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
+    scale = image.shape[1] / preview.width
+    return draw(image, [_scaled(track, scale) for track in tracks], colours)
 
 
 def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
