@@ -97,6 +97,7 @@ class DetectorLoop:
         self._repeats = 0  # the last message of an earlier detector: commands and pauses apply after it
         self._ending = STOPPED if self.desired.stopped else ""  # reason for which no more frames are tracked
         self._boxes: list[Command] = []  # that wait for a frame
+        self._arrived: dict[str, Model] = {}  # of objects that have not begun again yet
         self._begun: dict[str, Learned] = {}  # the saved models that objects begin with in the next message
         self._skipped = 0  # frames that were left out because the run was paused or waited for a box
         self._tracks = Tracks(0, 0, {})  # the last ones
@@ -138,7 +139,10 @@ class DetectorLoop:
 
     def _receive_models(self, seconds: float) -> None:
         for model in self._models.receive_all(seconds):
-            self.detectors.adopt(model)
+            if model.object in self.detectors.detectors:
+                self.detectors.adopt(model)
+            elif self._is_repeating:  # the object begins again in one of these frames
+                self._arrived[model.object] = model
 
     # Before the first frame
 
@@ -165,6 +169,7 @@ class DetectorLoop:
             detector.resume(state, models[name])
             if state.is_sought and (learned := self._model_files.get(self.desired.objects[name].model)) is not None:
                 detector.likeness = learned.likeness()
+        self._arrived = {name: model for name, model in models.items() if name not in start.states}
         features.window.resume(start.seq, position)
         self._conclude()
         return True
@@ -230,6 +235,8 @@ class DetectorLoop:
                 self.desired = self.desired.without(name)
                 self._conclude()
         tracks, features = self.detectors.step(pyramid, frame.time, given)
+        for name in self._arrived.keys() & tracks.tracks.keys():
+            self.detectors.adopt(self._arrived.pop(name))
         tracks = replace(tracks, tracks={name: replace(each, pts=frame.pts) for name, each in tracks.tracks.items()})
         models = {name: replace(features.objects[name], model=each.to_bytes()) for name, each in self._begun.items()}
         self._tracks, self._begun = tracks, {}
