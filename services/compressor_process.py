@@ -93,14 +93,16 @@ class CompressorLoop:
         """Write a checkpoint if one is due, then acknowledge the message, with the newest samples."""
         before, seq = self._position, self._forest.seq
         is_end = isinstance(message, End)
-        urgent = self._checkpoints is None or is_end or self._features.window.half_full
+        features = self._features
+        urgent = self._checkpoints is None or is_end or features.window.half_full or bool(features.asking)
         interval = self._process.settings.run.checkpoint_seconds
         if seq > self._stored and (urgent or checkpoint_is_due(monotonic() - self._tried, self._took, interval)):
             self._store(urgent)
         if message is not None or self._position is not before:
             # Samples count without a checkpoint, because in lockstep the detector waits for their models.
             position = replace(self._position, taken=seq, versions=self._forest.versions)
-            self._features.acknowledge(with_end(position, message.seq) if isinstance(message, End) else position)
+            features.acknowledge(with_end(position, message.seq) if isinstance(message, End) else position)
+        features.answer()
 
     @property
     def _stored(self) -> int:

@@ -34,6 +34,7 @@ from catstream.services.decisions import (
 )
 from catstream.services.outputs import ModelFiles, Outputs
 from catstream.services.process import LONG_SECONDS, TURN_SECONDS, Process
+from catstream.video import source as video_source
 from catstream.video.frames import Frame, Source, read_ahead, without_password
 from catstream.video.source import is_live, open_source
 from catstream.wire.channels import CONTROL, MODELS
@@ -46,6 +47,7 @@ _FEATURES_END_SECONDS = 10.0  # limit for the end to be stored, once the process
 _RESULTS_END_SECONDS = 0.5  # the same for the owner of the run to receive the end
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
+video_source.prepare()  # imports PyAV: once in the start server, not in each process
 _log = logging.getLogger(__name__)
 
 

@@ -26,6 +26,7 @@ from catstream.wire.socket import ChannelSocket
 from catstream.wire.timing import LINGER_SECONDS
 
 _LONGEST_QUESTION = 20  # digits
+_MOST_ASKING = 64  # senders that may wait for an answer at a time; any other asks again
 
 
 class _Numbered(Protocol):
@@ -116,7 +117,8 @@ class Sender(ChannelSocket[Message]):
 class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
-    Each message that `receive` returns is processed, and then acknowledged.
+    Each message that `receive` returns is processed, and then acknowledged. Senders that were restarted wait for
+    `answer`: what they have not sent themselves should be stored by then, as they cannot repeat it without the source.
 
     Parameters
     ----------
@@ -128,6 +130,7 @@ class Receiver(ChannelSocket[Message]):
     Attributes
     ----------
     window : the messages that were received and stored
+    asking : the senders that were restarted and wait for `answer`, and the message whose states they ask for
     """
 
     def __init__(
@@ -141,6 +144,7 @@ class Receiver(ChannelSocket[Message]):
     ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=size + 1)
         self.window, self._check, self._states = ReceiveWindow(position, size), check, states
+        self.asking: dict[bytes, int] = {}
         self._size = size
         self._bind()
 
@@ -152,8 +156,10 @@ class Receiver(ChannelSocket[Message]):
         if data is None:
             return None
         if len(data) <= _LONGEST_QUESTION and (not data or bytes(data).isdigit()):
-            position = self.window.asked(peer)
-            self._reply(peer, replace(position, states=self._states(int(bytes(data)))) if data else position)
+            if not data:
+                self._reply(peer, self.window.asked(peer))
+            elif len(self.asking) < _MOST_ASKING:
+                self.asking[peer] = int(bytes(data))
             return None
         message = self._decode(data, *self.channel.messages, check=self._check)
         if message is None:
@@ -171,6 +177,12 @@ class Receiver(ChannelSocket[Message]):
         self.window.acknowledge(position)
         if self.window.peer is not None:
             self._reply(self.window.peer, self.window.position)
+
+    def answer(self) -> None:
+        """Answer the senders that were restarted."""
+        for peer, after in self.asking.items():
+            self._reply(peer, replace(self.window.asked(peer), states=self._states(after)))
+        self.asking.clear()
 
     def close(self) -> None:
         """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""

@@ -63,6 +63,7 @@ def take(receiver, taken, *, store):
     if message is not None:
         taken.append(message.seq)
         receiver.acknowledge(Position(message.seq if store else 0))
+    receiver.answer()
 
 
 def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, until):
