@@ -47,12 +47,12 @@ class Outputs:
             self.features = stack.enter_context(Sender(FEATURES, endpoint, window))
             self.results = stack.enter_context(ResultsSender(endpoint, window + 1)) if process.job.owned else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
-            self._training = stack.enter_context(Publisher(TRAINING, endpoint, first_message=process.run))
+            self._training = stack.enter_context(Publisher(TRAINING, endpoint))
             self.previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
 
     def serve_late_joiners(self) -> None:
-        """Send the first message or the newest preview to new subscribers."""
+        """Send the end or the newest preview to new subscribers."""
         self._tracks.serve_late_joiners()
         self._training.serve_late_joiners()
         self.previews.turn()

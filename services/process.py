@@ -15,12 +15,12 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.errors import CatstreamError, StreamRewoundError
-from catstream.messages.kinds import Health, Run
+from catstream.messages.kinds import Health
 from catstream.run.job import Job
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
-from catstream.wire.rejects import rejects
+from catstream.wire.socket import rejects
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
@@ -145,11 +145,6 @@ class Process:
     def seconds_since_stop(self) -> float:
         """Seconds since a signal asked the process to end; negative if none has."""
         return time.monotonic() - self._stop_moment
-
-    @property
-    def run(self) -> Run:
-        """The settings of the pipeline, for subscribers that learn from its features."""
-        return Run.from_settings(self.settings.portable())
 
     def beat(
         self,

@@ -33,7 +33,10 @@ from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint, Place, find, fleets, meeting_place, private_folder
 from catstream.wire.keys import Keys
-from catstream.wire.timing import ANSWER_SECONDS, CONTROLLER_SECONDS, QUIET_SECONDS
+
+ANSWER_SECONDS = 5.0  #: limit for the answer of a registry, by default
+CONTROLLER_SECONDS = 0.5  #: without an answer, after which the endpoint of a fleet on this machine is read again
+QUIET_SECONDS = 1.0  #: without a message, after which the registry is asked where a stream runs; then repeated
 
 _log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from catstream.messages.storage import ABANDONED_SECONDS
 from catstream.services.supervisor import SHUTDOWN_SECONDS
-from catstream.wire.timing import RETRY_SECONDS
+from catstream.wire.commands import RETRY_SECONDS
 
 # The controller.
 TURN_SECONDS = 0.5  #: between two looks at the actors
