@@ -36,7 +36,8 @@ def desired(*names):
 
 
 def command(verb, name="", **more):
-    return Command("1", verb, object=name, **more)
+    needed = {"set-box": {"box": BOX}, "search": {"model": b"a file"}}.get(verb, {})
+    return Command("1", verb, object=name, **needed, **more)
 
 
 def test_pause_resume_and_stop_change_one_thing_each(tracked):
