@@ -42,9 +42,7 @@ VERSION = 4
 
 #: Kinds of message, by their name on the wire: those of the channels, and the reply on an acknowledged one.
 KINDS: dict[str, type] = {
-    kind.__name__.lower(): kind
-    for channel in (*CHANNELS.values(), REGISTRY)
-    for kind in channel.messages
+    kind.__name__.lower(): kind for channel in (*CHANNELS.values(), REGISTRY) for kind in channel.messages
 } | {"position": Position}
 
 #: What is wrong with bytes: msgspec raises no other error for them.
