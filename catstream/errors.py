@@ -96,8 +96,8 @@ EXTRAS = {
     "record": ("a recording", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "supervision": ("to_supervision", ("supervision",)),
-    "fleet": ("a fleet", ("ray",)),
-    "s3": ("a store on S3", ("obstore", "boto3")),
+    "fleet": ("a fleet", ("ray", "obstore")),
+    "s3": ("a store on S3", ("boto3",)),
 }
 
 

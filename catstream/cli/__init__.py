@@ -40,8 +40,9 @@ COMMANDS = {
     "settings": "List all settings with their defaults and descriptions.",
 }
 
-#: Module of the commands that share a module.
+#: Module of the commands that share a module, or whose module has another name.
 _MODULES = dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "control")
+_MODULES["fleet"] = "fleet_commands"
 
 
 def load_command(name: str) -> click.Command:

@@ -330,11 +330,8 @@ class FleetDashboard(Parts):
 
 def _stream(stream: StreamStatus) -> dict[str, Any]:
     """Return what the page shows of a stream; `picture` is whether it can show one of its newest frame."""
-    names = ("state", "trouble", "node", "source", "restarts", "skipped", "lost_frames")
+    names = ("state", "trouble", "node", "source", "frame", "skipped", "stored_seconds")
     return {name: getattr(stream, name) for name in names} | {
-        "rate": round(stream.rate, 1),
-        "lost_seconds": round(stream.lost_seconds, 1),
-        "stored_seconds": stream.stored_seconds,
         "models": list(stream.models.items()),
         "picture": bool(stream.endpoint) and stream.state in RUNNING,
     }
@@ -342,7 +339,7 @@ def _stream(stream: StreamStatus) -> dict[str, Any]:
 
 def _node(node: NodeStatus) -> dict[str, Any]:
     """Return what the page shows of a node."""
-    names = ("state", "trouble", "address", "streams")
+    names = ("state", "address", "streams")
     return {name: getattr(node, name) for name in names} | {
         "cores": round(node.cores, 2),
         "used": round(node.used, 2),

@@ -119,14 +119,8 @@ def _of_streams(status: FleetStatus) -> Iterator[_Row]:
     streams, labels = status.streams.values(), ("stream", "node")
     rows: tuple[tuple[Any, str, Callable[[Any], float | None], str], ...] = (
         (_COUNTER, "frames_skipped", lambda one: one.skipped, "Frames of a live source that were skipped."),
-        (_COUNTER, "restarts", lambda one: one.restarts, "Times that a stream was started again after a failure."),
-        (_COUNTER, "frames_lost", lambda one: one.lost_frames,
-         "Frames of a live source from the last state in the store to the first one after a failure or a move."),
-        (_COUNTER, "lost_seconds", lambda one: one.lost_seconds, "Duration of the lost frames."),
         (_GAUGE, "up", lambda one: one.state in RUNNING, "Whether the pipeline of the stream runs."),
         (_GAUGE, "frame", lambda one: one.frame, "Number of the newest frame that was tracked."),
-        (_GAUGE, "frames_per_second", lambda one: one.rate, "Tracked frames per second."),
-        (_GAUGE, "cores", lambda one: one.cores, "Processor cores that the stream uses."),
         (_GAUGE, "stored_age_seconds", lambda one: one.stored_seconds, "Age of the newest state in the store."),
         (_GAUGE, "trouble", lambda one: bool(one.trouble), "Whether the stream has trouble."),
     )  # fmt: skip
@@ -145,7 +139,6 @@ def _of_nodes(status: FleetStatus) -> Iterator[_Row]:
         ("node_cores", lambda node: node.cores, "Processor cores of the node that streams may use."),
         ("node_cores_used", lambda node: node.used, "Processor cores that the streams on the node need."),
         ("node_streams", lambda node: node.streams, "Streams on the node."),
-        ("node_trouble", lambda node: bool(node.trouble), "Whether the node has trouble."),
     )
     for name, value, meaning in rows:
         yield _GAUGE, name, ("node",), meaning, {(node.name,): value(node) for node in nodes}

@@ -4,14 +4,14 @@ import { add, duration, Items, many, write } from "./dom.js";
 import { Pictures } from "./pictures.js";
 
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
-  stopping: "bootstrapping", failed: "absent", unplaced: "absent", alive: "present", dead: "absent" };
+  stopping: "bootstrapping", failed: "absent", alive: "present", dead: "absent" };
 const WORDS = { waiting: "waiting for a box" };
 const WIDE = matchMedia("(min-width: 75rem)");
 const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 before cam-10
 
 /** Pairs of name and value: those that do not run because of trouble, others with trouble, the rest; by name. */
 function inOrder(values) {
-  for (const value of Object.values(values)) value.level = ["failed", "unplaced", "dead"].includes(value.state) ? 2 : value.trouble ? 1 : 0;
+  for (const value of Object.values(values)) value.level = ["failed", "dead"].includes(value.state) ? 2 : value.trouble ? 1 : 0;
   return Object.entries(values).sort(([name, one], [other, two]) => two.level - one.level || byNumber(name, other));
 }
 
@@ -75,13 +75,10 @@ function fillCard(item, card) {
   link.title = card.source;
   write(lines.trouble, card.trouble);
   lines.trouble.title = card.trouble;
-  const rate = ["running", "waiting", "moving"].includes(card.state) && `${round(card.rate, card.rate < 9.95 ? 1 : 0)} frames/s`;
-  write(lines.where, join(card.node || "on no node", rate));
+  write(lines.where, join(card.node || "on no node", card.frame && `frame ${card.frame.toLocaleString("en")}`));
   write(lines.models, card.models.map(([name, version]) => `${name ? `${name}: ` : ""}model ${version}`).join(", ") || "no model yet");
   lines.models.title = lines.models.textContent;
-  write(lines.store, join(stored(card.stored_seconds), card.restarts && many(card.restarts, "restart"),
-    card.skipped && `${card.skipped.toLocaleString("en")} skipped`,
-    card.lost_frames && `${many(card.lost_frames, "frame")} (${card.lost_seconds} s) lost`));
+  write(lines.store, join(stored(card.stored_seconds), card.skipped && `${card.skipped.toLocaleString("en")} skipped`));
 }
 
 export class Nodes {
@@ -122,7 +119,6 @@ function fillRow({ element, button, state, labels, trouble, used, bar, streams }
   showState(state, row.state);
   write(labels, row.labels.join(" · "));
   button.title = `Show the streams of this node${row.address && `, at ${row.address}`}`;
-  write(trouble, row.trouble);
   write(used, row.state === "dead" ? "–" : `${round(row.used)} of ${round(row.cores)}`);
   bar.style.width = `${row.state === "dead" || !row.cores ? 0 : Math.min(100, (100 * row.used) / row.cores)}%`;
   bar.classList.toggle("full", row.used > row.cores);

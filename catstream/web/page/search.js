@@ -2,7 +2,7 @@
 
 import { Items, write } from "./dom.js";
 
-const STATES = ["trouble", "failed", "unplaced", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
+const STATES = ["trouble", "failed", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
 
 export class Search {
   /** changed() is called whenever another search is made. */
