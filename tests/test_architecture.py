@@ -57,8 +57,8 @@ IMPORTERS = {
     "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/sprite.py"],
     "safetensors": ["catstream/messages/storage.py"],
-    "obstore": ["catstream/fleet/objects.py"],
-    "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
+    "obstore": ["catstream/fleet/store.py"],
+    "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/made.py"],
     "supervision": ["catstream/sinks/adapters.py"],
@@ -76,7 +76,7 @@ IMPORTERS = {
     "mcap": ["catstream/sinks/recording/container.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
-        *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
+        *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py", "catstream/client/registry.py"),
         *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
         *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
     ],
@@ -107,7 +107,7 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/fleet/desired.py"),
+    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py"),
     *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
 ]
 

@@ -32,7 +32,7 @@ from catstream.services.options import PATH, with_json, with_keys, with_overwrit
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
 
-_UP_SECONDS = 120.0  # limit for the streams to start, after which `up` waits no longer
+UP_SECONDS = 120.0  # limit for the streams to start, after which `up` waits no longer
 _SHOW_SECONDS = 0.5  # between two pictures of the status
 _STARTED = ("running", "waiting", "paused", "ended", "failed")
 
@@ -123,7 +123,7 @@ def _down(fleet: Fleet) -> None:
 
 def _watch(console: Console, fleet: Fleet) -> None:
     """Show the streams until all have started; of a fleet that this program has started, until its end."""
-    deadline = time.monotonic() + _UP_SECONDS
+    deadline = time.monotonic() + UP_SECONDS
     status = fleet.status()
     try:
         with Live(console=console, transient=True) as live:

@@ -126,16 +126,9 @@ class Fleet:
         return self._owned is not None
 
     def up(self) -> list[str]:
-        """Make the spec the desired state; what runs and is unchanged is not touched.
+        """Make the spec the desired state; returns what is done, a line for each stream.
 
-        Returns
-        -------
-        what is done, a line for each stream
-
-        Raises
-        ------
-        StoreError
-            If the store cannot be used. Nothing is started or changed then.
+        What runs and is unchanged is not touched. If the store cannot be used, nothing is started or changed.
         """
         if self._spec is None:
             raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
@@ -156,7 +149,7 @@ class Fleet:
             self._start_controller(spec)
             lines: list[str] = self._ask("apply", spec, models)
         except BaseException:
-            if not was_owner:
+            if not was_owner:  # a controller that another one has started runs on
                 self._end_ray()
             raise
         return lines
@@ -195,12 +188,7 @@ class Fleet:
     def merge(self, *names: str, object: str = UNNAMED) -> Merged:
         """Merge what streams have learned of an object; the streams that follow it then search for it by the result.
 
-        Parameters
-        ----------
-        names : str
-            The streams; by default all that have learned of the object.
-        object : str
-            Name of the object; "" also means the only object of each stream.
+        Without names, all streams that have learned of it are merged. The object "" is also the only one of each stream.
         """
         import ray
         from ray.exceptions import RayTaskError
@@ -222,9 +210,7 @@ class Fleet:
     def down(self) -> list[str]:
         """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too.
 
-        Returns
-        -------
-        a line for each stream whose last state could not be stored
+        Returns a line for each stream whose last state could not be stored.
         """
         deadline = time.monotonic() + DOWN_SECONDS
         while (left := self._ask("close")) and time.monotonic() < deadline:
@@ -327,7 +313,7 @@ class Fleet:
                 return
             try:
                 ray.init(address, namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR, **options)
-            except (ray.exceptions.RayError, OSError, RuntimeError, ValueError) as error:
+            except Exception as error:  # Ray has no type for a node that does not start
                 why = str(error).strip().partition("\n")[0]
                 if address is None:
                     raise FleetError(f"Ray does not start on this machine: {why}") from None
@@ -371,11 +357,7 @@ class Fleet:
             )
             .remote(spec.name, spec.store, listen, keys)
         )
-        try:
-            self._ask("ready")
-        except FleetError:
-            self._kill_controller()
-            raise
+        self._ask("ready")
 
     def _kill_controller(self) -> None:
         import ray
@@ -411,16 +393,10 @@ class Fleet:
 
 
 def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -> Merged:
-    """Merge the newest states of streams, and store the model if it is a new one.
+    """Merge what the newest states of streams in a store have learned of an object, and store the model if it is new.
 
-    Frames are counted once: of streams that share frames, as they continue from one model, one is merged.
-
-    Parameters
-    ----------
-    url : of the store
-    streams : their names
-    name : the object
-    named : whether each stream has to know the object; otherwise those that do not are left out
+    Frames are counted once: of streams that share frames, as they continue from one model, one is merged. If the
+    streams are `named`, each has to know the object; otherwise those that do not are left out.
     """
     if not name and not named:
         raise FleetError(
@@ -430,7 +406,8 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
     learned = {stream: found for stream in streams if (found := _learned(store, stream, name, named=named)) is not None}
     if not learned:
         raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
-    chosen = disjoint({stream: (set(each.origins), rows_of(each)) for stream, each in learned.items()})
+    rows = {stream: sum(tree.rows_seen for tree in each.trees.values()) for stream, each in learned.items()}
+    chosen = disjoint({stream: (set(each.origins), rows[stream]) for stream, each in learned.items()})
     # The name says that the object is the same, so its appearances are not compared.
     model = merge([learned[stream] for stream in chosen], force=True).to_bytes()
     models = store.model(name)
@@ -439,17 +416,10 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
     return Merged(model, tuple(chosen), tuple(stream for stream in learned if stream not in chosen))
 
 
-def rows_of(learned: Learned) -> int:
-    """Training rows that were inserted into the trees of a saved model."""
-    return sum(tree.rows_seen for tree in learned.trees.values())
-
-
 def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
     """The names of models that share no frames: those of the most streams of frames first, then of the most rows.
 
-    Parameters
-    ----------
-    parts : of each model, the origins of its trees, one for each stream of frames, and its rows
+    A part is the origins of the trees of a model, one for each stream of frames, and its rows.
 
     >>> disjoint({"door": ({"a"}, 90), "yard": ({"b"}, 20), "both": ({"a", "c"}, 70)})
     ['both', 'yard']

@@ -1,21 +1,7 @@
 """The desired state of a fleet: its streams, as a file in TOML describes them, and the nodes that they leave.
 
-    name = "site"                      # the default is the name of the file
-    store = "state"                    # a folder, file:///..., or s3://bucket/prefix
-    every = 5.0                        # seconds between two states of a stream in the store
-    registry = "10.0.0.1:5690"         # where clients ask for the streams of a cluster; the default is its head
-    keys = "keys"                      # folder of the clients' keys on that machine
-
-    [streams.cam-7]
-    source = "rtsp://camera/1"
-    box = [120, 80, 64, 48]            # or boxes = { anna = [...] }, model = "a.safetensors", models = { anna = "..." }
-    settings = { "coreset.size" = 128 }
-    cores = 0.5                        # that Ray reserves for it; the default is 1
-    labels = { site = "north" }        # labels that its node must have
-    follow = ["anna"]                  # objects whose merged model this stream searches for
-
-Relative paths count from the folder of the file. Every error is a `FleetError` that names the stream, or the line of
-a file that is not TOML.
+docs/how-to/fleet.md shows such a file. Relative paths count from its folder. Every error is a `FleetError` that names
+the stream, or the line of a file that is not TOML.
 """
 
 from __future__ import annotations
@@ -87,16 +73,7 @@ class StreamSpec:
     labels    labels that its node must have
     follow    objects whose merged model it searches for
 
-    Raises
-    ------
-    FleetError
-        If a value is not valid.
-
-    Examples
-    --------
-    >>> cam = StreamSpec("cam-7", "rtsp://camera/1", boxes={"": Box(120, 80, 64, 48)})
-    >>> cam.digest == StreamSpec("cam-7", "rtsp://camera/1", boxes={"": Box(120, 80, 64, 48)}, cores=2.0).digest
-    True
+    It raises FleetError if a value is not valid.
     """
 
     name: str
@@ -189,13 +166,7 @@ class FleetSpec:
 
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
-        """Read the file of a fleet.
-
-        Raises
-        ------
-        FleetError
-            If it cannot be read, has no streams, or has a key or value that is not valid.
-        """
+        """Read the file of a fleet; FleetError if it has no streams, or has a key or value that is not valid."""
         try:
             text = path.read_text(encoding="utf-8")
         except OSError as error:

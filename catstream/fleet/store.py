@@ -8,7 +8,6 @@ Below each of these folders, only the newest holder decides what comes next:
 
     <token>/claim     the claim of a holder; the token is one higher than that of every earlier claim
     <token>/<n>       its states, every few seconds: n = 1, 2, 3 ...
-    <token>/removed   the stream was removed by the holder: nobody reads the states of lower tokens any more
 
     claim   create the claim of the highest token + 1; this fails if another process has it already: try the next one
     write   create the next state under the own token, then list the folder: if there is a claim with a higher token,
@@ -24,7 +23,7 @@ from, and are as good as any. What can fail besides:
     a write ends half way           The state is damaged, and is passed over.
 
 A holder removes all states but the newest two, and the older claims that have no state any more. Of a stream that was
-removed, a claim stays, so that a holder that comes back later finds that it was superseded. See
+removed, a state that says so stays, and hides what a holder writes that comes back later. See
 docs/decisions/0078-fencing-by-name.md.
 
 A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
@@ -58,7 +57,7 @@ STORE_SECONDS = 10.0  # limit of a request to a server
 _CONNECT_SECONDS = 3.0  # limit to connect to it
 
 _FOLDERS = ("streams", "models", "fleet")
-_CLAIM, _REMOVED = "claim", "removed"
+_CLAIM = "claim"
 _DIGITS = 8  # of a token and of the number of a state in their names
 _KEPT = 2  # newest states
 _ATTEMPTS = 20  # to claim, or to read the newest state, while other processes change the folder
@@ -76,10 +75,6 @@ class Objects:
 
     Every method raises StoreError if the store cannot be reached or is full; a call that creates an object may
     nevertheless have created it. No message contains a credential.
-
-    Parameters
-    ----------
-    url : folder, file:///folder or s3://bucket/prefix
     """
 
     def __init__(self, url: str) -> None:
@@ -246,36 +241,28 @@ class _Place(NamedTuple):
 class Listing:
     """What is below the folder of a stream.
 
-    claims   tokens of the claims
-    states   places of the states
-    removed  highest token under which the stream was removed; 0 if it never was
+    claims  tokens of the claims
+    states  places of the states
     """
 
     claims: set[int]
     states: set[_Place]
-    removed: int
 
     @classmethod
     def of(cls, names: Iterable[str]) -> Listing:
         """The listing of these names, each without the folder; names of other things are passed over.
 
         >>> Listing.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
-        Listing(claims={1}, states={_Place(token=1, number=7)}, removed=0)
+        Listing(claims={1}, states={_Place(token=1, number=7)})
         """
-        claims, states, removed = set[int](), set[_Place](), 0
+        claims, states = set[int](), set[_Place]()
         for name in names:
             token, _, rest = name.partition("/")
             if token.isdecimal() and rest.isdecimal():
                 states.add(_Place(int(token), int(rest)))
             elif token.isdecimal() and rest == _CLAIM:
                 claims.add(int(token))
-            elif token.isdecimal() and rest == _REMOVED:
-                removed = max(removed, int(token))
-        return cls(claims, states, removed)
-
-    def newest(self, after: int = 0) -> list[_Place]:
-        """The places of the states that may be read, those of holders with a token above `after`, newest first."""
-        return sorted((place for place in self.states if place.token > max(after, self.removed)), reverse=True)
+        return cls(claims, states)
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,8 +290,9 @@ class States:
         """Return the newest state of a holder with a token above `after`. If there is none, no state is read."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
-                states = (self._read(place) for place in self.listed().newest(after))
-                return next((state for state in states if state is not None), None)
+                places = sorted((place for place in self.listed().states if place.token > after), reverse=True)
+                state = next(filter(None, map(self._read, places)), None)
+                return None if state is None or state.facts.get("removed") else state
         raise self._busy("read")
 
     def claim(self, holder: str) -> Claim:
@@ -326,11 +314,10 @@ class States:
 
     def clear(self) -> None:
         """Remove all states. A process that still holds them is superseded: it can no longer write."""
-        if self.listed().newest():
-            token = self.claim(_this_process()).token
-            with contextlib.suppress(FileExistsError):
-                self._objects.create(self._name(token, _REMOVED), b"")
-            self.remove_up_to(token, self.listed(), kept=0)
+        if self.newest() is not None:
+            claim = self.claim(_this_process())
+            claim.write({}, {"removed": True})
+            self.remove_up_to(claim.token, self.listed(), kept=1)
 
     def listed(self) -> Listing:
         """What is below the folder now."""
@@ -348,20 +335,14 @@ class States:
         self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
 
     def remove_up_to(self, token: int, found: Listing, kept: int) -> None:
-        """Remove the states up to a token but the newest ones, and the claims below it that have none any more.
-
-        Parameters
-        ----------
-        found : what is below the folder
-        """
+        """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
         before = sorted(place for place in found.states if place.token <= token)
         stay = before[len(before) - kept :]
         for place in before[: len(before) - kept]:
             self._objects.remove(self._name(*place))
         for old in sorted(found.claims - {place.token for place in stay}):
             if old < token:
-                for rest in (_REMOVED, _CLAIM):
-                    self._objects.remove(self._name(old, rest))
+                self._objects.remove(self._name(old, _CLAIM))
 
     def _name(self, token: int, rest: str | int) -> str:
         return f"{self.folder}/{token:0{_DIGITS}}/{rest if isinstance(rest, str) else f'{rest:0{_DIGITS}}'}"
@@ -396,19 +377,10 @@ class Claim:
         return f"Claim({self._states.folder!r}, token={self.token})"
 
     def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Write a state, and remove states that are no longer needed.
+        """Write a state, and remove those that are no longer needed.
 
-        Parameters
-        ----------
-        files : contents by name
-        facts : JSON about the state: frame, time ...
-
-        Raises
-        ------
-        FencedError
-            If another process has claimed the stream. Every later call raises it too.
-        StoreError
-            If the store cannot be reached or is full. The caller continues, and writes a newer state later.
+        Raises FencedError if another process has claimed the stream, and again in every later call; StoreError if the
+        store fails: the caller continues, and writes a newer state later.
         """
         if self._fenced is not None:
             raise self._fenced
@@ -435,16 +407,8 @@ class Claim:
 class Store:
     """The store of a fleet: the states of its streams, its desired state, and its merged models.
 
-    Parameters
-    ----------
-    url : folder, file:///folder or s3://bucket/prefix; the folder has to exist, or is made by `check`
-
-    Raises
-    ------
-    FleetError
-        If the URL is not valid, or contains credentials.
-    MissingExtraError
-        If a package is not installed that it needs.
+    The URL is a folder, file:///folder or s3://bucket/prefix. The folder has to exist, or is made by `check`. It raises
+    FleetError if the URL is not valid, or contains credentials.
     """
 
     def __init__(self, url: str) -> None:
