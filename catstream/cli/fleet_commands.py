@@ -37,14 +37,7 @@ _SHOW_SECONDS = 0.5  # between two pictures of the status
 _STARTED = ("running", "waiting", "paused", "ended", "failed")
 
 
-class _InOrder(click.Group):
-    """Lists the commands in the order in which they are defined."""
-
-    def list_commands(self, _: click.Context) -> list[str]:
-        return list(self.commands)
-
-
-@click.group(cls=_InOrder)
+@click.group()
 def fleet() -> None:
     """Run many streams on one machine or on many, and change them while they run.
 
@@ -140,7 +133,7 @@ def _watch(console: Console, fleet: Fleet) -> None:
                     click.echo(f"the fleet {fleet.name} was ended from elsewhere")
                     return
     finally:
-        _show(console, status)
+        console.print(*_tables(status), sep="\n")
 
 
 def _has_started(stream: StreamStatus) -> bool:
@@ -167,7 +160,7 @@ def status(fleet: str, keys: str, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(found)))
     else:
-        _show(screen(), found)
+        screen().print(*_tables(found), sep="\n")
     if any(each.trouble for each in found.streams.values()):
         sys.exit(1)
 
@@ -299,10 +292,6 @@ def down(running: Fleet) -> None:
     _down(running)
 
 
-def _show(console: Console, status: FleetStatus) -> None:
-    console.print(*_tables(status), sep="\n")
-
-
 def _tables(status: FleetStatus) -> list[RenderableType]:
     """The streams, what is wrong with them, a line for each, and the nodes."""
     troubles = [Text(f"{each.name}: {each.trouble}") for each in status.streams.values() if each.trouble]
@@ -320,11 +309,10 @@ def _streams(status: FleetStatus) -> Table:
 
 
 def _nodes(status: FleetStatus) -> Table:
-    numbers = ("\nreserved", "\nof cores", "\nstreams")
+    numbers = ("\nstreams", "\ncores")
     shown = table("\nnode", "\nstate", "\naddress", *numbers, "\nlabels", right=numbers)
     for each in status.nodes.values():
         labels = ", ".join(f"{key}={value}" for key, value in each.labels.items())
-        shown.add_row(
-            each.name, each.state, each.address, f"{each.used:.2g}", f"{each.cores:.3g}", str(each.streams), labels
-        )
+        cores = f"{each.used:.3g} of {each.cores:.3g}"
+        shown.add_row(each.name, each.state, each.address, str(each.streams), cores, labels)
     return shown

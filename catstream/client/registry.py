@@ -1,8 +1,8 @@
 """The registry of a fleet: which streams there are, and where each of them runs.
 
-The controller of the fleet serves the registry (`RegistryServer`), and knows the state of all streams. A client needs
-keys with the role "watch", or none if the fleet runs on this machine for this user alone. It gets the endpoint and the
-public key of a stream's pipeline, and connects with its own keys. No secret is transmitted.
+The controller of the fleet serves the registry, and knows the state of all streams. A client needs keys with the role
+"watch", or none on this machine. It gets the endpoint and the public key of a stream's pipeline, and connects with its
+own keys. No secret is transmitted.
 
 The address of a fleet is HOST:PORT of its registry, or the name of a fleet of this user on this machine; it is empty
 for the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STREAM` in the only fleet.
@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from time import monotonic
-from typing import Self
 from uuid import uuid4
 
 import msgspec
@@ -36,7 +35,7 @@ _QUIET_SECONDS = 1.0  # without a message of a stream, after which the registry 
 _PREFIX = "fleet://"
 
 
-class Registry:
+class Registry(AbstractContextManager["Registry"]):
     """Asks the controller of a fleet for its streams and nodes.
 
     Parameters
@@ -101,9 +100,6 @@ class Registry:
     def close(self) -> None:
         """Disconnect."""
         self._requester.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -238,13 +234,11 @@ class FollowedStream:
         return moved
 
 
-class RegistryServer:
+class RegistryServer(AbstractContextManager["RegistryServer"]):
     """Answers the questions of clients about the streams and nodes of a fleet.
 
-    listen    tcp://HOST:PORT, of which this port listens, or a folder for a Unix socket; empty for a private folder
-    keys      folder of the fleet's keys, required if other machines can reach the host; empty for none
-    status    returns the present state of the fleet
-    endpoint  where it listens; other processes of this user find it by the fleet's name
+    It listens at tcp://HOST:PORT with the keys of a folder, or in a folder of Unix sockets; if that is empty, in a new
+    one. Other processes of this user find it by the fleet's name.
     """
 
     def __init__(self, listen: str, keys: str, status: Callable[[], FleetStatus]) -> None:
@@ -271,24 +265,17 @@ class RegistryServer:
         """Stop listening."""
         self._stack.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
 def address_of(fleet: str, stream: str) -> str:
     """The address of a stream of a fleet: fleet://head:5690/cam-7, or fleet://cam-7 in the only fleet."""
-    return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}" if fleet else f"{_PREFIX}{stream}"
+    return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}".replace("///", "//")
 
 
 def fleet_and_stream(endpoint: Place) -> tuple[str, str] | None:
-    """The fleet and the stream of an address, None if it is no address of a stream of a fleet.
-
-    >>> fleet_and_stream("fleet://head:5690/cam-7"), fleet_and_stream("fleet://cam-7"), fleet_and_stream("run")
-    (('head:5690', 'cam-7'), ('', 'cam-7'), None)
-    """
+    """The fleet and the stream of an address, None if it is no address of a stream of a fleet."""
     if not (text := str(endpoint)).startswith(_PREFIX):
         return None
     fleet, _, stream = text.removeprefix(_PREFIX).rpartition("/")

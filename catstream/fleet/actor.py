@@ -58,14 +58,10 @@ def given_model(stream: str, name: str) -> str:
 class Stream:
     """Runs the pipeline of one stream until it ends or is stopped, and stores its state again and again.
 
-    Parameters
-    ----------
-    spec : the stream
-    node : id of its node
-    address : IP address at which other machines reach its sockets; empty if all clients are on this machine
-    clients : the clients that may connect, by name, if there is an address
-    store : the store of the fleet
-    every : seconds between two states in the store
+    node     id of its node
+    address  IP address at which other machines reach its sockets; empty if all clients are on this machine
+    clients  the clients that may connect, by name, if there is an address
+    every    seconds between two states in the store
     """
 
     def __init__(
@@ -95,10 +91,7 @@ class Stream:
     ) -> tuple[StreamStatus, bool]:
         """The state of the stream now, and whether it ended because another process has claimed it.
 
-        Parameters
-        ----------
-        clients : the only clients that may connect from now on
-        follow : the objects whose newest merged model it searches for from now on
+        From now on, only these clients may connect, and it searches for these objects by their newest merged models.
         """
         with self._lock:
             if clients is not None and clients != self._clients:

@@ -59,12 +59,8 @@ class StreamActor(Stream):
 class Controller:
     """Runs as one actor of a fleet; the methods without an underscore are called by `catstream.fleet.fleet`.
 
-    Parameters
-    ----------
-    name : name of the fleet
-    store : URL of the store
-    listen : tcp://HOST:PORT at which the registry listens, or the folder of its Unix socket
-    keys : folder of the keys of the clients; empty if all are on this machine
+    listen  tcp://HOST:PORT at which the registry listens, or the folder of its Unix socket
+    keys    folder of the keys of the clients; empty if all are on this machine
     """
 
     def __init__(self, name: str, store: str, listen: str, keys: str) -> None:
@@ -89,8 +85,6 @@ class Controller:
         except CatstreamError as error:
             self._trouble = error
         self._start_thread(self._run)
-
-    # What `Fleet` calls.
 
     def ready(self) -> None:
         """Return if it has begun; raise CatstreamError if its address is in use, or its store cannot be read."""
@@ -146,8 +140,6 @@ class Controller:
             self._registry.close()
         return [f"{name}: {trouble}" for name, trouble in sorted(self._unstored.items()) if trouble]
 
-    # What it does.
-
     def _change(self, change: Callable[[FleetSpec], FleetSpec], models: Models | None = None) -> list[str]:
         """Change the desired state, once that is stored."""
         with self._changing:
@@ -160,7 +152,7 @@ class Controller:
             with self._lock:
                 lines = self._spec.changes(spec, self._ended, are_running=self._phase == "up")
                 self._spec, self._phase = spec, "up"
-                self._mark_draining()
+                self._nodes = self._marked(self._nodes)
                 for name in self._actors.keys() - spec.streams.keys():  # it would be taken for the next one of its name
                     self._actors[name].status, self._actors[name].ended = None, ""
                 self._recent = self.status()
@@ -210,8 +202,7 @@ class Controller:
 
         found, existing = nodes(), actors(self._name)  # without the lock: they ask the head
         with self._lock:
-            self._nodes = found
-            self._mark_draining()
+            self._nodes = self._marked(found)
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
@@ -232,8 +223,8 @@ class Controller:
                     del self._actors[name]
             self._recent = self.status()
 
-    def _mark_draining(self) -> None:
-        self._nodes = [replace(node, draining=node.name in self._spec.draining) for node in self._nodes]
+    def _marked(self, found: list[Node]) -> list[Node]:
+        return [replace(node, draining=node.name in self._spec.draining) for node in found]
 
     def _wanted(self, name: str) -> StreamSpec | None:
         """The spec of a stream; None if it should not run now."""
@@ -339,8 +330,6 @@ class Controller:
             actor.state, actor.order, actor.ended = "pending", order, ""
             actor.since = actor.started = actor.answered = now
 
-    # What is shown.
-
     def _stream_status(self, name: str) -> StreamStatus:
         spec, actor, now = self._spec.streams[name], self._actors.get(name, Actor()), time.monotonic()
         source = without_password(spec.source)
@@ -372,11 +361,7 @@ class Controller:
 
 
 def actor_name(fleet: str, *words: str) -> str:
-    """The name of an actor: of the controller, or of a stream with what it was started for.
-
-    >>> actor_name("site", "stream", "cam-7", "ab12/1/cd34"), actor_name("site", "controller")
-    ('site/stream/cam-7/ab12/1/cd34', 'site/controller')
-    """
+    """The name of an actor: site/controller, or site/stream/cam-7/ and what it was started for."""
     return "/".join((fleet, *words))
 
 
@@ -395,10 +380,7 @@ def actors(fleet: str) -> dict[str, str]:
 
 
 def nodes() -> list[Node]:
-    """The nodes of the connected cluster by name.
-
-    A node that was started again appears once. A dead node appears as long as no living node has its name.
-    """
+    """The nodes of the connected cluster by name; a dead one as long as no living node has its name."""
     import ray
 
     found: dict[str, Node] = {}
@@ -411,9 +393,6 @@ def nodes() -> list[Node]:
             {key: value for key, value in (entry.get("Labels") or {}).items() if not key.startswith("ray.io/")},
             entry["Alive"],
         )
-        before = found.get(node.name)
-        if before is not None and before.alive and node.alive:  # two machines with one name
-            found[node.id[:12]] = node
-        elif before is None or node.alive:
+        if node.name not in found or node.alive:
             found[node.name] = node
     return sorted(found.values(), key=lambda node: node.name)

@@ -188,7 +188,7 @@ class Fleet:
     def merge(self, *names: str, object: str = UNNAMED) -> Merged:
         """Merge what streams have learned of an object; the streams that follow it then search for it by the result.
 
-        Without names, all streams that have learned of it are merged. The object "" is also the only one of each stream.
+        Without names, all streams that have learned of it are merged. "" is also the only object of each stream.
         """
         import ray
         from ray.exceptions import RayTaskError
@@ -408,8 +408,9 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
         raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
     rows = {stream: sum(tree.rows_seen for tree in each.trees.values()) for stream, each in learned.items()}
     chosen = disjoint({stream: (set(each.origins), rows[stream]) for stream, each in learned.items()})
+    first, *others = (learned[stream] for stream in chosen)
     # The name says that the object is the same, so its appearances are not compared.
-    model = merge([learned[stream] for stream in chosen], force=True).to_bytes()
+    model = (merge([first, *others], force=True) if others else first).to_bytes()
     models = store.model(name)
     if (before := models.newest()) is None or before.files["model"] != model:  # followers get each new model
         models.put({"model": model}, {"streams": chosen})

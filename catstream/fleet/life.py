@@ -136,17 +136,8 @@ def order(spec: StreamSpec, nodes: Collection[Node]) -> str:
 
 
 def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: float) -> Event | None:
-    """What happens to a stream now; None for nothing.
+    """What happens to a stream now, None for nothing; it should not run if there is no spec of it.
 
-    Parameters
-    ----------
-    spec : the stream; None if it should not run
-    actor : its actor
-    nodes : of the cluster
-    now : the time, by the clock of `actor`
-
-    Examples
-    --------
     >>> gate = StreamSpec("gate", "demo:1")
     >>> event(gate, Actor(), [], 0.0)
     'wanted'

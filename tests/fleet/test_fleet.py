@@ -168,7 +168,7 @@ def test_a_stream_runs_on_a_node_with_its_labels_and_continues_elsewhere_after_t
     cluster.remove_node(cluster.south, allow_graceful=False)
     until(lambda: (found := fleet.status().streams["gate"]).token > before.token and found.state == "running")
     assert fleet.status().streams["gate"].node == "north"
-    assert fleet.status().nodes["south"].state == "dead"
+    until(lambda: fleet.status().nodes["south"].state == "dead")
     cluster.south = cluster.add_node(
         num_cpus=1, object_store_memory=80 << 20, node_name="south", labels={"site": "south"}
     )

@@ -113,6 +113,7 @@ def test_of_streams_that_share_frames_the_one_with_the_most_is_merged(store, tmp
     put_state(tmp_path, "porch", 0, 14)  # the frames of the door, and two more
     merged = merge_streams(store, ["door", "porch", "yard"], "anna", named=False)
     assert (set(merged.streams), merged.skipped) == ({"porch", "yard"}, ("door",))
+    assert Learned.from_bytes(merge_streams(store, ["hall"], "", named=True).model, "").origins == learned(2).origins
 
 
 def test_a_stream_that_is_named_has_to_know_the_object(store):
