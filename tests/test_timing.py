@@ -33,7 +33,7 @@ ORDER = [*wire.ORDER, *services.ORDER, *web.ORDER, *FLEET]
 #: The files whose time limits are in one table, and what a time limit looks like there.
 LIMITS = {
     "wire": (
-        [*CATSTREAM.glob("wire/*.py"), *CATSTREAM.glob("client/*.py")],
+        [*CATSTREAM.glob("wire/*.py"), *(CATSTREAM / "client" / f"{name}.py" for name in ("control", "subscription"))],
         r"^\s*\w*(?:_SECONDS|_MILLISECONDS|PATIENCE)(?:: \w+)? = [0-9.]|: float = [1-9]",
     ),
     "services": (

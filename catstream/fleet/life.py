@@ -19,17 +19,10 @@ SILENT_SECONDS = 120.0  # without an answer, after which a stream is started aga
 STOPPING_SECONDS = 30.0  # limit for a stream to store its last state and to end, before it is killed
 _PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die each time, or be superseded
 
+#: There is no actor; Ray places it, or it starts; it reports; it stores its last state and ends, or was killed.
 State = Literal["absent", "pending", "working", "stopping"]
 Event = Literal["wanted", "reports", "interrupted", "silent", "unwanted", "superseded", "ended", "gone"]
 Action = Literal["", "start", "stop", "restart", "kill"]
-
-#: What each state is, for the documentation.
-STATES: dict[State, str] = {
-    "absent": "there is no actor",
-    "pending": "Ray places it, or it starts",
-    "working": "it reports",
-    "stopping": "it stores its last state and ends, or was killed",
-}
 
 #: What each event is, for the documentation.
 EVENTS: dict[Event, str] = {
