@@ -76,7 +76,8 @@ IMPORTERS = {
     "mcap": ["catstream/sinks/recording/container.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
-        *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py", "catstream/client/registry.py"),
+        *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
+        "catstream/client/registry.py",
         *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
         *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
     ],

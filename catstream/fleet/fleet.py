@@ -254,11 +254,11 @@ class Fleet:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with ExitStack() as stack:
             file = stack.enter_context((self._folder / "lock").open("w"))
-            if not lock(file.fileno()):
-                deadline = time.monotonic() + _START_SECONDS
-                while not (self._folder / "address").exists() and time.monotonic() < deadline:
-                    time.sleep(_LOOK_SECONDS)
-                return
+            deadline = time.monotonic() + _START_SECONDS
+            while not lock(file.fileno()):
+                if (self._folder / "address").exists() or time.monotonic() > deadline:
+                    return
+                time.sleep(_LOOK_SECONDS)
             (self._folder / "address").unlink(missing_ok=True)  # of one that was killed
             if not (self._folder / "token").exists():
                 write_atomically(self._folder / "token", secrets.token_hex(32).encode(), mode=0o600)
@@ -312,7 +312,9 @@ class Fleet:
                     raise FleetError(f"this process uses the cluster at {other}: it can use one cluster only")
                 return
             try:
-                ray.init(address, namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR, **options)
+                ray.init(
+                    address or "local", namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR, **options
+                )
             except Exception as error:  # Ray has no type for a node that does not start
                 why = str(error).strip().partition("\n")[0]
                 if address is None:

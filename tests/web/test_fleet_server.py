@@ -71,7 +71,7 @@ def test_without_the_token_nothing_of_the_fleet_is_shown(fleet, serve_fleet, unt
 
 def test_the_picture_of_a_stream_is_small_and_has_the_boxes_of_its_objects(fleet, page, camera, turning, folder, until):
     fleet.stream("cam-7", endpoint=str(folder), models={"anna": 3})
-    fleet.stream("cam-8", "unplaced")
+    fleet.stream("cam-8", "failed")
     shown(page, until)
     with turning(camera):
         answer = page.get("/streams/cam-7/picture.jpg")
