@@ -15,12 +15,11 @@ from groups import CHECK
 from sequences import sequences
 from table import command, mean_and_error
 
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.accuracy import rows_of
+from catstream.applications.evaluation.datasets import Sequence, Starts, choose_starts
 from catstream.applications.evaluation.onepass import evaluate
 from catstream.applications.evaluation.peers import PEERS, Peer
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.starts import Starts, choose_starts
-from catstream.applications.evaluation.summary import rows_of
 from catstream.errors import SettingsError
 from catstream.settings import Settings
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
@@ -18,12 +17,11 @@ import numpy as np
 from accuracy import many_sequences, videos
 from table import Cell, Table, benchmark, command
 
-from catstream.applications.evaluation.metrics import overlaps
+from catstream.applications.evaluation.accuracy import FLIP
+from catstream.applications.evaluation.datasets import jittered
 from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.report import write_strips
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.starts import jittered
-from catstream.applications.evaluation.summary import FLIP
+from catstream.applications.evaluation.scores import overlaps
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.detection.detector import Detector
@@ -43,7 +41,6 @@ LOST = 0.5  #: success of the best run, below which the sequence counts as lost
 APART, TOGETHER = 0.3, 5  #: overlap at most, and number of successive frames in which two runs have parted
 BEFORE, AFTER = 10, 3  #: frames around a fork that are shown
 STATE = ("score", "lead", "size", "aspect", "level")  #: headings for the values of `state`
-STRIPS = 10  #: film strips of the worst runs
 
 
 class Fork(NamedTuple):
@@ -88,9 +85,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     frames = observed(forks)
     yield overview(forks, frames)
     yield around(forks, frames)
-    if options.strips:
-        worst = [min(each, key=success) for each in found.values()]
-        write_strips(options.strips, worst, STRIPS)
 
 
 def success(run: EvaluationRun) -> float:
@@ -242,5 +236,4 @@ if __name__ == "__main__":
         figures,
         many_sequences(command(__doc__)),
         jitter=(7, "number of first boxes"),
-        strips=(Path, f"write film strips of the {STRIPS} worst runs"),
     )

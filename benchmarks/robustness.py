@@ -21,12 +21,20 @@ from accuracy import available, many_sequences, videos
 from groups import CHECK
 from table import Cell, Table, benchmark, command, mean_and_error
 
-from catstream.applications.evaluation.attributes import attributes_of, read_attributes
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.accuracy import Row, rows_of
+from catstream.applications.evaluation.datasets import (
+    Sequence,
+    Start,
+    Starts,
+    jittered,
+    one_pass,
+    read_attributes,
+    spatial,
+    temporal,
+    with_attributes,
+)
 from catstream.applications.evaluation.onepass import TRACKERS, evaluate
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.starts import Start, Starts, jittered, one_pass, spatial, temporal
-from catstream.applications.evaluation.summary import Row, rows_of
 from catstream.settings import Settings
 
 PARTS = ("ope", "tre", "sre", "jitter")
@@ -54,7 +62,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     groups = groups_of(sequences)
     yield overview(found, described(options), groups)
     attributes = {"any": [sequence.name for sequence in sequences]}
-    attributes |= attributes_of(sequences, seen)
+    attributes |= with_attributes(attributes["any"], seen)
     yield by_attribute(found, attributes)
     if lost := list(losses(found, groups)):
         yield Table("Losses", LOSSES, lost, "mean: of the share of the runs of a sequence; ±: its standard error")

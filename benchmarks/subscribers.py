@@ -18,7 +18,7 @@ from sequences import rendered, video
 from table import Table, benchmark, command
 
 import catstream
-from catstream.applications.loadtest.subscribers import Subscribers
+from catstream.applications.loadtest.load import Subscribers
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.settings import Settings

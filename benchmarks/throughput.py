@@ -17,7 +17,7 @@ from sequences import named, rendered, video
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.metrics import score
+from catstream.applications.evaluation.scores import score
 from catstream.box import Box
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors

@@ -17,8 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from catstream.applications.finding.search import find
-    from catstream.applications.finding.sightings import Sighting
+    from catstream.applications.finding.find import Sighting, find
     from catstream.applications.summaries.images import summarize
     from catstream.applications.summaries.selection import Selection
     from catstream.box import Box
@@ -69,12 +68,12 @@ _HOMES = {
     "Pipeline": "pipeline",
     "Selection": "applications.summaries.selection",
     "Settings": "settings",
-    "Sighting": "applications.finding.sightings",
+    "Sighting": "applications.finding.find",
     "Subscription": "client.subscription",
     "Track": "messages.kinds",
     "Tracker": "tracker",
     "control": "client.control",
-    "find": "applications.finding.search",
+    "find": "applications.finding.find",
     "merge": "run.learned",
     "subscribe": "client.subscription",
     "summarize": "applications.summaries.images",

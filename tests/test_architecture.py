@@ -35,11 +35,7 @@ LEVELS = [
 IMPORTERS = {
     "numpy": ["catstream", "services"],
     "scipy": [
-        *(
-            "catstream/numerics/ridge.py",
-            "catstream/compression/reduce.py",
-            "catstream/applications/evaluation/multiple.py",
-        ),
+        *("catstream/numerics/ridge.py", "catstream/compression/reduce.py"),
         "catstream/numerics/threads.py",  # its BLAS is limited, too
     ],
     "cv2": [
@@ -79,14 +75,15 @@ IMPORTERS = {
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
         "catstream/client/registry.py",
         *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
-        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/attributes.py"),
+        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
+        *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
     ],
-    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/provenance.py"],
-    "psutil": ["catstream/applications/loadtest/usage.py"],
+    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/runs.py"],
+    "psutil": ["catstream/applications/loadtest/latency.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],
-    "uvicorn": ["catstream/web/server.py", "catstream/web/connections.py"],
-    "prometheus_client": ["catstream/web/metrics.py"],
+    "uvicorn": ["catstream/web/server.py"],
+    "prometheus_client": ["catstream/web/prometheus.py"],
     "rich": ["catstream/cli"],
 }
 

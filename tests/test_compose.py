@@ -120,9 +120,9 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
 
 
 def test_without_a_token_of_the_user_the_page_makes_one():
-    """An empty variable counts as none: tests/cli/test_serving.py."""
+    """An empty variable counts as none: tests/web/test_view.py."""
     assert filled_in(SERVICES["view"]["environment"]["VIEW_TOKEN"]) == ""
-    assert "--no-token" not in SERVICES["view"]["command"]
+    assert "--token" not in SERVICES["view"]["command"]
 
 
 def test_a_process_that_dies_resumes_from_its_state():

@@ -26,7 +26,7 @@ import catstream
 catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
 from catstream.cli import COMMANDS, load_command
 from catstream.services.__main__ import main
-import catstream.applications.evaluation.runs, catstream.applications.evaluation.report
+import catstream.applications.evaluation.runs, catstream.applications.evaluation.accuracy
 for name in COMMANDS:
     load_command(name)
 """

@@ -17,7 +17,7 @@ import page  # noqa: E402
 import sections  # noqa: E402
 from groups import CHECK, TUNED  # noqa: E402
 
-from catstream.applications.evaluation.attributes import read_attributes  # noqa: E402
+from catstream.applications.evaluation.datasets import read_attributes  # noqa: E402
 
 SCRIPTS = {path.relative_to(ROOT).as_posix() for path in BENCHMARKS.rglob("*.py") if "__main__" in path.read_text()}
 SCRIPTS -= {"benchmarks/page.py"}  # it writes the pages

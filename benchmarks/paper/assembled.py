@@ -12,9 +12,8 @@ from unittest.mock import patch
 import numpy as np
 from accuracy import starts_of
 
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.datasets import Sequence, Start
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.starts import Start
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree

@@ -16,8 +16,7 @@ import shared  # noqa: F401
 from accuracy import MEANS, accuracy_command, compared, difference, means, starts_of, videos
 from table import Table, benchmark
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.starts import Start
+from catstream.applications.evaluation.datasets import Sequence, Start
 from catstream.settings import Settings
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.

@@ -33,9 +33,8 @@ from sequences import scratch, sequences
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.finding.files import File
+from catstream.applications.finding.find import File, Search
 from catstream.applications.finding.scan import Scan, Seen
-from catstream.applications.finding.search import Search
 from catstream.box import Box
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid

@@ -20,7 +20,7 @@ from sequences import named, scratch
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.metrics import score
+from catstream.applications.evaluation.scores import score
 from catstream.settings import PRESETS, Settings
 from catstream.video.writer import VideoWriter
 

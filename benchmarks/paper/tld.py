@@ -16,9 +16,9 @@ import shared  # noqa: F401
 from accuracy import accuracy_command, compared, videos
 from table import Table, benchmark
 
-from catstream.applications.evaluation.metrics import score
+from catstream.applications.evaluation.accuracy import rows_of
 from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.summary import rows_of
+from catstream.applications.evaluation.scores import score
 from catstream.settings import PRESETS, Settings
 
 #: Tracker -> success in the paper: mean of ten videos, and Panda.

@@ -9,8 +9,7 @@ from importlib import import_module
 
 import click
 
-from catstream.cli.interrupts import INTERRUPTS, stopped
-from catstream.cli.output import complain
+from catstream.cli.common import INTERRUPTS, complain, stopped
 from catstream.errors import CatstreamError
 
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
@@ -41,8 +40,14 @@ COMMANDS = {
 }
 
 #: Module of the commands that share a module, or whose module has another name.
-_MODULES = dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "control")
-_MODULES["fleet"] = "fleet_commands"
+_MODULES = {
+    "fleet": "fleet_commands",
+    **dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "operate"),
+    **dict.fromkeys(("watch", "status"), "attach"),
+    **dict.fromkeys(("find", "merge"), "models"),
+    **dict.fromkeys(("evaluate", "loadtest"), "measure"),
+    **dict.fromkeys(("keys", "settings"), "configure"),
+}
 
 
 def load_command(name: str) -> click.Command:
@@ -83,6 +88,7 @@ def group() -> None:
 def main() -> None:
     """Run the command line. The exit code is 1 after an error, which is one line, and `INTERRUPTED` after Ctrl-C."""
     INTERRUPTS.install()
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child of this process imports a file of the current folder
     if sys.stdout is None:  # it was closed before the start (>&-): what is printed is dropped
         sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     try:

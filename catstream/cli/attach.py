@@ -1,14 +1,29 @@
-"""Options that select a running pipeline, and the wait until it answers."""
+"""`catstream watch` and `status`, and the options and the wait of all commands that attach to a running pipeline."""
 
 from __future__ import annotations
 
+import json
+import sys
+import time
+from contextlib import suppress
+from typing import Any
+
 import click
+import msgspec
+import numpy as np
 from rich.console import Console
 
-from catstream.client.registry import address_of
-from catstream.client.subscription import wait_until_running
-from catstream.services.options import NumberRange, combined, with_keys
+from catstream.cli.common import complain, screen, table
+from catstream.client.registry import address_of, locate
+from catstream.client.subscription import AnyMessage, Subscription, subscribe, wait_until_running
+from catstream.errors import SilenceError
+from catstream.messages.kinds import Health
+from catstream.messages.names import counted
+from catstream.services.options import NumberRange, combined, with_json, with_keys
+from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
+
+_PROCESSES = CHANNELS["health"].senders
 
 
 def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
@@ -47,14 +62,194 @@ with_wait = click.option(
 
 
 def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
-    """Wait until a process of the pipeline answers, and return its endpoint; a terminal shows a status line.
-
-    Raises
-    ------
-    ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs, or the pipeline rejects the keys.
-    SilenceError
-        If no process answers in time.
-    """
+    """Wait until a process of the pipeline answers, and return its endpoint; a terminal shows a status line."""
     with Console(stderr=True).status(f"waiting for a pipeline {endpoint and f'at {endpoint}'}"):
         return wait_until_running(endpoint, keys, seconds)
+
+
+@click.command()
+@click.argument("channel", type=click.Choice(["tracks", "models", "health", "samples", "features", "previews"]))
+@with_endpoint
+@with_wait
+@click.option("--object", "name", metavar="NAME", help="Only the tracks, models or samples of this object.")
+@click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
+@click.option("--count", type=click.IntRange(min=1), help="End after this number of messages.")
+def watch(
+    channel: str, endpoint: str, keys: str, wait: float, name: str | None, as_json: bool, count: int | None
+) -> None:
+    """Print the messages of a running pipeline, one a line, until it ends or Ctrl-C.
+
+    The pipeline does not wait; messages that are dropped because this command
+    is too slow are counted as missed. An array is printed as its dtype, shape
+    and norm.
+
+    \b
+    CHANNEL
+      tracks    state and box of each object in each frame
+      models    the last model of each object, then each new one
+      health    the counters of each process, every second
+      samples   the samples for the trainer
+      features  the training rows of each frame
+      previews  small pictures of the newest frame
+
+    \b
+    EXAMPLES
+      catstream watch tracks
+      catstream watch tracks --json | jq .box
+      catstream watch tracks --object anna
+      catstream watch models --endpoint run --count 1 --json
+      catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
+    """
+    seen = 0
+    with Subscription[AnyMessage](endpoint, channel, object=name, keys=keys) as messages:
+        with suppress(KeyboardInterrupt):
+            wait_for_pipeline(messages.endpoint, messages.keys, wait)
+            for message in messages:
+                fields = msgspec.to_builtins(message, builtin_types=(bytes,), enc_hook=_described)
+                click.echo(json.dumps(fields, default=_described) if as_json else _line(fields))
+                seen += 1
+                if seen == count:
+                    break
+        reason = f": {messages.end.reason}" if messages.end is not None else ""
+        click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
+
+
+def _described(value: bytes | np.ndarray) -> dict[str, object]:
+    """Return a description of a picture or an array, for which JSON has no form."""
+    if isinstance(value, bytes):
+        return {"bytes": len(value)}
+    norm = float(np.linalg.norm(np.nan_to_num(value)))
+    return {"dtype": value.dtype.name, "shape": list(value.shape), "norm": round(norm, 6)}
+
+
+def _line(value: Any) -> str:
+    """The fields of a message that are not empty, each after its name; those of a field that has fields in brackets."""
+    if isinstance(value, dict):
+        shown = ((name, f"({_line(each)})" if isinstance(each, dict) else _line(each)) for name, each in value.items())
+        return "  ".join(f"{name} {text}" for name, text in shown if text not in ("", "()"))
+    if isinstance(value, list | tuple):
+        return ",".join(map(_line, value))
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    return "" if value is None else str(round(value, 4) if isinstance(value, float) else value)
+
+
+@click.command()
+@with_endpoint
+@with_json
+@click.option(
+    "--wait", default=3.0, show_default=True, type=NumberRange(0), help="Maximum seconds to wait for health reports."
+)
+def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
+    """Show the state of a running pipeline.
+
+    The exit code is 0 if all three processes sent a health report, else 1, so
+    that it can be the health check of a container.
+
+    "learning" are the messages that the compressor has not received, or not
+    stored; "rejected" those that do not conform to the protocol; "reports" the
+    age of the last health report of each process.
+
+    \b
+    EXAMPLES
+      catstream status
+      catstream status --endpoint run --json
+    """
+    place, reports = _collect_reports(endpoint, keys, wait)
+    summary = _summary(place, reports)
+    if as_json:
+        click.echo(json.dumps(summary))
+    elif reports:
+        click.echo(_format(summary))
+        if any(summary["objects"]):  # they have names
+            figures = ("state", "score", "model", "leaves")
+            shown = table("object", *figures, right=figures)
+            for name, each in summary["objects"].items():
+                shown.add_row(name or "-", *("-" if cell is None else str(cell) for cell in each.values()))
+            screen().print("", shown, sep="\n")
+    if silent := [name for name in _PROCESSES if name not in reports]:
+        if not reports:
+            locate(endpoint, keys)  # its error says why a stream of a fleet does not run
+        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}")
+        sys.exit(1)
+
+
+def _collect_reports(endpoint: str, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
+    """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
+    deadline = time.monotonic() + seconds
+    reports: dict[str, list[Health]] = {}
+    with subscribe(endpoint, "health", timeout=seconds, keys=keys) as health, suppress(SilenceError):
+        for report in health:
+            reports.setdefault(report.process, []).append(report)
+            if len(reports) == len(_PROCESSES) and len(reports["detector"]) > 1:
+                break
+            health.timeout = max(0.0, deadline - time.monotonic())
+    return health.endpoint, reports
+
+
+def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
+    """Return the figures from the reports, None for those that are missing."""
+    newest = {name: history[-1] for name, history in reports.items()}
+    counters = {name: newest[name].counters if name in newest else {} for name in _PROCESSES}
+    objects = {name: newest[name].objects if name in newest else {} for name in _PROCESSES}
+    detector, history = counters["detector"], reports.get("detector", [])
+    seconds = history[-1].time - history[0].time if history else 0.0
+    rate = (history[-1].counters["sent"] - history[0].counters["sent"]) / seconds if seconds > 0 else None
+    state = "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "tracking"
+
+    def whole(process: str, *names: str) -> dict[str, int | None]:
+        own = counters[process]
+        return {name: int(own[name]) if name in own else None for name in names}
+
+    return {
+        "endpoint": place,
+        "ok": len(reports) == len(_PROCESSES),
+        "state": state if detector else None,
+        "objects": {
+            name: {
+                "state": "present" if each["present"] else "absent",
+                "score": round(each["score"], 2),
+                "model_version": int(each["model_version"]),
+                "leaves": int(objects["compressor"][name]["leaves"]) if name in objects["compressor"] else None,
+            }
+            for name, each in objects["detector"].items()
+        },
+        "frames": whole("detector", "sent")["sent"],
+        "frames_per_second": None if rate is None else round(max(0.0, rate), 1),  # that of a restarted detector falls
+        "lag": int(detector["sent"] - detector["taken"]) if detector else None,
+        "not_stored": int(detector["sent"] - detector["stored"]) if detector else None,
+        **whole("detector", "model_version"),
+        **whole("compressor", "level", "leaves", "nodes", "bytes"),
+        **whole("detector", "skipped", "reopened"),
+        "lost_seconds": detector.get("lost_seconds"),
+        "trouble": {name: report.trouble for name, report in newest.items() if report.trouble},
+        "rejected": {name: int(counters[name].get("rejected", 0)) for name in reports},
+        "processes": {
+            name: {"seconds_ago": round(max(0.0, time.time() - report.time), 2), "counters": report.counters}
+            for name, report in newest.items()
+        },
+    }
+
+
+def _format(summary: dict[str, Any]) -> str:
+    at = {name: "-" if value is None else value for name, value in summary.items()}
+    size = (summary["bytes"] or 0) / 1e6
+    lines = {
+        "pipeline": at["endpoint"],
+        "state": at["state"],
+        "frames": f"{at['frames']}, {at['frames_per_second']} a second",
+        "learning": f"{at['lag']} messages behind, {at['not_stored']} not stored",
+        "model": at["model_version"],
+    }
+    if summary["bytes"] is not None:  # None before the first box
+        lines["trees"] = f"{at['leaves']} leaves, {at['nodes']} nodes, level {at['level']}, {size:.1f} MB"
+    if summary["skipped"] is not None:  # None for a file
+        lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "available"
+        lines["source"] = f"{lost}, {counted(summary['skipped'], 'frame')} skipped"
+        if summary["reopened"] is not None:  # a demo is never lost
+            lines["source"] += f", reopened {counted(summary['reopened'], 'time')}"
+    lines["rejected"] = counted(sum(summary["rejected"].values()), "message")
+    lines["reports"] = ", ".join(f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
+    if summary["trouble"]:
+        lines["trouble"] = "; ".join(f"{name}: {trouble}" for name, trouble in summary["trouble"].items())
+    return "\n".join(f"{name:10} {line}" for name, line in lines.items())

@@ -9,8 +9,7 @@ from typing import TypeVar
 import click
 import numpy as np
 
-from catstream.box import Box
-from catstream.cli.output import line_of, messages
+from catstream.cli.common import line_of, messages
 from catstream.cli.track import track
 from catstream.services.options import PATH
 
@@ -33,8 +32,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
     A dahlia moves over a lake: it rotates and changes its size, the brightness
     changes, a similar flower crosses it, a pagoda occludes it, and it leaves the
     picture and returns. With --objects, several flowers and other objects with
-    names cross and occlude one another. Their accuracy is measured as MOTA, IDF1
-    and HOTA.
+    names cross and occlude one another.
 
     The source demo:SEED is a part of the video as a live source, which needs no
     camera and never ends. SEED is a number; demo:SEED?size=640x480&rate=10
@@ -65,7 +63,7 @@ def demo(output: Path, objects: int, frames: int | None, render_only: bool, live
 
 def _one(output: Path, frames: int | None, render_only: bool) -> None:
     """The demo with one object."""
-    from catstream.applications.evaluation.metrics import score
+    from catstream.applications.evaluation.scores import score
     from catstream.video.demo import FRAMES, write
 
     frames = frames or FRAMES
@@ -85,7 +83,7 @@ def _one(output: Path, frames: int | None, render_only: bool) -> None:
 
 def _several(output: Path, objects: int, frames: int | None, render_only: bool) -> None:
     """The demo with several objects."""
-    from catstream.applications.evaluation.multiple import score_multiple
+    from catstream.applications.evaluation.scores import score
     from catstream.sinks.formats import CsvSink
     from catstream.video.crowd import FRAMES, write
 
@@ -95,13 +93,13 @@ def _several(output: Path, objects: int, frames: int | None, render_only: bool) 
         return
     tracks = output / "tracks"
     _track(video, tracks, [word for name, box in truth[0].items() for word in ("--box", f"{name}={box}")])
-    found: list[dict[str, Box | None]] = [{} for _ in truth]
-    for each in CsvSink.tracks(tracks / "crowd.csv"):
-        found[each.frame][each.object] = each.box
-    scores = score_multiple(truth, found)
-    click.echo(
-        f"MOTA {scores.mota:.3f}, IDF1 {scores.idf1:.3f}, HOTA {scores.hota:.3f}, identity switches {scores.switches}"
-    )
+    found = {(track.frame, track.object): track.box for track in CsvSink.tracks(tracks / "crowd.csv")}
+    for name in truth[0]:
+        boxes = (
+            np.array([box or (np.nan,) * 4 for box in each])
+            for each in ([found.get((number, name)) for number in range(frames)], [boxes[name] for boxes in truth])
+        )
+        click.echo(f"success rate of {name}: {score(*boxes).success:.3f}")
     click.echo(f"annotated video: {tracks / 'crowd.mp4'}")
 
 

@@ -19,8 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.cli.attach import with_fleet_address
-from catstream.cli.files import check_file
-from catstream.cli.output import screen, table
+from catstream.cli.common import check_file, screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
 from catstream.errors import FleetError

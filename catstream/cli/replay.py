@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from catstream.cli.output import line_of, messages, screen, table
+from catstream.cli.common import line_of, messages, screen, table
 from catstream.errors import RecordingError
 from catstream.messages.kinds import Features, Model, Run, Track
 from catstream.services.options import PATH, NumberRange

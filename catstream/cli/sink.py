@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
-from catstream.cli.interrupts import INTERRUPTS
+from catstream.cli.common import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Run
 from catstream.messages.names import counted, listed

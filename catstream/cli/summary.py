@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from catstream.cli.files import check_file
-from catstream.cli.interrupts import INTERRUPTS
-from catstream.cli.output import line_of, messages
+from catstream.cli.common import INTERRUPTS, check_file, line_of, messages
 from catstream.errors import ObjectError, SettingsError, VideoError
 from catstream.messages.kinds import Features, Health
 from catstream.messages.names import boxes_by_name, listed, split_name

@@ -2,16 +2,62 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import secrets
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from catstream.cli.attach import with_endpoint, with_fleet_address
-from catstream.cli.serving import PORT, Address, AddressType, with_token
-from catstream.services.options import with_keys
+from catstream.services.options import Decorator, combined, with_keys
 
 if TYPE_CHECKING:
     from catstream.web.app import Site
+
+#: The port of the page if none is given.
+PORT = 8000
+
+_LARGEST_PORT = 65535
+
+
+class Address(NamedTuple):
+    """Address that the web server listens on."""
+
+    host: str
+    port: int
+
+
+class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
+    """Parameter type [HOST:]PORT; the default host is 127.0.0.1.
+
+    >>> [tuple(AddressType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]
+    [('127.0.0.1', 8080), ('0.0.0.0', 8000), ('::', 0)]
+    """
+
+    name = "[HOST:]PORT"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Address:
+        host, _, port = str(value).rpartition(":")
+        if not (port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT):
+            self.fail(f"expected [HOST:]PORT, for example 8000 or 0.0.0.0:8000, got {value!r}", param, ctx)
+        return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
+
+
+def with_token(prefix: str = "") -> Decorator:
+    """Add --PREFIXtoken; the argument `token` is a new random one if none is given, and None for "none"."""
+    return combined(
+        "token",
+        lambda token: None if token == "none" else token or secrets.token_hex(16),
+        click.option(
+            f"--{prefix}token",
+            "token",
+            envvar="VIEW_TOKEN",
+            show_envvar=True,
+            metavar="TOKEN",
+            help="Token for access to the page, at least 16 characters; by default a random one. "
+            '"none" lets every user of this machine watch and control.',
+        ),
+    )
+
 
 _with_listen = click.option(
     "--listen",
@@ -30,10 +76,9 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
     """Watch and control a running pipeline in a browser.
 
     The page shows the picture with the box of each object, the score, frames
-    per second, the coreset trees, and the most surprising frames. If you draw
-    a box on the picture, the pipeline tracks that object. If no pipeline runs,
-    the page waits for the next one. Ctrl-C ends the server; the pipeline
-    continues.
+    per second, and the coreset trees. If you draw a box on the picture, the
+    pipeline tracks that object. If no pipeline runs, the page waits for the
+    next one. Ctrl-C ends the server; the pipeline continues.
 
     Only users with the token can watch and control: open the printed link,
     which ends with it. Each start makes a new token; give one of your own to
@@ -41,19 +86,10 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
     other machines, use an ssh tunnel, or a proxy with TLS.
 
     \b
-    Serves
-      /              the page
-      /live.mjpeg    the newest pictures with their tracks drawn in, as MJPEG
-      /metrics       metrics for Prometheus: catstream_frames_total ...
-      /healthz       200 while this server runs
-      /readyz        200 while all processes send health reports
-
-    \b
     EXAMPLES
       catstream view
       catstream view --endpoint run --listen 8080
-      catstream view --listen 0.0.0.0:8000
-      VIEW_TOKEN_FILE=my-token catstream view
+      VIEW_TOKEN=$(cat my-token) catstream view --listen 0.0.0.0:8000
     """
     from catstream.web.app import pipeline_site
 
@@ -68,26 +104,16 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
 def fleet_view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
     """Watch all streams of a fleet in a browser.
 
-    The page shows the state and a small picture of each stream, those in
-    trouble first, and the nodes. Each stream links to its own page, which is
-    that of catstream view. If the fleet does not answer, the page keeps its
-    last state and waits. Ctrl-C ends the server; the fleet continues. Token
-    and encryption are as for catstream view.
-
-    \b
-    Serves
-      /                 the page of the fleet
-      /streams/NAME/    the page of a stream
-      /metrics          metrics of all streams and nodes for Prometheus
-      /healthz          200 while this server runs
-      /readyz           200 while the fleet answers
+    The page is a table of the streams, those in trouble first, and of the
+    nodes. Each stream links to its own page, which is that of catstream view.
+    If the fleet does not answer, the page keeps its last state and waits.
+    Ctrl-C ends the server; the fleet continues. Token and encryption are as
+    for catstream view.
 
     \b
     EXAMPLES
       catstream fleet view
       catstream fleet view --fleet head.example.org:5690 --keys my-keys
-      catstream fleet view --listen 0.0.0.0:8000
-      VIEW_TOKEN_FILE=my-token catstream fleet view
     """
     from catstream.web.app import fleet_site
 

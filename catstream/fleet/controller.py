@@ -206,7 +206,7 @@ class Controller:
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
-            for name in existing.keys() | self._spec.streams.keys():
+            for name in sorted(existing.keys() | self._spec.streams.keys()):
                 self._actors.setdefault(name, Actor())
             for name, actor in self._actors.items():
                 self._ask(name, actor, existing.get(name))

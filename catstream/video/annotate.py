@@ -106,26 +106,6 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
     return _small(image, boxes, width)
 
 
-def draw_boxes(preview: Preview, colours: Colours, width: int) -> bytes:
-    """Return a small version of a preview with the box of each object, without text.
-
-    Parameters
-    ----------
-    colours : the colours of the objects
-    width : width of the small image in pixels
-
-    Returns
-    -------
-    JPEG file
-    """
-    image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        return preview.jpeg
-    scale = image.shape[1] / preview.width
-    boxes = [(np.array(box) * scale, _bgr(colours.of(name))) for name, box in preview.boxes.items()]
-    return _small(image, boxes, width)
-
-
 def _small(image: np.ndarray, boxes: Sequence[tuple[np.ndarray, _Colour]], width: int) -> bytes:
     """Return a JPEG file of an image at this width, with boxes x, y, w, h in pixels of the image and their colours."""
     scale = width / image.shape[1]

@@ -5,17 +5,10 @@
 /metrics          metrics for Prometheus
 /healthz          200 while this server runs
 /readyz           200 while all processes of the pipeline send health reports, or while the fleet answers
-
-of a pipeline only
-
-/pictures/N.jpg   the picture of frame N
-/live.mjpeg       the newest pictures with their tracks drawn in, as an MJPEG stream
-/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...}
-
-of a fleet only
-
-/streams/NAME/              all of the above for the pipeline of a stream
-/streams/NAME/picture.jpg   a small picture of its newest frame; 204 if there is none
+/pictures/N.jpg   the picture of frame N of a pipeline
+/live.mjpeg       the newest pictures of a pipeline with their tracks drawn in, as an MJPEG stream
+/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...} to a pipeline
+/streams/NAME/    all of the above for the pipeline of a stream of a fleet
 """
 
 from __future__ import annotations
@@ -25,32 +18,32 @@ import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Annotated, Literal
+from typing import Literal
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
-from starlette.routing import BaseRoute, Mount, Route
+from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages.kinds import ObjectName
-from catstream.messages.schema import OnlyWith
 from catstream.video.annotate import draw_preview
-from catstream.web import metrics
-from catstream.web.connections import body_of
-from catstream.web.feed import Feed, PipelineFeed
-from catstream.web.streams import FleetFeed
-from catstream.web.timing import KEEP_ALIVE_SECONDS, RETRY_SECONDS, UPDATE_SECONDS
+from catstream.web import prometheus
+from catstream.web.feed import Feed, FleetFeed, PipelineFeed
 from catstream.wire.codec import decode_json
 
 _PAGE = Path(__file__).with_name("page")
+
+UPDATE_SECONDS = 0.1  #: between two updates
+COMMENT_SECONDS = 5.0  #: without an update, after which a comment is sent, which detects closed connections
+RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
+_MAX_BODY = 4096  # bytes
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.
 _CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, CatstreamError: 503}
@@ -67,30 +60,11 @@ def fleet_site(fleet: str = "", keys: str = "") -> Site:
 
 
 class Site:
-    """The web application of a pipeline or of a fleet, without access control; `Server` serves it.
-
-    Attributes
-    ----------
-    app : the application
-    """
+    """The web application of a pipeline or of a fleet, `app`, without access control; `Server` serves it."""
 
     def __init__(self, feed: PipelineFeed | FleetFeed) -> None:
         self._feed = feed
         self._closed = False
-        routes = self._routes(feed)
-        self.app = Starlette(lifespan=self._lifespan, routes=routes, exception_handlers={CatstreamError: _failed})
-
-    def close(self) -> None:
-        """End the streams of all open pages; called before the shutdown of a server, which waits for them."""
-        self._closed = True
-
-    @asynccontextmanager
-    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        self._feed.start()
-        yield
-        await asyncio.wait([self._feed.stop()])
-
-    def _routes(self, feed: PipelineFeed | FleetFeed) -> list[BaseRoute]:
         common = [
             Route("/", self._index),
             Route("/events", self._events),
@@ -105,13 +79,22 @@ class Site:
             Route("/live.mjpeg", self._live),
             Route("/control", self._control, methods=["POST"]),
         ]
-        if isinstance(feed, PipelineFeed):
-            return of_pipeline
-        return [
-            *common,
-            Route("/streams/{stream}/picture.jpg", partial(_small_picture, feed)),
-            Mount("/streams/{stream}", routes=of_pipeline),
-        ]
+        of_fleet = [*common, Mount("/streams/{stream}", routes=of_pipeline)]
+        self.app = Starlette(
+            lifespan=self._lifespan,
+            routes=of_pipeline if isinstance(feed, PipelineFeed) else of_fleet,
+            exception_handlers={CatstreamError: _failed},
+        )
+
+    def close(self) -> None:
+        """End the streams of all open pages; called before the shutdown of a server, which waits for them."""
+        self._closed = True
+
+    @asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        self._feed.start()
+        yield
+        await asyncio.to_thread(self._feed.stop)
 
     async def _index(self, request: Request) -> Response:
         self._feed_of(request)
@@ -121,7 +104,7 @@ class Site:
         return _endless(request, self._updates(self._feed_of(request)), "text/event-stream")
 
     async def _metrics(self, request: Request) -> Response:
-        text = metrics.text(self._feed_of(request))
+        text = prometheus.text(self._feed_of(request))
         return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _healthz(self, _: Request) -> Response:
@@ -146,9 +129,15 @@ class Site:
         # A page of another origin cannot send this content type without a CORS preflight request.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise HTTPException(415, "expected application/json\n")
-        command = decode_json(await body_of(request), Command)
+        body = b""
+        async for part in request.stream():
+            if len(body := body + part) > _MAX_BODY:
+                raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
+        command = decode_json(body, Command)
         if command.object and command.verb not in ("set-box", "forget"):
             raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
+        if (command.box is not None) != (command.verb == "set-box"):
+            raise ProtocolError(f"expected a box with set-box and with no other verb, got {command.verb}")
         try:
             answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
@@ -174,7 +163,7 @@ class Site:
                 if parts := feed.dashboard.updates(seen):
                     last_sent = monotonic()
                     yield _event(parts)
-                elif monotonic() - last_sent > KEEP_ALIVE_SECONDS:
+                elif monotonic() - last_sent > COMMENT_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)
@@ -189,12 +178,10 @@ class Site:
                 newest = feed.dashboard.newest
                 if newest is not None and newest != shown:
                     shown = newest
-                    jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.objects.colours)
+                    jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.colours)
                     # The boundary after the picture is sent with it: many clients show a picture only after it.
-                    yield b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n--picture\r\n" % (
-                        len(jpeg),
-                        jpeg,
-                    )
+                    head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+                    yield head + jpeg + b"\r\n--picture\r\n"
                 await asyncio.sleep(UPDATE_SECONDS)
 
 
@@ -207,18 +194,13 @@ def _event(parts: dict[str, object]) -> str:
     return f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
 
 
-async def _small_picture(feed: FleetFeed, request: Request) -> Response:
-    jpeg = await feed.picture(request.path_params["stream"])
-    return Response(status_code=204) if jpeg is None else Response(jpeg, media_type="image/jpeg")
-
-
 @dataclass(frozen=True, slots=True)
 class Command:
     """A command of the page: the fields of `catstream.messages.kinds.Command` that it may set."""
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: ObjectName = ""
-    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    box: Box | None = None
     keep: bool = False
 
 

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from itertools import takewhile
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from catstream.messages.heads import TREES
-from catstream.messages.kinds import End, Features, FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
-from catstream.web.objects import Objects
-from catstream.web.recent import Recent
-from catstream.web.surprising import SurprisingFrames
-from catstream.web.timing import POINT_SECONDS, RATE_SECONDS
+from catstream.messages.kinds import End, FleetStatus, Health, Model, NodeStatus, Preview, State, StreamStatus, Track
+from catstream.video.palette import Colours
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 #: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
 
-#: States in which the pipeline of a stream runs.
-RUNNING = ("running", "waiting", "paused")
-
+POINT_SECONDS = 0.25  #: between two points of the charts
+RATE_SECONDS = 2.0  #: over which frames per second are counted
 _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
-_PICTURES = 64  # number of pictures that a page may still request, for slow connections, or whose features may arrive
+_PICTURES = 64  # number of pictures that a page with a slow connection may still request
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
@@ -31,32 +31,20 @@ _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
 class Parts:
-    """The state of a page, in parts that are sent to each open page when they have changed.
+    """The state of a page, in parts that are sent to each open page, in this order, when they have changed.
 
-    Parameters
-    ----------
-    parts : of each part the function that returns it as JSON values; its argument is the number of changes since the
-        page has received it. The parts are sent in this order
-
-    Attributes
-    ----------
-    phase, reason : phase of the pipeline or the fleet, and the reason of its end or silence
+    A part is a function of the number of its changes since the page has received it, which returns JSON values.
     """
 
     def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
         self._parts = parts
         self._revisions: Counter[str] = Counter()
         self.phase: Phase = "waiting"
-        self.reason = ""
+        self.reason = ""  #: of the end or the silence
         self._mark_changed(*parts)
 
     def updates(self, seen: dict[str, int]) -> dict[str, object]:
-        """Return the parts that have changed since the last call for this page; all at first.
-
-        Parameters
-        ----------
-        seen : revisions that the page has received; empty at first, updated by this call
-        """
+        """Return the parts that have changed since the last call with these revisions; they are empty at first."""
         news = {name: self._revisions[name] - seen.get(name, 0) for name in self._parts}
         seen.update(self._revisions)
         return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
@@ -73,16 +61,34 @@ class Parts:
         self._revisions.update(parts)
 
 
+@dataclass(slots=True)
+class ShownObject:
+    """One of the objects that a pipeline tracks.
+
+    colour         colour of its box, #rrggbb
+    state, score   those of its newest track
+    version        version of the model that scored it
+    began          number of its first frame, None before its first track
+    seq            number of its newest track, 0 before the first
+    trained        version of its newest model that has arrived
+    model_latency  seconds from the track of a frame to the model that was trained on it, None before the first model
+    """
+
+    colour: str
+    state: State = "absent"
+    score: float = 0.0
+    version: int = 0
+    began: int | None = None
+    seq: int = 0
+    trained: int = 0
+    model_latency: float | None = None
+
+
 class Dashboard(Parts):
     """Receives messages, and returns the updates for each open page.
 
     It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
     then it drops all state of the previous one.
-
-    endpoint, source : endpoint of the pipeline, and its source of frames
-    health : last health report of each process
-    last_reports : arrival time of the last health report of each process
-    objects : the objects that are tracked
     """
 
     def __init__(self) -> None:
@@ -92,9 +98,8 @@ class Dashboard(Parts):
                 "status": self._status_part,
                 "tracks": self._tracks_part,
                 "picture": self._picture_part,
-                "points": self._points_part,
+                "points": lambda new: list(self._points)[-new:],
                 "trees": self._trees_part,
-                "surprising": self._surprising_part,
             }
         )
         self.endpoint = self._attached = ""
@@ -106,15 +111,15 @@ class Dashboard(Parts):
         """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
         self.reason = self.source = ""
-        self.objects = Objects()
-        self.health: dict[str, Health] = {}
-        self.last_reports: dict[str, float] = {}
-        self.pictures = Recent[int, Preview](_PICTURES)
-        self.surprising = SurprisingFrames(self.pictures)
+        self.objects: dict[str, ShownObject] = {}  #: in the order in which they began
+        self.colours = Colours()
+        self.health: dict[str, Health] = {}  #: the last report of each process
+        self.last_reports: dict[str, float] = {}  #: the times at which they arrived
+        self._pictures: dict[int, Preview] = {}
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
-        self._arrivals = Recent[int, float](_FRAMES)  # of the first track of each frame
-        self._tracks = Recent[int, dict[str, Track]](_TRACKS)  # by frame and object
+        self._arrivals: dict[int, float] = {}  # of the first track of each frame
+        self._tracks: dict[int, dict[str, Track]] = {}  # by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
 
     def attach(self, endpoint: str) -> None:
@@ -127,9 +132,7 @@ class Dashboard(Parts):
     def take(self, message: object, now: float, run: str = "") -> None:
         """Process a message that arrived at the time `now`, in seconds of a monotonic clock.
 
-        Parameters
-        ----------
-        run : id of the run that it is from; empty if its sender knows none: then it is of the run that is shown
+        It is from the run with this id; without one, from the run that is shown.
         """
         if run in self._runs_before:
             return
@@ -150,10 +153,8 @@ class Dashboard(Parts):
             case Health():
                 self._add_health(message, now)
             case Preview():
-                self._add_preview(message)
-            case Features():
-                if self.surprising.add_features(message, self.objects.models):
-                    self._mark_changed("surprising")
+                _remember(self._pictures, message.frame, message, _PICTURES)
+                self._mark_changed("picture")
             case End() if self.phase != "ended":
                 self.phase, self.reason = "ended", message.reason
                 self._mark_changed("status")
@@ -163,29 +164,42 @@ class Dashboard(Parts):
         recent = takewhile(lambda moment: now - moment <= RATE_SECONDS, reversed(self._arrivals.values()))
         return len(list(recent)) / RATE_SECONDS
 
-    def counter(self, process: str, name: str) -> float | None:
-        """Return a counter from the last health report of a process, None if there is none."""
-        return self.health[process].counters.get(name) if process in self.health else None
-
-    def object_counters(self, process: str, name: str) -> dict[str, float]:
-        """Return a counter of each object that is shown from the last health report of a process, by object."""
-        objects = self.health[process].objects if process in self.health else {}
-        return {each: objects[each][name] for each in self.objects.shown if name in objects.get(each, {})}
-
     def picture(self, frame: int) -> Preview | None:
-        """Return the picture of a recent frame or of a surprising one, None if it is not kept."""
-        if frame in self.pictures:
-            return self.pictures[frame]
-        return next((one.preview for one in self.surprising.frames if one.frame == frame), None)
+        """Return the picture of a recent frame, None if it is not kept."""
+        return self._pictures.get(frame)
 
     @property
     def newest(self) -> tuple[Preview, list[Track]] | None:
         """The newest picture, and the tracks of its frame as far as they have arrived."""
-        preview = next(reversed(self.pictures.values()), None)
+        preview = next(reversed(self._pictures.values()), None)
         if preview is None:
             return None
         tracks = self._tracks.get(preview.frame, {}).values()
-        return preview, [track for track in tracks if track.object in self.objects.shown]
+        return preview, [track for track in tracks if track.object in self.objects]
+
+    def _add_track(self, track: Track, now: float) -> None:
+        name, before = track.object, self.objects.get(track.object)
+        if before is None or before.began not in (None, track.began):  # another object of this name begins
+            self.objects[name] = ShownObject(self.colours.of(name))
+        each = self.objects[name]
+        each.state, each.score, each.version, each.seq = track.state, track.score, track.model_version, track.seq
+        each.began = track.began
+        if self._frame is None or track.frame != self._frame[0]:
+            self._frame = track.frame, track.time
+            _remember(self._tracks, track.frame, {}, _TRACKS)
+            _remember(self._arrivals, track.frame, now, _FRAMES)
+        self._tracks[track.frame][name] = track
+        self._add_point(now)
+        self._mark_changed("tracks")
+
+    def _add_model(self, model: Model, now: float) -> None:
+        """Measure the latency of a new model of a shown object; not of another object that had the name before."""
+        each, arrived = self.objects.get(model.object), self._arrivals.get(model.frame)
+        if each is None or each.began != model.began or each.trained == model.version:
+            return
+        each.trained = model.version
+        if arrived is not None:
+            each.model_latency = round(now - arrived, 3)
 
     def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
@@ -197,63 +211,51 @@ class Dashboard(Parts):
         self._mark_changed("status", "trees")
 
     def _add_objects(self, health: Health) -> None:
-        """Add and drop objects by a health report of the detector."""
-        before = set(self.objects.shown)
-        if dropped := self.objects.add_health(health):
-            self.surprising.drop(dropped)
-            self._mark_changed("surprising")
-        if before != self.objects.shown.keys():
+        """Add the objects of the detector's report that have no track yet; drop those that it does not track."""
+        if len(health.objects) != health.counters.get("objects"):  # it has no track of some objects yet
+            return
+        before = set(self.objects)
+        for name, counters in health.objects.items():
+            if name not in self.objects:
+                version = int(counters.get("model_version", 0))
+                state: State = "absent" if not counters.get("present") else "present" if version else "bootstrapping"
+                self.objects[name] = ShownObject(self.colours.of(name), state, counters.get("score", 0.0), version)
+        sent = health.counters.get("sent", 0)  # a track after this one may be of an object that began later
+        for name in [name for name, each in self.objects.items() if name not in health.objects and each.seq <= sent]:
+            del self.objects[name]
+        self.colours.keep(self.objects)
+        if before != self.objects.keys():
             self._mark_changed("tracks")
 
-    def _add_track(self, track: Track, now: float) -> None:
-        if self.objects.add_track(track):
-            self.surprising.drop({track.object})
-            self._mark_changed("surprising")
-        if self._frame is None or track.frame != self._frame[0]:
-            self._frame = track.frame, track.time
-            self._tracks[track.frame], self._arrivals[track.frame] = {}, now
-        self._tracks[track.frame][track.object] = track
-        self._add_point(now)
-        self._mark_changed("tracks")
-
-    def _add_model(self, model: Model, now: float) -> None:
-        arrived = self._arrivals.get(model.frame)
-        self.objects.add_model(model, None if arrived is None else round(now - arrived, 3))
-
-    def _add_preview(self, preview: Preview) -> None:
-        self.pictures[preview.frame] = preview
-        if self.surprising.measure(preview.frame):
-            self._mark_changed("surprising")
-        self._mark_changed("picture")
-
     def _add_point(self, now: float) -> None:
-        if not self.objects.shown or now - self._last_point < POINT_SECONDS:
+        if not self.objects or now - self._last_point < POINT_SECONDS:
             return
         self._last_point = now
         objects = {
             name: (round(each.score, 3), each.model_latency, each.version, each.state != "absent")
-            for name, each in self.objects.shown.items()
+            for name, each in self.objects.items()
         }
         self._points.append((round(now, 3), self.rate(now), objects))
         self._mark_changed("points")
 
     def _status_part(self, _: int) -> dict[str, object]:
+        counters = self.health["detector"].counters if "detector" in self.health else {}
         return {
             "phase": self.phase,
             "reason": self.reason,
             "endpoint": self.endpoint,
             "source": self.source,
-            "paused": bool(self.counter("detector", "paused")),
-            "waiting": bool(self.counter("detector", "waiting")),
-            "lost_seconds": self.counter("detector", "lost_seconds"),
-            "skipped": self.counter("detector", "skipped"),
+            "paused": bool(counters.get("paused")),
+            "waiting": bool(counters.get("waiting")),
+            "lost_seconds": counters.get("lost_seconds"),
+            "skipped": counters.get("skipped"),
         }
 
     def _tracks_part(self, _: int) -> dict[str, object]:
         frame, time = self._frame or (None, None)
         objects = [
             {"name": name, "colour": each.colour, "state": each.state, "score": each.score, "version": each.version}
-            for name, each in self.objects.shown.items()
+            for name, each in self.objects.items()
         ]
         return {"frame": frame, "time": time, "objects": objects}
 
@@ -262,9 +264,6 @@ class Dashboard(Parts):
             return None
         preview = self.newest[0]
         return {"frame": preview.frame, "width": preview.width, "height": preview.height, "boxes": preview.boxes}
-
-    def _points_part(self, new: int) -> list[_Point]:
-        return list(self._points)[-new:]
 
     def _trees_part(self, _: int) -> dict[str, object]:
         counted = self.health["compressor"].objects if "compressor" in self.health else {}
@@ -281,37 +280,36 @@ class Dashboard(Parts):
             "objects": objects,
         }
 
-    def _surprising_part(self, _: int) -> dict[str, object]:
-        frames = [
-            {"frame": one.frame, "object": one.object}
-            | {"surprise": round(one.surprise, 3), "colour": self.objects.colours.of(one.object)}
-            | {"box": one.preview.boxes[one.object], "width": one.preview.width, "height": one.preview.height}
-            for one in self.surprising.frames
-        ]
-        return {"measured": self.surprising.measured, "frames": frames}
+
+def _remember(recent: dict[Key, Value], key: Key, value: Value, most: int) -> None:
+    """Set the newest entry of a dictionary of the last `most` ones."""
+    recent.pop(key, None)
+    recent[key] = value
+    if len(recent) > most:
+        del recent[next(iter(recent))]
 
 
 class FleetDashboard(Parts):
     """Receives the status of a fleet, and returns the updates for each open page: all streams and nodes, once a second.
 
     It keeps the last status while the fleet does not answer.
-
-    Attributes
-    ----------
-    status : the last status, without a stream before the first
-    age : seconds since the last status arrived, 0 while the fleet answers
     """
 
     def __init__(self) -> None:
         super().__init__(
             {
-                "status": self._status_part,
-                "streams": lambda _: {name: _stream(each) for name, each in self.status.streams.items()},
-                "nodes": lambda _: {name: _node(each) for name, each in self.status.nodes.items()},
+                "status": lambda _: {
+                    "name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age),
+                },
+                "streams": lambda _: {  # JSON objects of a browser have numbers first
+                    name: _shown(each) | {"models": list(each.models.items())}
+                    for name, each in self.status.streams.items()
+                },
+                "nodes": lambda _: {name: _shown(each) for name, each in self.status.nodes.items()},
             }
-        )
+        )  # fmt: skip
         self.status = FleetStatus("", 0.0)
-        self.age = self._arrived = 0.0
+        self.age = self._arrived = 0.0  # seconds since the last status arrived, 0 while the fleet answers
 
     def take(self, status: FleetStatus, now: float) -> None:
         """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""
@@ -324,24 +322,8 @@ class FleetDashboard(Parts):
         if self.phase == "silent":
             self.age = now - self._arrived
 
-    def _status_part(self, _: int) -> dict[str, object]:
-        return {"name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age)}
 
-
-def _stream(stream: StreamStatus) -> dict[str, Any]:
-    """Return what the page shows of a stream; `picture` is whether it can show one of its newest frame."""
-    names = ("state", "trouble", "node", "source", "frame", "skipped", "stored_seconds")
-    return {name: getattr(stream, name) for name in names} | {
-        "models": list(stream.models.items()),
-        "picture": bool(stream.endpoint) and stream.state in RUNNING,
-    }
-
-
-def _node(node: NodeStatus) -> dict[str, Any]:
-    """Return what the page shows of a node."""
-    names = ("state", "address", "streams")
-    return {name: getattr(node, name) for name in names} | {
-        "cores": round(node.cores, 2),
-        "used": round(node.used, 2),
-        "labels": [f"{name}={value}" for name, value in sorted(node.labels.items())],
-    }
+def _shown(status: StreamStatus | NodeStatus) -> dict[str, Any]:
+    """Return what the page shows of a stream or a node: neither the address nor a key of a pipeline."""
+    hidden = ("name", "endpoint", "server", "token")
+    return {field.name: getattr(status, field.name) for field in fields(status) if field.name not in hidden}

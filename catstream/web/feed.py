@@ -1,47 +1,57 @@
-"""Keeps the state of a page up to date: that of a pipeline, with its messages."""
+"""Keeps the state of a page up to date: a thread reads the messages of a pipeline, or asks the registry of a fleet.
+
+The thread reads with the public client API, and passes each message to the event loop of the server, which alone uses
+the dashboard.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from math import inf
 from time import monotonic
+from typing import Any, cast
+
+from starlette.exceptions import HTTPException
 
 from catstream.box import Box
 from catstream.client.control import Control
-from catstream.client.registry import locate
-from catstream.client.subscription import AnyMessage, Subscription
-from catstream.errors import CatstreamError
+from catstream.client.registry import Registry, address_of, locate
+from catstream.client.subscription import Subscription
+from catstream.errors import CatstreamError, SilenceError
 from catstream.messages.kinds import Answer, End, Verb
-from catstream.web.dashboard import Dashboard, Parts
-from catstream.web.timing import DRAIN_SECONDS, PAUSE_SECONDS, SILENCE_SECONDS
+from catstream.web.dashboard import Dashboard, FleetDashboard, Parts
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
 _log = logging.getLogger(__name__)
 
-#: Channels that are always read, and those that are read only while a page is open, because they cost the pipeline
-#: processor time.
-_PERMANENT, _FOR_VIEWERS = ("tracks", "health", "models"), ("previews", "features")
+SILENCE_SECONDS = 4.0  #: without a health report, after which a process is silent; each sends one every second
+DRAIN_SECONDS = 2.0  #: for the last messages to arrive after the end
+PAUSE_SECONDS = 0.5  #: before a pipeline is looked up again
+READ_SECONDS = 0.03  #: between two looks at the other channels than that of the tracks, which are waited for
+PERIOD_SECONDS = 1.0  #: between two questions to the registry
+REGISTRY_SECONDS = 2.0  #: limit for its answer
+IDLE_SECONDS = 60.0  #: after which the feed of a stream that nobody looks at is closed
+
+_MAX_FEEDS = 32  # of streams of a fleet, each with a thread
 
 
 class Feed(ABC):
-    """Keeps a dashboard up to date while it runs, and counts the open pages.
-
-    Attributes
-    ----------
-    dashboard : the state of the page
-    viewers : number of open pages
-    """
+    """Keeps a dashboard up to date from `start` to `stop`, and counts the open pages."""
 
     dashboard: Parts
-    _task: asyncio.Task[None]
+    _pause: float  # seconds between two calls of `_feed`
 
     def __init__(self) -> None:
-        self.viewers = 0
-        self._has_viewers = asyncio.Event()
+        self.viewers = 0  #: open pages
+        self.used = monotonic()  #: time of the last request to the page
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
     @property
     @abstractmethod
@@ -56,56 +66,52 @@ class Feed(ABC):
     def viewed(self) -> Iterator[None]:
         """Count an open page inside a `with`."""
         self.viewers += 1
-        self._has_viewers.set()
         try:
             yield
         finally:
             self.viewers -= 1
-            if not self.viewers:
-                self._has_viewers.clear()
 
     def start(self) -> None:
-        """Feed the dashboard in a task, until `stop`."""
-        self._task = asyncio.create_task(self._run())
+        """Start the thread; called in the event loop."""
+        self._loop = asyncio.get_running_loop()
+        self._thread.start()
 
-    def stop(self) -> asyncio.Task[None]:
-        """Return the task, cancelled."""
-        self._task.cancel()
-        return self._task
+    def end(self) -> None:
+        """Let the thread end as soon as it does not wait for an answer."""
+        self._stopped.set()
 
-    async def _run(self) -> None:
-        """Feed the dashboard until cancelled; each error is shown on the page, and then it continues."""
-        while True:
+    def stop(self) -> None:
+        """End the thread, and wait for it, but not for long."""
+        self.end()
+        self._thread.join(REGISTRY_SECONDS)
+
+    def _run(self) -> None:
+        """Feed the dashboard until `stop`; each error is shown on the page, and then it continues."""
+        while not self._stopped.is_set():
             try:
-                await self._feed()
+                self._feed()
             except CatstreamError as error:
-                self.dashboard.mark_silent(str(error), monotonic())
+                self._call(self.dashboard.mark_silent, str(error), monotonic())
             except Exception as error:  # an unexpected error must not end the feed silently
                 _log.exception("The page lost what it shows, and tries again.")
-                self.dashboard.mark_silent(f"{type(error).__name__}: {error}", monotonic())
-            await asyncio.sleep(self._pause)
+                self._call(self.dashboard.mark_silent, f"{type(error).__name__}: {error}", monotonic())
+            self._stopped.wait(self._pause)
 
-    #: Seconds between two calls of `_feed`.
-    _pause: float
+    def _call(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call a function in the event loop, which may have ended."""
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function, *arguments)
 
     @abstractmethod
-    async def _feed(self) -> None:
+    def _feed(self) -> None:
         """Feed the dashboard, until the connection is lost or the answer is complete."""
 
 
 class PipelineFeed(Feed):
     """Receives the messages of a pipeline, and reconnects after each end, silence or restart.
 
-    Parameters
-    ----------
-    endpoint : endpoint of the pipeline, or address of a stream of a fleet; empty for the only running pipeline of this
-        user. It is looked up at each connection
-    keys : folder of the keys of this client, if the pipeline requires keys
-
-    Attributes
-    ----------
-    place : endpoint of the current connection, with its keys; None if there is none
-    used : time of the last request to the page, of the monotonic clock
+    Previews, which cost the pipeline processor time, are received only while a page is open. The endpoint, or the
+    address of a stream of a fleet, is looked up at each connection; it is empty for the only running pipeline.
     """
 
     dashboard: Dashboard
@@ -114,9 +120,8 @@ class PipelineFeed(Feed):
     def __init__(self, endpoint: str = "", keys: str = "") -> None:
         super().__init__()
         self._endpoint, self._keys = endpoint, keys
+        self._place: Endpoint | None = None  # of the current connection, with its keys
         self.dashboard = Dashboard()
-        self.place: Endpoint | None = None
-        self.used = monotonic()
 
     @property
     def problem(self) -> str:
@@ -129,39 +134,109 @@ class PipelineFeed(Feed):
 
     def execute(self, verb: Verb, object: str, box: Box | None, keep: bool) -> Answer:
         """Send a command to the pipeline, and wait for its answer."""
-        with Control(self.place or self._endpoint, keys=self._keys) as pipeline:
+        with Control(self._place or self._endpoint, keys=self._keys) as pipeline:
             return pipeline.execute(verb, object, box=box, keep=keep)
 
-    async def _feed(self) -> None:
-        self.place = await asyncio.to_thread(locate, self._endpoint, self._keys)
-        self.dashboard.attach(str(self.place))
-        await self._receive(self.place)
-
-    async def _receive(self, place: Endpoint) -> None:
-        """Receive all channels until the pipeline ends or is silent."""
-        tasks = [asyncio.create_task(self._forward(place, channel)) for channel in (*_PERMANENT, *_FOR_VIEWERS)]
+    def _feed(self) -> None:
+        self._place = locate(self._endpoint, self._keys)
+        self._call(self.dashboard.attach, str(self._place))
+        subscriptions: dict[str, Subscription[Any]] = {}
         try:
-            done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                self.dashboard.take(task.result(), monotonic())
-            # After the end, the last health report, with the final size of the trees, and the last picture may follow.
-            await asyncio.wait(rest, timeout=DRAIN_SECONDS)
+            for channel, timeout in (("tracks", READ_SECONDS), ("health", 0.0), ("models", 0.0)):
+                subscriptions[channel] = Subscription(self._place, channel, timeout=timeout)
+            self._receive(self._place, subscriptions)
         finally:
-            self.place = None
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            self._place = None
+            for each in subscriptions.values():
+                each.close()
 
-    async def _forward(self, place: Endpoint, channel: str) -> End | None:
-        """Feed the messages of a channel until the pipeline ends; channels for viewers only while there are viewers."""
-        timeout = SILENCE_SECONDS if channel == "health" else None
-        while True:
-            if channel in _FOR_VIEWERS:
-                await self._has_viewers.wait()
-            with Subscription[AnyMessage](place, channel, timeout=timeout) as messages:
-                async for message in messages:
-                    self.dashboard.take(message, monotonic(), messages.run)
-                    if channel in _FOR_VIEWERS and not self.viewers:
-                        break
-                else:
-                    return messages.end
+    def _receive(self, place: Endpoint, subscriptions: dict[str, Subscription[Any]]) -> None:
+        """Receive all channels until the pipeline ends or is silent, those that have ended are removed."""
+        last_report, last_read, deadline = monotonic(), 0.0, inf
+        while subscriptions and monotonic() < deadline and not self._stopped.is_set():
+            if self.viewers and deadline == inf and "previews" not in subscriptions:
+                subscriptions["previews"] = Subscription(place, "previews", timeout=0.0)
+            elif not self.viewers and "previews" in subscriptions:
+                subscriptions.pop("previews").close()
+            due = monotonic() - last_read >= READ_SECONDS
+            last_read = monotonic() if due else last_read
+            for channel, messages in list(subscriptions.items()):
+                if not (due or channel == "tracks") or (message := _next(messages)) is None:
+                    continue
+                now = monotonic()
+                self._call(self.dashboard.take, message, now, messages.run)
+                if channel == "health":
+                    last_report = now
+                if isinstance(message, End):
+                    # The last health report, with the final size of the trees, and the last picture may follow.
+                    deadline = min(deadline, now + DRAIN_SECONDS)
+                    subscriptions.pop(channel).close()
+            if deadline == inf and monotonic() - last_report > SILENCE_SECONDS:
+                raise SilenceError(f"no health report arrived from {place} within {SILENCE_SECONDS:g} s")
+            if "tracks" not in subscriptions:  # nothing else waits
+                self._stopped.wait(READ_SECONDS)
+
+
+def _next(messages: Subscription[Any]) -> object | None:
+    """Return the next message, at last the end; None if none arrives within the time-out of the subscription."""
+    with suppress(SilenceError):
+        for message in messages:
+            return cast(object, message)
+        return messages.end
+    return None
+
+
+class FleetFeed(Feed):
+    """Asks the registry of a fleet once a second for all streams and nodes, and opens the feeds of single streams.
+
+    The address of the fleet is that of `Registry`; the fleet may start later.
+    """
+
+    dashboard: FleetDashboard
+    _pause = PERIOD_SECONDS
+
+    def __init__(self, fleet: str = "", keys: str = "") -> None:
+        super().__init__()
+        self._fleet, self._keys = fleet, keys
+        self._registry: Registry | None = None
+        self._streams: dict[str, PipelineFeed] = {}
+        self.dashboard = FleetDashboard()
+
+    @property
+    def problem(self) -> str:
+        return "" if self.dashboard.phase == "running" else "the fleet does not answer"
+
+    def pipeline(self, stream: str) -> PipelineFeed:
+        """Return the feed of a stream, opened by the first request to its page."""
+        if stream not in self.dashboard.status.streams:
+            raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
+        if stream not in self._streams:
+            if len(self._streams) >= _MAX_FEEDS:
+                self.close_unused(0.0)
+            if len(self._streams) >= _MAX_FEEDS:
+                raise HTTPException(503, "too many pages of streams are open already\n")
+            self._streams[stream] = PipelineFeed(address_of(self._fleet, stream), self._keys)
+            self._streams[stream].start()
+        self._streams[stream].used = monotonic()
+        return self._streams[stream]
+
+    def close_unused(self, seconds: float = IDLE_SECONDS) -> None:
+        """End the feeds that nobody looks at, and to which the last request was so many seconds ago."""
+        for name, feed in list(self._streams.items()):
+            if not feed.viewers and monotonic() - feed.used >= seconds:
+                self._streams.pop(name).end()
+
+    def stop(self) -> None:
+        self.close_unused(0.0)
+        super().stop()
+
+    def _run(self) -> None:
+        super()._run()
+        if self._registry is not None:
+            self._registry.close()
+
+    def _feed(self) -> None:
+        self._call(self.close_unused)
+        if self._registry is None:
+            self._registry = Registry(self._fleet, self._keys, timeout=REGISTRY_SECONDS)
+        self._call(self.dashboard.take, self._registry.streams(), monotonic())

@@ -1,28 +1,51 @@
-"""The web server of a page; it runs in this thread or in one of its own."""
+"""The web server of a page, with its access control; it runs in this thread or in one of its own."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import fcntl
+import hashlib
+import hmac
 import socket
-import struct
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType
-from typing import cast
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 import uvicorn
+from starlette.datastructures import MutableHeaders
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from catstream.errors import ServiceError
 from catstream.web.app import Site
-from catstream.web.connections import MAX_CONNECTIONS, Connections
-from catstream.web.guard import Guard, is_loopback
-from catstream.web.timing import SHUTDOWN_SECONDS
 
-_ALL_ADDRESSES = ("0.0.0.0", "::")  # bind addresses that include all interfaces
-_GET_ADDRESS = 0x8915  # SIOCGIFADDR of Linux: the IPv4 address of a network interface
+_LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
+_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
+
+_MIN_TOKEN_LENGTH = 16
+_LOOPBACK = ("127.0.0.1", "localhost")
+
+SHUTDOWN_SECONDS = 2  #: limit for the responses to end when the server does
+KEEP_ALIVE_SECONDS = 5  #: after which a connection without a request is closed
+_MAX_CONNECTIONS = 256
+_MAX_HEAD = 16384  # bytes
+
+#: Headers of all responses: no content from other hosts, no inline scripts, no frames.
+_HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+        "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "cache-control": "no-store",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "referrer-policy": "no-referrer",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+}
 
 
 class Server:
@@ -32,13 +55,13 @@ class Server:
     ----------
     site : what is served
     host, port : address to listen on; port 0 for a free port
-    token : token that clients must have; None, which is possible on a loopback address only, lets every user of this
-        machine watch and give commands
+    token : token that clients must have; None, which is possible on 127.0.0.1 only, lets every user of this machine
+        watch and give commands
 
     Attributes
     ----------
     url : URL of the page for a browser on this machine, with the token
-    urls : `url`, and if the server listens on all interfaces, the URLs for other machines
+    urls : `url`, and if the server listens on all interfaces, the URL for other machines
 
     Raises
     ------
@@ -47,32 +70,29 @@ class Server:
     """
 
     def __init__(self, site: Site, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:
-        if token is None and not is_loopback(host):
+        if token is None and host not in _LOOPBACK:
             raise ServiceError(
                 f"{host} can be reached from other machines, and anyone who opens the page may control the pipeline: "
-                "serve it with a token (without --no-token), or listen on 127.0.0.1"
+                "serve it with a token (without --token none), or listen on 127.0.0.1"
             )
-        connections = Connections(Guard(site.app, token))
+        app = Guard(site.app, token)
         self._socket = _listen(host, port)
-        bound = self._socket.getsockname()[1]
-        end = f":{bound}/" + (f"?token={quote(token, safe='')}" if token else "")
-        hosts = (
-            ["127.0.0.1", *_addresses_of_this_machine()]
-            if host in _ALL_ADDRESSES
-            else [f"[{host}]" if ":" in host else host]
-        )
-        self.urls = [f"http://{name}{end}" for name in hosts]
+        end = f":{self._socket.getsockname()[1]}/" + (f"?token={quote(token, safe='')}" if token else "")
+        hosts = ["127.0.0.1", socket.gethostname()] if host in ("0.0.0.0", "::") else [host]
+        self.urls = [f"http://{f'[{name}]' if ':' in name else name}{end}" for name in hosts]
         self.url = self.urls[0]
         config = uvicorn.Config(
-            connections,
-            http=cast("type[asyncio.Protocol]", connections.protocol),  # uvicorn only calls it
+            app,
+            http="h11",
             ws="none",
             log_level="warning",
             access_log=False,
             server_header=False,
             proxy_headers=False,
-            backlog=MAX_CONNECTIONS // 2,
+            limit_concurrency=_MAX_CONNECTIONS,
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=SHUTDOWN_SECONDS,
+            h11_max_incomplete_event_size=_MAX_HEAD,
         )
         self._server = _Uvicorn(config, site.close)
 
@@ -113,24 +133,81 @@ class _Uvicorn(uvicorn.Server):
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listening = socket.socket(family)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((host, port))
-        listening.listen(MAX_CONNECTIONS // 2)
+        if ":" in host:
+            return socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=True)
+        return socket.create_server((host, port))
     except OSError as error:
-        listening.close()
         raise ServiceError(f"cannot listen on {host}:{port} ({error.strerror}): give another port or host") from None
-    return listening
 
 
-def _addresses_of_this_machine() -> list[str]:
-    """Return the host name, and the IPv4 address of each network interface except the loopback."""
-    names = [socket.gethostname()]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        for _, interface in socket.if_nameindex():
-            with contextlib.suppress(OSError):  # it has no address
-                answer = fcntl.ioctl(asking, _GET_ADDRESS, struct.pack("256s", interface.encode()))
-                names.append(socket.inet_ntoa(answer[20:24]))
-    return [name for name in names if not name.startswith("127.")]
+class Guard:
+    """ASGI middleware that checks each request before an application receives it.
+
+    With a token, a request must have it as `?token=TOKEN`, as `Authorization: Bearer TOKEN`, or as the cookie that a
+    page sets if it is opened with `?token=TOKEN`. Without a token, only requests to a loopback host name are answered;
+    this prevents DNS rebinding. Requests that change something must come from a page of the same origin, or from a
+    program, which sends no Origin header; this prevents CSRF. The length of the token protects it from being guessed.
+    """
+
+    def __init__(self, app: ASGIApp, token: str | None) -> None:
+        if token is not None and len(token) < _MIN_TOKEN_LENGTH:
+            raise ServiceError(
+                f"a token of {len(token)} characters can be guessed: give {_MIN_TOKEN_LENGTH} or more, "
+                "for example VIEW_TOKEN=$(openssl rand -hex 16)"
+            )
+        self._app = app if token is not None else TrustedHostMiddleware(app, _LOOPBACK, www_redirect=False)
+        self._token_digest = None if token is None else _digest(token)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":  # start-up and shutdown events of the server
+            await self._app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+            await send(message)
+
+        request = Request(scope, receive)
+        answer = _reject_foreign(request) or self._check_token(request) or self._app
+        await answer(scope, receive, send_with_headers)
+
+    def _check_token(self, request: Request) -> Response | None:
+        """Return the answer to a request without the token, or to a page that is opened with it in its URL."""
+        path: str = request.scope["path"]  # as in the routes; `request.url` depends on the client's Host header
+        if self._token_digest is None or path.startswith(_PUBLIC_PATHS):
+            return None
+        cookie = f"catstream-{self._token_digest[:8]}"  # browsers send a cookie to all ports of a host
+        in_url = request.query_params.get("token")
+        kind, _, in_header = request.headers.get("authorization", "").partition(" ")
+        given = in_url or (in_header if kind.lower() == "bearer" else None)
+        shown = request.cookies.get(cookie, "") if given is None else _digest(given.strip())
+        if hmac.compare_digest(shown.encode(), self._token_digest.encode()):
+            return _enter(request, cookie, shown) if in_url and path.endswith("/") and request.method == "GET" else None
+        if path.endswith("/") and given is None:
+            return FileResponse(_LOGIN_PAGE, 401)
+        expected = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN"
+        return PlainTextResponse(f"{expected}\n" if given is None else "this is not the token of this page\n", 401)
+
+
+def _reject_foreign(request: Request) -> Response | None:
+    """Return an error if a request that changes something comes from a page of another origin."""
+    host, origin = request.headers.get("host", ""), request.headers.get("origin")
+    if request.method not in ("GET", "HEAD") and origin is not None and origin.partition("://")[2] != host:
+        return PlainTextResponse(f"rejected: the request comes from a page of another origin, {origin!r}\n", 403)
+    return None
+
+
+def _enter(request: Request, cookie: str, digest: str) -> Response:
+    """Set the cookie, and redirect to the same page without the token in its URL."""
+    query = urlencode([pair for pair in request.query_params.multi_items() if pair[0] != "token"])
+    answer = RedirectResponse("./" + (f"?{query}" if query else ""), 303)
+    secure = request.headers.get("x-forwarded-proto") == "https"
+    answer.set_cookie(cookie, digest, httponly=True, samesite="lax", secure=secure)
+    return answer
+
+
+def _digest(token: str) -> str:
+    """Return the digest of a token, which is the value of the cookie and is compared in place of the token."""
+    return hashlib.sha256(b"catstream view\0" + token.encode()).hexdigest()[:32]

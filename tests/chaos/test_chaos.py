@@ -8,7 +8,7 @@ import pytest
 import sequences
 import table
 
-from catstream.applications.evaluation.metrics import score
+from catstream.applications.evaluation.scores import score
 from catstream.box import Box
 from catstream.settings import Settings
 

@@ -23,10 +23,9 @@ def test_render_only_starts_no_pipeline(succeed, tmp_path):
 
 def test_several_objects_are_followed_and_measured(succeed, tmp_path):
     output, _ = succeed("demo", "--objects", 3, "--output", tmp_path, "--frames", 20)
-    scores = re.search(r"MOTA ([\d.]+), IDF1 ([\d.]+), HOTA ([\d.]+), identity switches (\d+)", output)
-    assert scores
-    assert float(scores[1]) > 0.8  # the three processes are not in lockstep, so it varies
-    assert scores[4] == "0"
+    rates = re.findall(r"success rate of \w+: ([\d.]+)", output)
+    assert len(rates) == 3
+    assert sum(map(float, rates)) > 2.4  # the three processes are not in lockstep, so it varies
     assert (tmp_path / "tracks" / "crowd.mp4").exists()
 
 

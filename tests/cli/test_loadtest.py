@@ -33,7 +33,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert figures["processes"]["detector 0"]["cores"] > 0
 
     page = (tmp_path / "load" / "report.html").read_text()
-    assert page.count("<svg") == 7
+    assert page.count("<svg") == 3
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
 
 

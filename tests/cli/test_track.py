@@ -16,7 +16,7 @@ import psutil
 import pytest
 from pyarrow import parquet
 
-from catstream.cli.progress import RunProgress
+from catstream.cli.common import RunProgress
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned

@@ -91,10 +91,7 @@ def test_a_stream_of_a_fleet_can_be_selected_by_its_name(pipeline, managing):
 def test_the_status_of_a_stream_that_does_not_run_says_why(managing):
     streams = {"a": StreamStatus("a", "failed", trouble="there is no video"), "b": StreamStatus("b", "ended")}
     with managing(lambda: FleetStatus("site", 0.0, streams)):
-        for name, why in {
-            "a": "its state is failed: there is no video",
-            "b": "its state is ended",
-        }.items():
+        for name, why in {"a": "its state is failed: there is no video", "b": "its state is ended"}.items():
             assert why in str(said("status", "--stream", name, "--wait", 0.1).exception)
 
 

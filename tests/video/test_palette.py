@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from catstream.applications.html.plots import COLOURS
+from catstream.applications.html.page import COLOURS
 from catstream.video.palette import PALETTE, Colours, rgb
 
 #: Linear red, green, blue as people of each kind of vision see them (Machado and others, 2009, severity 1).

@@ -14,18 +14,7 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.messages.kinds import (
-    Features,
-    FleetStatus,
-    Health,
-    Model,
-    NodeStatus,
-    ObjectFeatures,
-    Preview,
-    StreamStatus,
-    Track,
-    TrainingRows,
-)
+from catstream.messages.kinds import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.web.app import fleet_site, pipeline_site
 from catstream.web.server import Server
 from catstream.wire.channels import HEALTH, PREVIEWS
@@ -45,13 +34,6 @@ class Facts:
     @staticmethod
     def model(version, frame, name="", began=0):
         return Model(version, frame, np.ones(2, np.float32), 0.0, object=name, began=began)
-
-    @staticmethod
-    def features(frame, wrong, *names):
-        """One row of each object, for which the loss of the model above is `wrong` squared."""
-        rows = np.full((1, 2), 0.5 + wrong / 2, np.float32)
-        part = ObjectFeatures(None, {"appearance": TrainingRows.labelled(rows, 1)})
-        return Features(frame + 1, frame, frame / 10, dict.fromkeys(names or ("",), part))
 
     @staticmethod
     def preview(frame, *names):

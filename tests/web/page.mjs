@@ -62,8 +62,6 @@ await withBrowser(executablePath, profile, async (browser) => {
   await is("absent");
   console.log("state", await state.innerText());
   await page.waitForSelector(".tree .node", { state: "attached", ...patience });
-  await page.waitForSelector(".surprising li svg", patience);
-  console.log("surprising", (await page.locator(".surprising li").count()) > 0);
 
   console.log("kill");
   await is("silent");

@@ -24,15 +24,12 @@ const points = [...Array(40).keys()].map((n) => [n / 4, 60 + n, byName([Math.sin
 for (const [, , objects] of points.slice(0, 20)) delete objects[ben.name]; // it began later; each object of JavaScript has one of that name
 const kinds = [0, 1, 2, 3].map((place) => ({ title: `Tree ${place}`, meaning: "what it summarises" }));
 const trees = (...leaves) => ({ kinds, objects: leaves.length ? byName({ leaves, bytes: 4e6, rows: 5120 }) : {} });
-const frames = (...objects) => objects.map(({ name, colour }, place) => ({ frame: 20 + 70 * place, time: 1 + 3 * place, object: name, colour,
-  surprise: 1 + place / 2, box, width: 320, height: 240 }));
-const nothing = { tracks: tracks(), picture: null, trees: trees(), surprising: { measured: 0, frames: [] } };
+const nothing = { tracks: tracks(), picture: null, trees: trees() };
 const all = {
   pipeline: 1, status, tracks: unnamed("present"), picture: { frame: 210, width: 320, height: 240, boxes: { "": box } }, points,
-  trees: trees(13, 22, 9, 0), surprising: { measured: 90, frames: frames({ ...anna, name: "" }, { ...anna, name: "" }, { ...anna, name: "" }) },
+  trees: trees(13, 22, 9, 0),
 };
-const several = { tracks: tracks(anna, ben, carl), picture: { frame: 210, width: 320, height: 240, boxes: { anna: box, [ben.name]: [30, 4, 50, 90] } },
-  surprising: { measured: 90, frames: frames(anna, ben, carl) } };
+const several = { tracks: tracks(anna, ben, carl), picture: { frame: 210, width: 320, height: 240, boxes: { anna: box, [ben.name]: [30, 4, 50, 90] } } };
 const changed = (more, state = "present") => ({ status: { ...status, ...more }, tracks: unnamed(state) });
 
 //: What the page is told in each state, after it was told all; what is done there; in that order.
@@ -53,7 +50,7 @@ const STATES = {
   "another one chosen": {},
   "drawing one more": {},
   forgetting: {},
-  "two objects": { tracks: tracks(anna, carl), surprising: { measured: 60, frames: frames(anna, carl) } },
+  "two objects": { tracks: tracks(anna, carl) },
   drawing: { ...all },
   "drawing the next one while the answer comes": {},
   "cancelled, begun and cancelled": {},
@@ -165,7 +162,7 @@ await withBrowser(executablePath, profile, async (browser) => {
         message: await page.locator("#message").textContent(), loud: await page.locator("#watching .main").allInnerTexts(), role: await page.locator("#role").inputValue(),
         header: await page.locator("header").innerText(), keys: await page.locator(".keys").isVisible(),
         folded: !(await page.locator(".trees").isVisible()), lines: await page.locator("polyline").evaluateAll(colours),
-        frames: await page.locator(".surprising li").count(), trees: await page.locator(".tree figcaption b").allTextContents(),
+        trees: await page.locator(".tree figcaption b").allTextContents(),
         wide: await page.evaluate(() => document.documentElement.scrollWidth - innerWidth),
         violations: await violationsOf(page), loaded });
       if (screenshots) await page.screenshot({ path: `${screenshots}/${name}-${scheme}-${viewport.width}.png`, fullPage: ["present", "three objects"].includes(name) });

@@ -1,7 +1,8 @@
-"""The dashboard: what a page is told of the messages of a pipeline."""
+"""The dashboards: what a page is told of the messages of a pipeline, or of the status of a fleet."""
 
 from __future__ import annotations
 
+import json
 from time import monotonic
 
 import pytest
@@ -11,9 +12,8 @@ from hypothesis import strategies as some
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Health
 from catstream.video.palette import PALETTE
-from catstream.web.dashboard import Dashboard
-from catstream.web.feed import PipelineFeed
-from catstream.web.timing import SILENCE_SECONDS
+from catstream.web.dashboard import Dashboard, FleetDashboard
+from catstream.web.feed import SILENCE_SECONDS, PipelineFeed
 
 
 @pytest.fixture
@@ -72,13 +72,6 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
 
 
-def test_the_number_of_skipped_frames_is_shown_after_the_end(dashboard):
-    dashboard.take(Health("detector", 1.0, {"sent": 1.0, "skipped": 40.0}), 0.0)
-    dashboard.take(End(2, "the source has ended"), 1.0)
-    dashboard.mark_silent("no pipeline is running", 5.0)
-    assert dashboard.updates({})["status"]["skipped"] == 40.0
-
-
 def test_a_process_is_silent_some_seconds_after_its_last_report_also_if_none_of_another_one_arrives():
     feed, everyone = PipelineFeed("run"), "no health report from: detector, compressor, trainer"
     assert feed.problem == everyone
@@ -105,12 +98,15 @@ def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, fac
     assert (dashboard.phase, names(dashboard)) == ("running", [])
 
 
-def test_the_trees_of_the_last_health_report_are_shown_after_the_end(dashboard):
+def test_the_trees_and_skipped_frames_of_the_last_health_reports_are_shown_after_the_end(dashboard):
+    dashboard.take(Health("detector", 1.0, {"sent": 1.0, "skipped": 40.0}), 0.0)
     dashboard.take(End(2, "the source has ended"), 10.0)
     dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
     dashboard.mark_silent("no pipeline is running", 15.0)
-    trees = dashboard.updates({})["trees"]["objects"][""]
+    parts = dashboard.updates({})
+    trees = parts["trees"]["objects"][""]
     assert (trees["leaves"], trees["rows"]) == ([3.0, *[0.0] * (len(TREES) - 1)], 200.0)
+    assert parts["status"]["skipped"] == 40.0
 
 
 def learning(counters):
@@ -127,9 +123,8 @@ def followed(dashboard, facts, endpoint, run="one"):
     for frame in (50, 51):
         dashboard.take(facts.track(frame, version=5), frame / 10, run)
         dashboard.take(facts.model(5, frame=50), frame / 10, run)
-        dashboard.take(facts.features(frame, wrong=1.0), frame / 10, run)
         dashboard.take(facts.preview(frame), frame / 10, run)
-    assert dashboard.updates(told)["surprising"]["frames"]
+    dashboard.updates(told)
     return told
 
 
@@ -146,27 +141,10 @@ def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, en
     assert next(iter(parts)) == "pipeline", "a page clears what it shows before it takes the rest"
     assert (parts["status"]["phase"], parts["status"]["endpoint"]) == ("running", "b")
     assert parts["status"]["source"] != "first.mp4"
-    assert parts["surprising"]["frames"] == []
     assert parts["picture"] is None
     assert not any(leaves for trees in parts["trees"]["objects"].values() for leaves in trees["leaves"])
     assert len(parts.get("points", [])) <= 1
     assert dashboard.picture(51) is None
-    dashboard.take(facts.features(70, wrong=1.0), 6.1, "two")
-    dashboard.take(facts.preview(70), 6.1, "two")
-    assert dashboard.surprising.measured == 0, "the model is that of the pipeline before"
-
-
-def test_frames_of_another_object_are_not_measured_by_the_model_of_the_one_before(dashboard, facts):
-    followed(dashboard, facts, "a")
-    dashboard.take(facts.track(60, version=0, state="bootstrapping", began=60), 6.0)
-    dashboard.take(facts.model(6, frame=55), 6.0)
-    dashboard.take(facts.features(60, wrong=1.0), 6.0)
-    dashboard.take(facts.preview(60), 6.0)
-    assert dashboard.surprising.measured == 0
-    dashboard.take(facts.model(7, frame=61, began=60), 6.0)
-    dashboard.take(facts.features(61, wrong=1.0), 6.0)
-    dashboard.take(facts.preview(61), 6.0)
-    assert dashboard.surprising.measured == 1
 
 
 def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
@@ -190,10 +168,8 @@ def test_objects_are_listed_in_the_order_in_which_they_began_each_in_a_colour_of
     for frame, alive in enumerate((["ben"], ["ben", "anna"], ["ben", "anna", "carl"])):
         for name in alive:
             dashboard.take(facts.track(frame, name=name), float(frame))
-    objects = dashboard.updates({})["tracks"]["objects"]
-    assert [(one["name"], one["colour"]) for one in objects] == list(
-        zip(["ben", "anna", "carl"], PALETTE, strict=False)
-    )
+    shown = {one["name"]: one["colour"] for one in dashboard.updates({})["tracks"]["objects"]}
+    assert list(shown.items()) == list(zip(["ben", "anna", "carl"], PALETTE, strict=False))
 
 
 def test_a_point_of_the_charts_has_each_object(dashboard, facts):
@@ -212,7 +188,7 @@ def test_latency_is_measured_from_a_track_to_the_model_trained_on_its_frame_for_
     dashboard.take(facts.model(1, 8, "anna"), 9.0)
     dashboard.take(facts.model(2, 4, "ben"), 9.5)
     dashboard.take(facts.model(1, 8, "anna"), 20.0)  # sent again to a late joiner
-    assert {name: each.model_latency for name, each in dashboard.objects.shown.items()} == {"anna": 1.0, "ben": 5.5}
+    assert {name: each.model_latency for name, each in dashboard.objects.items()} == {"anna": 1.0, "ben": 5.5}
 
 
 def test_the_objects_of_a_paused_pipeline_are_known_from_its_health(dashboard, facts):
@@ -225,18 +201,12 @@ def test_the_objects_of_a_paused_pipeline_are_known_from_its_health(dashboard, f
     }
 
 
-def test_a_forgotten_object_leaves_the_page_with_its_surprising_frames(dashboard, facts):
+def test_a_forgotten_object_leaves_the_page(dashboard, facts):
     for name in ("anna", "ben"):
-        dashboard.take(facts.model(1, 0, name), 0.0)
-    for frame in (1, 2):
-        for name in ("anna", "ben"):
-            dashboard.take(facts.track(frame, name=name), 0.1 * frame)
-    dashboard.take(facts.features(2, 1.0, "anna", "ben"), 0.2)
+        dashboard.take(facts.track(2, name=name), 0.2)
     dashboard.take(facts.preview(2, "anna", "ben"), 0.2)
     dashboard.take(facts.tracking(3, "ben"), 0.3)
-    parts = dashboard.updates({})
-    assert [one["name"] for one in parts["tracks"]["objects"]] == ["ben"]
-    assert [one["object"] for one in parts["surprising"]["frames"]] == ["ben"]
+    assert names(dashboard) == ["ben"]
     assert dashboard.newest == (facts.preview(2, "anna", "ben"), [facts.track(2, name="ben")])
 
 
@@ -247,16 +217,13 @@ def test_a_restarted_detector_that_has_no_tracks_yet_drops_no_object(dashboard, 
     assert names(dashboard) == ["anna", "ben"]
 
 
-def test_another_object_of_the_same_name_does_not_clear_the_others(dashboard, facts):
+def test_the_latency_of_an_object_is_not_that_of_another_one_of_the_same_name(dashboard, facts):
     for name in ("anna", "ben"):
-        dashboard.take(facts.model(3, 0, name), 0.0)
-        dashboard.take(facts.track(5, name=name, version=3), 0.0)
-    dashboard.take(facts.features(5, 1.0, "anna", "ben"), 0.0)
-    dashboard.take(facts.preview(5, "anna", "ben"), 0.0)
-    dashboard.take(facts.track(6, name="anna", version=7, began=6), 0.1)
-    assert [one["object"] for one in dashboard.updates({})["surprising"]["frames"]] == ["ben"]
-    dashboard.take(facts.model(4, 5, "anna"), 0.2)
-    assert "anna" not in dashboard.objects.models, "it is of the object before"
+        dashboard.take(facts.track(5, name=name), 0.0)
+    dashboard.take(facts.track(6, name="anna", began=6), 0.1)
+    for name in ("anna", "ben"):
+        dashboard.take(facts.model(4, 5, name), 0.2)
+    assert {name: each.model_latency for name, each in dashboard.objects.items()} == {"anna": None, "ben": 0.2}
 
 
 @given(
@@ -279,7 +246,48 @@ def test_the_tracked_objects_are_shown_and_no_others_once_the_reports_have_arriv
             reports.append(facts.tracking(float(seq), *alive))
         elif event == "arrival" and reports:  # later than tracks that were sent after it
             dashboard.take(reports.pop(0), float(seq))
-            assert set(alive) <= set(dashboard.objects.shown)
+            assert set(alive) <= set(dashboard.objects)
     for report in (*reports, facts.tracking(float(seq), *alive)):
         dashboard.take(report, float(seq))
-    assert set(dashboard.objects.shown) == set(alive)
+    assert set(dashboard.objects) == set(alive)
+
+
+@pytest.fixture
+def of_fleet():
+    return FleetDashboard()
+
+
+def told(of_fleet, seen):
+    """The updates as a browser gets them."""
+    return json.loads(json.dumps(of_fleet.updates(seen)))
+
+
+def test_a_page_is_told_of_all_streams_and_nodes_once_for_each_status(of_fleet, fleet):
+    seen = {}
+    assert "streams" in told(of_fleet, seen), "a new page is told which page it is, before the first status"
+    fleet.node("north-1", labels={"site": "north"})
+    fleet.stream("cam-7", endpoint="/tmp/secret-place", server="a public key", models={"ben": 3, "2024": 1, "anna": 2})
+    fleet.stream("cam-8", "failed", trouble="no source")
+    of_fleet.take(fleet.status(), 0.0)
+    first = told(of_fleet, seen)
+    assert (list(first["streams"]), first["streams"]["cam-8"]["trouble"]) == (["cam-7", "cam-8"], "no source")
+    assert first["streams"]["cam-7"]["models"] == [["ben", 3], ["2024", 1], ["anna", 2]], "as they began"
+    assert first["nodes"]["north-1"]["labels"] == {"site": "north"}
+    assert "secret-place" not in str(first)
+    assert "public key" not in str(first)
+    assert told(of_fleet, seen) == {}
+
+
+def test_the_last_status_is_kept_with_its_age_while_the_fleet_does_not_answer(of_fleet, fleet):
+    seen, fleet.name = {}, "site"
+    of_fleet.mark_silent("no fleet of yours is running", 5.0)
+    status = {"name": "", "phase": "waiting", "reason": "no fleet of yours is running", "age": 0}
+    assert told(of_fleet, seen)["status"] == status
+    fleet.stream("cam-7")
+    of_fleet.take(fleet.status(), 10.0)
+    of_fleet.updates(seen)
+    of_fleet.mark_silent("no answer", 17.5)
+    assert told(of_fleet, seen) == {"status": {"name": "site", "phase": "silent", "reason": "no answer", "age": 7}}
+    assert "cam-7" in of_fleet.updates({})["streams"]
+    of_fleet.take(fleet.status(), 18.0)
+    assert told(of_fleet, seen)["status"] == {"name": "site", "phase": "running", "reason": "", "age": 0}

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from catstream.web import streams
+from catstream.web import feed
 
 pytestmark = pytest.mark.system
 
@@ -17,13 +17,13 @@ TOKEN = "correct-horse-battery"
 def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
     fleet, manager, serve_fleet, camera, turning, folder, script_of_browser, monkeypatch
 ):
-    monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
+    monkeypatch.setattr(feed, "REGISTRY_SECONDS", 1.0)
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
     fleet.node("south-2", cores=4.0)
     fleet.node("south", "dead", cores=4.0)
     fleet.stream("cam-7", node="north", endpoint=str(folder), models={"anna": 3}, frame=25, stored_seconds=2.0)
     fleet.stream("cam-10", "moving", node="south")
-    fleet.stream("cam-9", "failed", trouble="there is no camera")
+    fleet.stream("cam-9", "failed", trouble="cam-9 needs a node with site=west, there is none")
     fleet.stream("dock", "waiting", node="south-2")
     link = str(serve_fleet(token=TOKEN).base_url.copy_set_param("token", TOKEN))
     said = {}

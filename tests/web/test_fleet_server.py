@@ -6,18 +6,16 @@ import asyncio
 import json
 import re
 
-import cv2
-import numpy as np
 import pytest
+from starlette.exceptions import HTTPException
 
-from catstream.web import streams
-from catstream.web.feed import PipelineFeed
-from catstream.web.streams import StreamFeeds, TokenBucket
+from catstream.web import feed
+from catstream.web.feed import FleetFeed
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, allowed, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
-PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events", "/streams/cam-7/picture.jpg"]
+PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
 
 
 @pytest.fixture
@@ -56,50 +54,17 @@ def keyed(fleet, folder, tcp):
     return stream
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_without_the_token_nothing_of_the_fleet_is_shown(fleet, serve_fleet, until, path):
+def test_without_the_token_nothing_of_the_fleet_is_shown(fleet, serve_fleet, until):
     fleet.stream("cam-7")
     locked = serve_fleet(token=TOKEN)
-    answer = locked.get(path)
-    assert answer.status_code == 401
-    assert ("<form" in answer.text) == path.endswith("/"), "each page asks for the token"
+    for path in PATHS:
+        answer = locked.get(path)
+        assert (answer.status_code, "<form" in answer.text) == (401, path.endswith("/")), "each page asks for the token"
     locked.get("/", params={"token": TOKEN})
     until(lambda: locked.get("/streams/cam-7/").status_code == 200)
-    with locked.stream("GET", path) as answer:
-        assert answer.status_code in (200, 204), "204: there is no picture"
-
-
-def test_the_picture_of_a_stream_is_small_and_has_the_boxes_of_its_objects(fleet, page, camera, turning, folder, until):
-    fleet.stream("cam-7", endpoint=str(folder), models={"anna": 3})
-    fleet.stream("cam-8", "failed")
-    shown(page, until)
-    with turning(camera):
-        answer = page.get("/streams/cam-7/picture.jpg")
-    assert answer.headers["content-type"] == "image/jpeg"
-    assert cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_COLOR).shape == (180, 320, 3)
-    assert page.get("/streams/cam-8/picture.jpg").status_code == 204
-    assert page.get("/streams/cam-9/picture.jpg").status_code == 404
-
-
-def test_no_more_pictures_are_made_than_the_limit_allows(
-    fleet, serve_fleet, camera, turning, folder, until, monkeypatch
-):
-    made = []
-    monkeypatch.setattr(streams, "draw_boxes", lambda *_: made.append(1) or b"picture %d" % len(made))
-    monkeypatch.setattr(streams, "FRESH_SECONDS", 0.0)
-    monkeypatch.setattr(streams, "_BURST", 2)
-    monkeypatch.setattr(streams, "_PER_SECOND", 1e-6)
-    fleet.stream("cam-7", endpoint=str(folder))
-    page = serve_fleet()
-    shown(page, until)
-    with turning(camera):
-        pictures = [page.get("/streams/cam-7/picture.jpg").content for _ in range(4)]
-    assert pictures == [b"picture 1", b"picture 2", b"picture 2", b"picture 2"]
-
-
-def test_a_token_bucket_allows_its_burst_and_its_rate():
-    bucket = TokenBucket(3, 0.5)
-    assert [moment for moment in range(20) if bucket.take(moment)] == [0, 1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18]
+    for path in PATHS:
+        with locked.stream("GET", path) as answer:
+            assert answer.status_code == 200
 
 
 def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, folder, until):
@@ -124,21 +89,19 @@ def test_the_page_of_a_stream_follows_it_to_another_node(fleet, page, camera_at,
 
 
 def test_a_stream_with_a_key_of_its_own_is_shown_with_the_keys_of_the_client(
-    fleet, keyed, serve_fleet, camera_at, turning, until
+    fleet, keyed, serve_fleet, camera_at, until
 ):
     endpoint = Endpoint.parse(fleet.listen, str(keyed))
     fleet.stream("cam-7", endpoint=fleet.listen, server=public_key(keyed))
     page, turn = serve_fleet(), camera_at(endpoint)
     shown(page, until)
-    with turning(turn):
-        assert page.get("/streams/cam-7/picture.jpg").headers["content-type"] == "image/jpeg"
     until(lambda: source(page) == "walk.mp4", turn)
 
 
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
     fleet, manager, serve_fleet, until, monkeypatch
 ):
-    monkeypatch.setattr(streams, "REGISTRY_SECONDS", 1.0)
+    monkeypatch.setattr(feed, "REGISTRY_SECONDS", 1.0)
     fleet.stream("cam-7")
     page = serve_fleet()
     shown(page, until)
@@ -154,31 +117,25 @@ def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams
     assert (told["status"]["phase"], list(told["streams"])) == ("silent", ["cam-7"])
 
 
-def test_pages_of_streams_are_closed_when_nobody_looks_at_them(folder, monkeypatch):
-    monkeypatch.setattr(streams, "_MAX_FEEDS", 2)
-    made = {}
-
-    def make_feed(name):
-        made[name] = PipelineFeed(str(folder))
-        return made[name]
+def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatch):
+    monkeypatch.setattr(feed, "_MAX_FEEDS", 2)
+    for number in range(1, 5):
+        fleet.stream(f"cam-{number}")
 
     async def use():
-        feeds = StreamFeeds(make_feed)
-        first = feeds.open("cam-1")
+        streams = FleetFeed(fleet.address)
+        streams.dashboard.take(fleet.status(), 0.0)
+        first = streams.pipeline("cam-1")
         with first.viewed():
-            assert feeds.open("cam-2") is not None
-            assert feeds.open("cam-3") is not None, "in place of one that nobody looks at"
-            assert feeds.open("cam-1") is first
-            with made["cam-3"].viewed():
-                assert feeds.open("cam-4") is None
-                feeds.close_unused(0.0)
-                assert len(feeds) == 2
-        feeds.close_unused(60.0)
-        assert len(feeds) == 2, "they were used just now"
-        feeds.close_unused(0.0)
-        assert not len(feeds)
-        feeds.open("cam-1")
-        await feeds.stop()
-        assert not len(feeds)
+            assert streams.pipeline("cam-2") is not first
+            third = streams.pipeline("cam-3")  # in place of one that nobody looks at
+            assert streams.pipeline("cam-1") is first
+            with third.viewed(), pytest.raises(HTTPException, match="too many"):
+                streams.pipeline("cam-4")
+        streams.close_unused(60.0)
+        assert streams.pipeline("cam-1") is first, "it was used just now"
+        streams.close_unused(0.0)
+        assert streams.pipeline("cam-1") is not first
+        streams.close_unused(0.0)
 
     asyncio.run(use())

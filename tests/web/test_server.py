@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import json
 import re
@@ -27,13 +26,13 @@ from catstream.web import app
 from catstream.web.app import pipeline_site
 from catstream.web.dashboard import Dashboard
 from catstream.web.feed import PipelineFeed
-from catstream.web.guard import Guard
 from catstream.web.server import Server
 from catstream.wire.channels import HEALTH, PREVIEWS, TRACKS
 from catstream.wire.newest import Publisher
 
 TOKEN = "correct-horse-battery"
 FILES = sorted((Path(app.__file__).parent / "page").iterdir())
+TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
 PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics"]
 
 
@@ -95,45 +94,32 @@ def test_the_page_loads_nothing_from_other_hosts_and_has_no_inline_script(kind, 
     assert not re.search(r"https?://|style=|<script>", answer.text)
     for file in re.findall(r'(?:src|href)="(page/[^"]+)"', answer.text):
         assert page.get(f"/{file}").status_code == 200
-
-
-@pytest.mark.parametrize("name", [path.name for path in FILES if path.suffix in (".js", ".css")])
-def test_each_file_of_the_page_has_its_content_type(page, name):
-    answer = page.get(f"/page/{name}")
-    assert answer.headers["content-type"].startswith("text/css" if name.endswith("css") else "text/javascript")
-    assert answer.headers["x-content-type-options"] == "nosniff"
+    for file in FILES:
+        headers = page.get(f"/page/{file.name}").headers
+        assert headers["content-type"].startswith(TYPES[file.suffix])
+        assert headers["x-content-type-options"] == "nosniff"
 
 
 def test_files_outside_the_page_folder_are_not_served(page):
-    assert page.get("/page/..%2fguard.py").status_code == 404
-    assert page.get("/page/%2e%2e/guard.py").status_code == 404
+    assert page.get("/page/..%2fserver.py").status_code == 404
+    assert page.get("/page/%2e%2e/server.py").status_code == 404
 
 
-def test_the_server_is_healthy_alone_and_ready_with_all_processes(page, pipeline, until):
-    assert page.get("/healthz").status_code == 200
-    assert page.get("/readyz").status_code == 503
-
-    def ready():
-        for name in ("detector", "compressor", "trainer"):
-            pipeline[name].send(Health(name, 1.0, {"sent": 3.0, "rejected": 1.0}))
-        return page.get("/readyz").status_code == 200
-
-    until(ready)
-    shown = page.get("/metrics").text
-    assert "\ncatstream_up 1.0\n" in shown
-    assert "\ncatstream_frames_total 3.0\n" in shown
-    assert '\ncatstream_rejected_messages_total{process="trainer"} 1.0\n' in shown
-
-
-def test_the_server_is_not_ready_if_one_process_is_silent(page, pipeline, until, monkeypatch):
+def test_the_server_is_healthy_alone_and_ready_while_all_processes_report(page, pipeline, until, monkeypatch):
     monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 0.5)
 
     def answer(*heard):
         for name in heard:
-            pipeline[name].send(Health(name, time.monotonic(), {}))
+            pipeline[name].send(Health(name, time.monotonic(), {"sent": 3.0, "rejected": 1.0}))
         return page.get("/readyz")
 
+    assert page.get("/healthz").status_code == 200
+    assert page.get("/readyz").status_code == 503
     until(lambda: answer("detector", "compressor", "trainer").status_code == 200)
+    shown = page.get("/metrics").text
+    assert "\ncatstream_up 1.0\n" in shown
+    assert "\ncatstream_detector_sent 3.0\n" in shown
+    assert "\ncatstream_trainer_rejected 1.0\n" in shown
     until(lambda: answer("detector", "compressor").status_code == 503)
     assert answer("detector", "compressor").text == "no health report from: trainer\n"
 
@@ -195,46 +181,33 @@ def test_the_response_to_head_ends_and_its_client_is_no_viewer(page, path):
     assert "\ncatstream_viewers 0.0\n" in page.get("/metrics").text, "on the same connection"
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1", ""])
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1"])
 def test_a_request_with_a_foreign_host_name_is_rejected(page, host):
-    assert page.get("/", headers={"Host": host}).status_code in (400, 421)
+    assert page.get("/", headers={"Host": host}).status_code == 400
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1"])
 def test_a_page_of_another_origin_cannot_steer(page, origin):
-    answer = page.post("/control", json={"verb": "pause"}, headers={"Origin": origin})
-    assert answer.status_code == 403
+    assert page.post("/control", json={"verb": "pause"}, headers={"Origin": origin}).status_code == 403
+    assert page.post("/control", data={"verb": "pause"}).status_code == 415, "a form, without an origin header"
 
 
-def test_a_form_of_another_page_cannot_steer_without_an_origin_header(page):
-    assert page.post("/control", data={"verb": "pause"}).status_code == 415
+INVALID = [
+    {"verb": "format"},
+    {"verb": "set-box"},
+    {"verb": "set-box", "box": [1, 2, 3]},
+    {"verb": "set-box", "box": [1, 2, 0, 4]},
+    {"verb": "set-box", "box": [1, 2, 3, float("nan")]},
+    {"verb": "pause", "box": [1, 2, 3, 4]},
+    {"verb": "pause", "keep": "yes"},
+    {"verb": "pause", "object": "anna"},
+    {"verb": "set-box", "object": "../anna", "box": [1, 2, 3, 4]},
+    ["pause"],
+    "x" * 5000,
+]
 
 
-INVALID = {
-    repr(command): json.dumps(command)
-    for command in (
-        {"verb": "format"},
-        {"verb": "set-box"},
-        {"verb": "set-box", "box": [1, 2, 3]},
-        {"verb": "set-box", "box": [1, 2, 3, "4"]},
-        {"verb": "set-box", "box": [1, 2, 0, 4]},
-        {"verb": "set-box", "box": [1, 2, 3, float("nan")]},
-        {"verb": "pause", "box": [1, 2, 3, 4]},
-        {"verb": "pause", "keep": "yes"},
-        {"verb": "pause", "object": "anna"},
-        {"verb": "forget", "object": 1},
-        {"verb": "forget", "object": "no name"},
-        {"verb": "forget", "object": "a" * 65},
-        {"verb": "set-box", "object": "../anna", "box": [1, 2, 3, 4]},
-        ["pause"],
-        "x" * 5000,
-    )
-}
-INVALID |= {"deep": "[" * 4000, "no JSON": "pause"}
-INVALID |= {"many digits": '{"verb": "set-box", "box": [1, 2, 3, %s]}' % ("9" * 400)}
-
-
-@pytest.mark.parametrize("body", INVALID.values(), ids=INVALID)
+@pytest.mark.parametrize("body", [*map(json.dumps, INVALID), "[" * 4000, "pause"])
 def test_an_invalid_command_is_rejected_before_it_is_sent(page, body):
     answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 400
@@ -267,6 +240,7 @@ def test_without_the_token_nothing_of_the_pipeline_is_shown(locked, path):
     assert answer.status_code == 401
     assert ("<form" in answer.text) == (path == "/"), "the page asks for the token"
     assert locked.post("/control", json={"verb": "pause"}).status_code == 401
+    assert [locked.get(public).status_code for public in ("/healthz", "/readyz")] == [200, 503]
 
 
 @pytest.mark.parametrize("opened", ["by the link", "by a header", "by no token"])
@@ -285,29 +259,8 @@ def test_with_the_token_or_without_the_need_of_one_everything_is_shown(serve, fa
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/control"])
-def test_a_host_header_that_looks_like_a_public_path_does_not_open_another_path(path):
-    # An older Starlette begins an address with this header, a newer one, where that names no host, with the server.
-    head = [(b"host", b"x/page/")]
-    scope = {"type": "http", "method": "GET", "path": path, "query_string": b"", "headers": head}
-    scope |= {"scheme": "http", "server": ("x/page/", 80), "client": ("10.0.0.7", 5000)}
-    said = []
-
-    async def inside(*_):
-        raise AssertionError("it was let in")
-
-    async def send(message):
-        said.append(message)
-
-    async def receive():
-        await asyncio.Event().wait()  # nothing more comes, and nobody leaves
-
-    asyncio.run(Guard(inside, TOKEN)(scope, receive, send))
-    assert said[0]["status"] == 401
-
-
-def test_health_checks_need_no_token(locked):
-    assert locked.get("/healthz").status_code == 200
-    assert locked.get("/readyz").status_code == 503
+def test_a_host_header_that_looks_like_a_public_path_does_not_open_another_path(locked, path):
+    assert locked.get(path, headers={"Host": "x/page/"}).status_code == 401  # an address would begin with this header
 
 
 @pytest.mark.parametrize(("asked", "opened"), [("/", "/"), ("/?search=a%3Db&", "/?search=a%3Db")])
@@ -320,14 +273,14 @@ def test_the_link_sets_a_cookie_and_the_browser_does_not_show_the_token(locked, 
     assert "SameSite=lax" in kept
     assert "Secure" not in kept
     assert locked.get("/").status_code == 200
+    locked.cookies.clear()
+    answer = locked.get("/", headers={"Cookie": f"{kept.partition('=')[0]}=0123; {{another program: yes}}"})
+    assert (answer.status_code, "<form" in answer.text) == (401, True), "a wrong cookie"
 
 
-def test_behind_a_proxy_with_tls_the_cookie_is_sent_over_tls_only(locked):
+def test_the_link_sets_a_cookie_for_tls_behind_a_proxy_with_tls_and_never_leads_to_another_host(locked):
     answer = locked.get(f"/?token={TOKEN}", headers={"X-Forwarded-Proto": "https"})
     assert "Secure" in answer.headers["set-cookie"]
-
-
-def test_the_link_never_leads_to_another_host(locked):
     answer = locked.get(f"{locked.base_url}/evil.example/?token={TOKEN}")
     assert answer.status_code == 303
     assert answer.next_request.url.host == locked.base_url.host
@@ -342,29 +295,25 @@ def test_a_browser_may_open_two_pages_at_two_ports(serve):
     assert [page.get("/metrics").status_code for page in (one, other)] == [200, 200]
 
 
-def test_a_page_whose_cookie_is_that_of_an_earlier_server_asks_for_the_token(locked):
-    port = locked.base_url.port
-    answer = locked.get("/", headers={"Cookie": f"catstream-{port}=0123; {{another program: yes}}"})
-    assert (answer.status_code, "<form" in answer.text) == (401, True)
-
-
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
 def test_a_public_address_requires_a_token(host):
-    with pytest.raises(ServiceError, match="without --no-token"):
+    with pytest.raises(ServiceError, match="without --token none"):
         Server(pipeline_site(), host=host, port=0)
 
 
+def test_a_short_token_is_an_error():
+    with pytest.raises(ServiceError, match="can be guessed"):
+        Server(pipeline_site(), port=0, token="secret")
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_server_on_all_interfaces_lists_the_addresses_for_other_machines(host):
+def test_a_server_on_all_interfaces_is_found_at_the_loopback_and_by_the_name_of_the_machine(host):
     server = Server(pipeline_site(), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
+        assert httpx.get(server.url, follow_redirects=True).status_code == 200
     assert {url.query for url in urls} == {f"token={TOKEN}"}
-    assert [url.hostname for url in urls[:2]] == ["127.0.0.1", socket.gethostname().lower()]
-    assert not {"0.0.0.0", "::"} & {url.hostname for url in urls}
-    for url in urls[2:]:
-        with socket.socket() as other:  # only what is an address of this machine can be bound
-            other.bind((url.hostname, 0))
+    assert [url.hostname for url in urls] == ["127.0.0.1", socket.gethostname().lower()]
 
 
 def test_a_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatch):
@@ -399,11 +348,6 @@ def test_a_command_that_waits_for_its_answer_is_answered_at_the_end_of_the_serve
         answered.set()
     assert (answer.status_code, answer.text) == (503, "the server of this page has ended\n")
     assert "Exception" not in caplog.text
-
-
-def test_a_short_token_is_an_error():
-    with pytest.raises(ServiceError, match="can be guessed"):
-        Server(pipeline_site(), port=0, token="secret")
 
 
 def test_a_port_in_use_is_an_error(page):

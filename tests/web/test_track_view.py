@@ -1,10 +1,16 @@
-"""`catstream track --view`: the page of a run, and its first box."""
+"""`catstream track --view`: the page of a run, its first box, and its metrics."""
 
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import httpx
+
+BOARD = Path(__file__).parents[2] / "docs" / "grafana.json"
+#: Counters of a live source.
+LIVE = {"catstream_detector_lost_seconds", "catstream_detector_skipped"}
 
 
 def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and_of_the_server(
@@ -29,6 +35,10 @@ def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and
             command = {"verb": "set-box", "box": list(boxes[0])}
             answer = until(lambda: browser.post(f"{url}control", json=command))
             assert answer.json()["done"], answer.text
+            browser.post(f"{url}control", json={"verb": "pause"})
+            asked = set(re.findall(r"(catstream_\w+){", BOARD.read_text())) - LIVE
+            until(lambda: asked <= set(re.findall(r"catstream_\w+", browser.get(f"{url}metrics").text)))
+            browser.post(f"{url}control", json={"verb": "resume"})
             for line in lines:
                 told |= json.loads(line.removeprefix("data: ")) if line.startswith("data: ") else {}
         run.communicate(timeout=120)

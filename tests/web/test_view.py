@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import encodings.idna  # noqa: F401  # used below as another user, who may not read this installation
 import os
+import re
 from contextlib import contextmanager
 from pathlib import Path
 
+import click
 import httpx
 import pytest
+from click.testing import CliRunner
 
-PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics", "/streams/roof/", "/streams/roof/picture.jpg"]
+from catstream.cli.view import AddressType, with_token
+
+PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics", "/streams/roof/", "/streams/roof/events"]
 OTHER_USER = 65534
 
 
@@ -56,8 +61,32 @@ def test_another_user_of_the_machine_can_neither_watch_nor_steer(started, words)
 
 
 def test_with_no_token_the_page_is_open_to_every_user_of_the_machine_until_sigterm(started):
-    process, link = started("view", "--listen", "127.0.0.1:0", "--no-token")
+    process, link = started("view", "--listen", "127.0.0.1:0", "--token", "none")
     with another_user(), httpx.Client(base_url=link, verify=False) as stranger:
         assert [stranger.get(path).status_code for path in ("/", "/metrics")] == [200, 200]
     process.terminate()
     assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize("text", ["", "x", "host:", "8000:host", "70000", "-1"])
+def test_a_malformed_address_is_an_error(text):
+    with pytest.raises(click.BadParameter, match="for example 8000"):
+        AddressType().convert(text, None, None)
+
+
+@pytest.mark.parametrize("prefix", ["", "view-"])
+def test_the_token_of_a_page_is_read_from_an_option_or_a_variable_and_is_a_random_one_without_them(prefix):
+    @click.command()
+    @with_token(prefix)
+    def command(token):
+        click.echo(str(token))
+
+    def says(*words, **variables):
+        return CliRunner().invoke(command, list(words), env=variables, standalone_mode=False).output
+
+    made = [says(), says(VIEW_TOKEN="")]
+    assert all(re.fullmatch(r"[0-9a-f]{32}\n", each) for each in made)
+    assert made[0] != made[1]
+    assert says(f"--{prefix}token", "none") == "None\n"
+    assert says(f"--{prefix}token", "given-on-the-line", VIEW_TOKEN="from-a-variable-1") == "given-on-the-line\n"
+    assert says(VIEW_TOKEN="from-a-variable-1") == "from-a-variable-1\n"

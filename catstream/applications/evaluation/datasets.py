@@ -1,4 +1,4 @@
-"""Reads annotated sequences in the layouts of OTB, TLD, VOT and Princeton.
+"""Annotated sequences in the layouts of OTB, TLD, VOT and Princeton, and the frames and boxes that runs start with.
 
 A sequence is a folder with frames, in any form that `catstream.video.source`
 opens, and one of these files:
@@ -12,19 +12,28 @@ opens, and one of these files:
 Each file has one line for each frame; NaN, or a box without area, means that
 the object is absent. Boxes are used as published; OTB's pixel coordinates,
 which start at 1, are not shifted.
+
+A run starts from one of these:
+
+    one_pass  one-pass evaluation (OPE): the first box of the ground truth
+    temporal  temporal robustness (TRE): several frames
+    spatial   spatial robustness (SRE) of the CVPR2013 benchmark: 12 first boxes, shifted or scaled
+    jittered  several first boxes that differ by at most 2 %: dependence of a result on chance
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
-from catstream.errors import VideoError
+from catstream.box import Box
+from catstream.errors import BoxError, SettingsError, VideoError
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64, UInt8
 from catstream.video.source import natural_order, open_source
@@ -54,13 +63,7 @@ class Sequence:
         return len(self.boxes)
 
     def frames(self, start: int = 0) -> Generator[UInt8]:
-        """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box.
-
-        Raises
-        ------
-        VideoError
-            If there are fewer frames than boxes, or a frame cannot be read.
-        """
+        """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box; VideoError if there are too few."""
         left = len(self.boxes) - start
         with open_source(self.path, self.begin + start) as source:
             for frame in source:
@@ -74,26 +77,14 @@ class Sequence:
         )
 
     def size(self, start: int = 0) -> tuple[int, int]:
-        """Read the frame of boxes[start], and return its width and height.
-
-        Raises
-        ------
-        VideoError
-            If it cannot be read.
-        """
+        """Read the frame of boxes[start], and return its width and height."""
         with closing(self.frames(start)) as frames:
             height, width = next(frames).shape[:2]
         return width, height
 
 
 def find_sequences(path: str | Path) -> list[Sequence]:
-    """Return the sequence in a folder, or the sequences in its subfolders, in natural order.
-
-    Raises
-    ------
-    VideoError
-        If there is no sequence, or a ground truth file cannot be read.
-    """
+    """Return the sequence in a folder, or the sequences in its subfolders, in natural order."""
     path = Path(path)
     sequences = _sequences(path)
     if not sequences and path.is_dir():
@@ -175,3 +166,176 @@ def _polygons(table: Float64) -> Float64:
         return _rectangles(table)
     low, high = (np.stack([pick(table[:, axis::2], axis=1) for axis in (0, 1)], axis=1) for pick in (np.min, np.max))
     return np.hstack([low, high - low])
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """A change of the first box: shifts of its centre in widths and heights, and factors of its sides.
+
+    name  part of the name of the run; empty for the box of the ground truth, which is not changed
+
+    >>> Variation("right", right=0.1).applied(Box(10, 20, 30, 40))
+    Box(x=13.0, y=20.0, w=30.0, h=40.0)
+    """
+
+    name: str = ""
+    right: float = 0.0
+    down: float = 0.0
+    wider: float = 1.0
+    higher: float = 1.0
+
+    def applied(self, box: Box) -> Box:
+        """Return the changed box."""
+        x, y = box.centre
+        return box.scaled(self.wider, self.higher).centred(x + self.right * box.w, y + self.down * box.h)
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """The frame and the box that a run starts with: a row of the ground truth, and a change of its box."""
+
+    frame: int = 0
+    variation: Variation = Variation()
+
+    @property
+    def suffix(self) -> str:
+        """The end of the name of a run, after the name of its sequence: `@120`, `@left`, `@120-left`, or empty."""
+        parts = [str(self.frame)] if self.frame else []
+        parts += [self.variation.name] if self.variation.name else []
+        return "@" + "-".join(parts) if parts else ""
+
+    def box(self, sequence: Sequence, size: tuple[int, int] | None = None) -> Box:
+        """Return the first box.
+
+        size : width and height of the frame; a changed box that tracking cannot start with there is moved until its
+            centre is in the frame, and gets sides from 2 pixels to twice those of the frame; None: the box is not moved
+        """
+        box = Box(*map(float, sequence.boxes[self.frame]))
+        if not self.variation.name:
+            return box
+        changed = self.variation.applied(box)
+        return changed if size is None else _startable(changed, *size)
+
+
+FIRST = Start()
+#: Chooses the starts of a sequence.
+Starts = Callable[[Sequence], list[Start]]
+
+_DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, -1), "down": (0, 1)}
+_CORNERS = {"left-up": (-1, -1), "right-up": (1, -1), "left-down": (-1, 1), "right-down": (1, 1)}
+
+#: The 12 first boxes of the CVPR2013 benchmark: shifts by 10 % of the box, and four sizes.
+SHIFTS = (
+    *(Variation(name, 0.1 * x, 0.1 * y) for name, (x, y) in (_DIRECTIONS | _CORNERS).items()),
+    *(Variation(f"size-{factor}", wider=factor, higher=factor) for factor in (0.8, 0.9, 1.1, 1.2)),
+)
+
+_JITTER = 0.02
+
+
+def choose_starts(frames: int | None = None, boxes: int | None = None, *, shifts: bool = False) -> Starts:
+    """Return the starts for `--starts FRAMES`, `--jitter BOXES` or `--shifts`; without any of them, those of OPE."""
+    if shifts:
+        return spatial
+    if boxes is not None:
+        return jittered(boxes)
+    return one_pass if frames is None else temporal(frames)
+
+
+def one_pass(sequence: Sequence) -> list[Start]:
+    """Return one start: the first frame with the object."""
+    return [Start(_present(sequence)[0])]
+
+
+def temporal(count: int) -> Starts:
+    """Choose `count` evenly spaced start frames.
+
+    If the object is absent in one, or tracking cannot start with its box, the next frame is used. It reads a frame of
+    each sequence.
+    """
+
+    def starts(sequence: Sequence) -> list[Start]:
+        frames = _valid(sequence)
+        places = np.searchsorted(frames, np.arange(count) * len(sequence) // count)
+        return [Start(frame) for frame in sorted({frames[place] for place in places if place < len(frames)})]
+
+    return starts
+
+
+def spatial(sequence: Sequence) -> list[Start]:
+    """Return the first frame with the object, with each of the first boxes in `SHIFTS`."""
+    return [Start(_present(sequence)[0], variation) for variation in SHIFTS]
+
+
+def jittered(count: int) -> Starts:
+    """Choose `count` boxes in the first frame with the object: that of the ground truth, and random changes of it.
+
+    The changes are at most 2 % of the sides, and the same in each sequence and on each machine.
+    """
+    variations = [Variation(), *map(_jitter, range(1, count))]
+
+    def starts(sequence: Sequence) -> list[Start]:
+        return [Start(_present(sequence)[0], variation) for variation in variations]
+
+    return starts
+
+
+def _jitter(seed: int) -> Variation:
+    right, down, wider, higher = np.random.default_rng(seed).uniform(-_JITTER, _JITTER, 4).tolist()
+    return Variation(f"jitter-{seed}", right, down, 1 + wider, 1 + higher)
+
+
+def _present(sequence: Sequence) -> list[int]:
+    """Return the frames with the object."""
+    return [int(frame) for frame in np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))]
+
+
+def _valid(sequence: Sequence) -> list[int]:
+    """Return the frames with a box that `Box.validated` accepts; all with the object if none has one, or none is read.
+
+    The run then raises the error.
+    """
+    present = _present(sequence)
+    try:
+        size = sequence.size(present[0])
+    except VideoError:
+        return present
+    return [frame for frame in present if _is_valid(Start(frame).box(sequence), *size)] or present
+
+
+def _is_valid(box: Box, width: int, height: int) -> bool:
+    try:
+        box.validated(width, height)
+    except BoxError:
+        return False
+    return True
+
+
+def _startable(box: Box, width: int, height: int) -> Box:
+    """Return the nearest box that `Box.validated` accepts in a frame of this size."""
+    x, y = box.centre
+    w, h = min(max(box.w, 2.0), 2.0 * width), min(max(box.h, 2.0), 2.0 * height)
+    return Box(0.0, 0.0, w, h).centred(x, y).with_centre_in(width, height)
+
+
+def read_attributes(file: Path) -> dict[str, list[str]]:
+    """Read attributes of sequences, for example occlusion, from a JSON file {sequence: [attribute]}."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
+    except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
+        raise SettingsError(
+            f'cannot read the attributes in {str(file)!r} ({error}): give a JSON file {{"sequence": ["occlusion"]}}'
+        ) from None
+
+
+def with_attributes(names: Iterable[str], attributes: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
+    """Return which of these sequences have each attribute; `attributes` is what `read_attributes` returns.
+
+    >>> with_attributes(["walk", "run"], {"walk": ["blur"], "run": ["blur", "occlusion"], "other": ["blur"]})
+    {'blur': ['walk', 'run'], 'occlusion': ['run']}
+    """
+    found: dict[str, list[str]] = {}
+    for name in names:
+        for attribute in dict.fromkeys(attributes.get(name, ())):
+            found.setdefault(attribute, []).append(name)
+    return dict(sorted(found.items()))

@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.evaluation.datasets import FIRST, Sequence, Start, Starts, one_pass
 from catstream.applications.evaluation.peers import PEERS, Peer
 from catstream.applications.evaluation.runs import EvaluationRun, load, prepare_folder, run_name, save
-from catstream.applications.evaluation.starts import FIRST, Start, Starts, one_pass
-from catstream.applications.evaluation.workers import run_tasks
+from catstream.applications.workers import run_tasks
 from catstream.box import Box
 from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.numerics.threads import one_thread
@@ -88,7 +87,7 @@ def evaluate(
     ----------
     sequences, trackers : sequences, and names from `TRACKERS`
     settings : settings of catstream
-    starts : the starts of a sequence, one of the functions of `catstream.applications.evaluation.starts`
+    starts : the starts of a sequence, `one_pass`, or what `choose_starts` returns
     peer_models : folder of the model files of `nano` and `vit`
     jobs : number of processes, with one thread each
     output : folder for results, or None; runs that are complete there are not repeated
@@ -100,11 +99,6 @@ def evaluate(
     Returns
     -------
     runs in order of sequence, tracker and start
-
-    Raises
-    ------
-    CatstreamError
-        If a tracker is unknown, two sequences have the same name, or `output` has runs with other settings.
     """
     trackers = list(dict.fromkeys(trackers))
     folder, models = (None if path is None else Path(path) for path in (output, peer_models))

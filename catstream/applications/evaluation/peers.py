@@ -40,19 +40,9 @@ MODELS = {
 class Peer:
     """One of OpenCV's trackers with the interface of `catstream.tracker.Tracker`.
 
-    Parameters
-    ----------
-    name : one of `PEERS`
-    models : folder of the files in `MODELS`
-
-    Attributes
-    ----------
-    score : confidence of the last box; 1 if the tracker has none, 0 if the object was not found
-
-    Raises
-    ------
-    SettingsError
-        If the installed OpenCV does not have this tracker, or cannot read its model files.
+    name    one of `PEERS`
+    models  folder of the files in `MODELS`
+    score   confidence of the last box; 1 if the tracker has none, 0 if the object was not found
     """
 
     def __init__(self, name: str, models: Path | None = None) -> None:
@@ -62,13 +52,7 @@ class Peer:
         self.score = 0.0
 
     def init(self, frame: np.ndarray, box: Sequence[float]) -> None:
-        """Start with a box x, y, w, h in pixels. It is rounded and clipped to the frame, as OpenCV's trackers need it.
-
-        Raises
-        ------
-        BoxError
-            If `Box.validated` or OpenCV does not accept the box.
-        """
+        """Start with a box x, y, w, h in pixels. It is rounded and clipped to the frame, as OpenCV needs it."""
         height, width = frame.shape[:2]
         Box(*map(float, box)).validated(width, height)  # from one outside the frame, OpenCV's MIL never returns
         left, top, w, h = (round(value) for value in box)
@@ -108,9 +92,8 @@ def _parameters(name: str, models: Path | None) -> Any:
     """Return the parameters of a tracker with model files."""
     files = MODELS[name]
     if models is None:
-        raise SettingsError(
-            f"the tracker {name!r} needs {' and '.join(files.values())}: give the folder with --peer-models"
-        )
+        needed = " and ".join(files.values())
+        raise SettingsError(f"the tracker {name!r} needs {needed}: give the folder with --peer-models")
     missing = [file for file in files.values() if not (models / file).is_file()]
     if missing:
         raise SettingsError(

@@ -69,18 +69,12 @@ class Scan:
     The score of a window is its likeness to the object (see `catstream.detection.likeness`) times the score of the
     appearance model, of which at most 1 counts: about 1 on the object, and near 0 on an unknown background.
 
-    Parameters
-    ----------
-    learned : the models
     threshold : least score of a sighting
     sizes : smallest and largest size, as multiples of the learned size
     """
 
     def __init__(
-        self,
-        learned: Iterable[Learned],
-        threshold: float = THRESHOLD,
-        sizes: tuple[float, float] = SIZES,
+        self, learned: Iterable[Learned], threshold: float = THRESHOLD, sizes: tuple[float, float] = SIZES
     ) -> None:
         self._threshold = threshold
         self._models = [
@@ -94,12 +88,7 @@ class Scan:
 
     @one_thread()
     def __call__(self, image: np.ndarray) -> list[list[Seen]]:
-        """Search a frame, uint8 (h, w, 3) BGR.
-
-        Returns
-        -------
-        for each model, windows of the fitted size and aspect ratio that do not overlap, highest score first
-        """
+        """Search a frame, uint8 (h, w, 3): for each model, fitted windows that do not overlap, best first."""
         frame = Pyramid(image)
         found = []
         for searched, windows in zip(self._models, self.windows(frame), strict=True):

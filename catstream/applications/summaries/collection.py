@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.applications.finding.files import find_files
+from catstream.applications.finding.find import find_files
 from catstream.errors import VideoError
 from catstream.video.source import IMAGES, open_source, read_image
 

@@ -1,47 +1,73 @@
-// The page of a fleet: passes updates to the cards of the streams and to the table of the nodes.
+// The page of a fleet: a table of the streams, each with a link to its page, and one of the nodes; those in trouble first.
 
-import { Nodes, Streams } from "./cards.js";
-import { $, duration, write } from "./dom.js";
-import { Search } from "./search.js";
+import { $, add, duration, Items, write } from "./dom.js";
+
+const STATES = ["trouble", "failed", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
+const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
+  stopping: "bootstrapping", failed: "absent", alive: "present", dead: "absent" };
+const WORDS = { waiting: "waiting for a box" };
+const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 before cam-10
+const round = (value) => String(Number(value.toFixed(2)));
 
 export class FleetPage {
   /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
   constructor(server) {
     this.server = server;
     this.fleet = { phase: "waiting", name: "", reason: "", age: 0 };
-    this.streams = new Streams($(".cards"));
+    this.streams = []; // pairs of name and value
+    this.rows = new Items($("#fleet tbody"), { make: makeStream, fill: fillStream });
+    this.nodes = new Items($("#nodes tbody"), { make: (name) => makeNode(name, () => this.search.ask(`node=${name}`)), fill: fillNode });
     this.search = new Search($("#search"), $(".states"), () => this.showMatching());
-    this.nodes = new Nodes($("#nodes"), (text) => this.search.ask(text));
     $("#streams").hidden = false;
-    addEventListener("pagehide", () => sessionStorage.setItem("top", String(scrollY)));
     setInterval(() => server.silent !== null && this.showState(), 1000);
     this.showState();
   }
 
   take({ status, streams, nodes }) {
     this.fleet = status ?? this.fleet;
-    if (nodes) this.nodes.show(nodes);
-    if (streams) this.streams.show(streams, this.nodes.rows);
+    this.labels = nodes ? Object.fromEntries(Object.entries(nodes).map(([name, node]) => [name, labels(node)])) : this.labels;
+    if (nodes) this.showNodes(nodes);
+    if (streams) this.showStreams(streams);
     this.showMatching();
     this.showState();
-    this.restorePosition();
+  }
+
+  /** Show all streams; one is found by its `words`: name, state, node with its labels, and objects. */
+  showStreams(streams) {
+    this.streams = inOrder(streams);
+    for (const [name, one] of this.streams) {
+      one.words = [name, one.state, one.level ? "trouble" : "", `node=${one.node}`, ...(this.labels?.[one.node] ?? []),
+        ...one.models.map(([object]) => object)].join(" ").toLowerCase();
+    }
+    this.rows.show(this.streams);
+  }
+
+  /** Show all nodes, how many are alive, and how many of their cores are used. */
+  showNodes(nodes) {
+    const rows = Object.values(nodes), alive = rows.filter((row) => row.state !== "dead");
+    const total = (field) => round(alive.reduce((sum, row) => sum + row[field], 0));
+    const states = alive.length === rows.length ? `${rows.length}` : `${alive.length} of ${rows.length} alive`;
+    $("#nodes .scrolled").hidden = !rows.length;
+    write($("#nodes .count"), rows.length ? `${states} · ${total("used")} of ${total("cores")} cores used` : "none");
+    this.nodes.show(inOrder(nodes));
   }
 
   showMatching() {
-    const { streams, search, fleet } = this;
-    search.offer(streams.cards);
-    const shown = streams.filter((card) => search.matches(card));
-    const empty = fleet.phase === "running" && !streams.cards.length;
-    $(".find").hidden = !streams.cards.length;
-    write($(".none"), empty ? "This fleet has no streams. Add some to its file, and apply it with “catstream fleet up”."
-      : streams.cards.length && !shown ? `No stream matches “${search.text}”.` : "");
+    const { search, fleet } = this, values = this.streams.map(([, one]) => one);
+    search.offer(values);
+    for (const [name, one] of this.streams) this.rows.items.get(name).element.hidden = !search.matches(one);
+    const shown = values.filter((one) => search.matches(one)).length;
+    $(".find").hidden = !values.length;
+    $("#fleet .scrolled").hidden = !shown;
+    write($(".none"), fleet.phase === "running" && !values.length ? "This fleet has no streams. Add some to its file, and apply it with “catstream fleet up”."
+      : values.length && !shown ? `No stream matches “${search.text}”.` : "");
   }
 
   showState() {
-    const { fleet, server: { silent, closed }, streams: { cards } } = this;
-    const troubled = cards.filter((card) => card.level).length;
+    const { fleet, server: { silent, closed } } = this;
     const current = fleet.phase === "running" && silent === null && !closed;
-    const [state, words] = this.state(cards, troubled);
+    const troubled = this.streams.filter(([, one]) => one.level).length;
+    const [state, words] = this.state(troubled);
     $("#state").dataset.state = state;
     write($("#state b"), words);
     write($("#source"), fleet.name && `fleet ${fleet.name}`);
@@ -51,18 +77,17 @@ export class FleetPage {
     $("#silence").hidden = !message;
     for (const each of document.querySelectorAll("#streams section")) each.hidden = fleet.phase === "waiting";
     $("#streams").classList.toggle("old", !current);
-    this.streams.pictures.paused = !current;
   }
 
   /** The state of the fleet for its colour, and in words. */
-  state(cards, troubled) {
-    const { fleet, server: { silent, closed } } = this;
+  state(troubled) {
+    const { fleet, streams, server: { silent, closed } } = this;
     if (silent !== null || closed) return ["silent", "page stopped"];
     if (fleet.phase !== "running") return [fleet.phase, fleet.phase === "silent" ? "fleet silent" : "waiting"];
     if (troubled) return ["absent", `${troubled} in trouble`];
-    const running = cards.filter((card) => card.state === "running").length;
-    if (!cards.length) return ["waiting", "no streams"];
-    return [running ? "present" : "waiting", `${running === cards.length ? "" : `${running} of `}${cards.length} running`];
+    const running = streams.filter(([, one]) => one.state === "running").length;
+    if (!streams.length) return ["waiting", "no streams"];
+    return [running ? "present" : "waiting", `${running === streams.length ? "" : `${running} of `}${streams.length} running`];
   }
 
   /** Why the page is not current; empty if it is. */
@@ -75,12 +100,108 @@ export class FleetPage {
     if (fleet.phase === "silent") return `The fleet does not answer.${shown.replace("It", "This page")} The reason: ${fleet.reason}`;
     return fleet.phase === "waiting" && fleet.reason ? `Waiting for the fleet: ${fleet.reason}` : "";
   }
+}
 
-  /** After a page of a stream, return to the same cards. */
-  restorePosition() {
-    const top = sessionStorage.getItem("top");
-    if (top === null || !this.streams.cards.length) return;
-    sessionStorage.removeItem("top");
-    scrollTo(0, Number(top));
+/** Pairs of name and value: those that do not run because of trouble, others with trouble, the rest; by name. */
+function inOrder(values) {
+  for (const value of Object.values(values)) value.level = ["failed", "dead"].includes(value.state) ? 2 : value.trouble ? 1 : 0;
+  return Object.entries(values).sort(([name, one], [other, two]) => two.level - one.level || byNumber(name, other));
+}
+
+const labels = (node) => Object.entries(node.labels).map(([name, value]) => `${name}=${value}`).sort();
+
+/** A row: the name, which is a link or a button, with lines below it, the state, and cells of text. */
+function makeRow(tag, properties, cells) {
+  const element = document.createElement("tr");
+  const first = add(element, "td"), pill = add(add(element, "td"), "span", { className: "pill" });
+  add(pill, "span", { ariaHidden: "true" });
+  return { element, pill, name: add(first, tag, properties), about: add(first, "p", { className: "quiet" }),
+    trouble: add(first, "p", { className: "trouble" }), word: add(pill, "b"), cells: cells.map((className) => add(element, "td", { className })) };
+}
+
+function fillRow({ pill, word, trouble, cells }, { state, trouble: problem = "" }, texts) {
+  pill.dataset.state = TONES[state] ?? state;
+  write(word, WORDS[state] ?? state);
+  write(trouble, problem);
+  texts.forEach((text, place) => write(cells[place], text));
+}
+
+const makeStream = (name) => makeRow("a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name }, ["", "number", "number", "", ""]);
+
+function fillStream(item, one) {
+  item.name.title = one.source;
+  fillRow(item, one, [one.node || "–", one.frame.toLocaleString("en"), one.skipped.toLocaleString("en"),
+    one.models.map(([name, version]) => (name ? `${name}: ${version}` : version)).join(", ") || "–", stored(one.stored_seconds)]);
+}
+
+const makeNode = (name, onclick) => makeRow("button", { type: "button", textContent: name, onclick }, ["number", "number"]);
+
+function fillNode(item, one) {
+  write(item.about, labels(one).join(" · "));
+  item.name.title = `Show the streams of this node${one.address && `, at ${one.address}`}`;
+  fillRow(item, one, [one.state === "dead" ? "–" : `${round(one.used)} of ${round(one.cores)}`, String(one.streams)]);
+}
+
+/** The age of the state in the store; it changes only when it passes a limit. */
+function stored(seconds) {
+  if (seconds === null) return "–";
+  const limit = [5, 10, 15, 30, 60].find((each) => seconds < each);
+  return limit ? `< ${limit} s ago` : `${duration(Math.floor(seconds / 60) * 60)} ago`;
+}
+
+/** The search field, and buttons that search for the streams in a state. The search is kept in the address of the page. */
+class Search {
+  /** changed() is called whenever another search is made. */
+  constructor(field, buttons, changed) {
+    Object.assign(this, { field, changed });
+    this.buttons = new Items(buttons, { make: (state) => this.make(state), fill: fillButton });
+    field.value = new URLSearchParams(location.search).get("search") ?? "";
+    field.addEventListener("input", () => this.tell());
+    field.addEventListener("keydown", (event) => event.key === "Escape" && this.ask(""));
   }
+
+  get text() {
+    return this.field.value.trim();
+  }
+
+  get words() {
+    return this.text.toLowerCase().split(/\s+/).filter(Boolean);
+  }
+
+  /** Search for a text. */
+  ask(text) {
+    this.field.value = text;
+    this.tell();
+  }
+
+  tell() {
+    history.replaceState(null, "", this.text ? `?${new URLSearchParams({ search: this.text })}` : location.pathname);
+    this.changed();
+  }
+
+  /** Whether all words are found in the words of a stream, those with an = as whole words. */
+  matches(stream) {
+    return this.words.every((word) => (word.includes("=") ? ` ${stream.words} `.includes(` ${word} `) : stream.words.includes(word)));
+  }
+
+  /** Show a button for each state that streams are in, how many there are, and whether they are searched for. */
+  offer(streams) {
+    const counts = STATES.map((state) => [state, streams.filter((one) => (state === "trouble" ? one.level : one.state === state)).length]);
+    const shown = counts.map(([state, count]) => [state, { count, pressed: this.words.includes(state) }]);
+    this.buttons.show(shown.filter(([, { count, pressed }]) => count || pressed));
+  }
+
+  /** A button that adds its state to the words, in place of another one, or removes it. */
+  make(state) {
+    const press = () => this.ask([...this.words.filter((word) => !STATES.includes(word)), ...(this.words.includes(state) ? [] : [state])].join(" "));
+    const element = Object.assign(document.createElement("button"), { type: "button", onclick: press });
+    element.dataset.state = state;
+    return { element };
+  }
+}
+
+function fillButton({ element }, { count, pressed }) {
+  const { state } = element.dataset;
+  write(element, `${state === "trouble" ? "in trouble" : state} ${count}`);
+  element.setAttribute("aria-pressed", String(pressed));
 }

@@ -1,11 +1,9 @@
 // The page of a stream: passes updates to the parts of the page, and commands of the user to the pipeline.
 
-import { BoxForm } from "./boxform.js";
 import { Charts } from "./charts.js";
 import { $, write } from "./dom.js";
-import { Objects } from "./objects.js";
+import { BoxForm, Objects } from "./objects.js";
 import { Stage } from "./stage.js";
-import { SurprisingFrames } from "./surprising.js";
 import { Trees } from "./trees.js";
 
 const MESSAGE = { delay: 8000, duration: 1000 }; // milliseconds that a message is shown, and fades
@@ -19,7 +17,6 @@ export class StreamPage {
     this.frame = null; // number and time of the newest frame
     this.charts = new Charts($(".charts"));
     this.trees = new Trees($(".trees"), $("#tree-summary"));
-    this.surprising = new SurprisingFrames($(".surprising"), $("#surprising-summary"));
     this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.askToForget(name) });
     this.form = new BoxForm(this.objects, { accept: () => this.stage.accept(), cancel: () => this.stage.cancel() });
     this.stage = new Stage($("#stage"), this.objects, { pause: () => this.pause(), follow: (box, leave) => this.follow(box, leave),
@@ -44,7 +41,7 @@ export class StreamPage {
   }
 
   /** Show the parts that have changed; `pipeline` is sent, with all of them, if all that was shown is of another one. */
-  take({ pipeline, status, tracks, picture, points, trees, surprising }) {
+  take({ pipeline, status, tracks, picture, points, trees }) {
     if (pipeline !== undefined) this.clear();
     if (status) {
       this.status = status;
@@ -60,7 +57,6 @@ export class StreamPage {
     if (picture) this.stage.show(picture).then(() => this.showState());
     if (points) this.charts.add(points);
     if (trees) this.trees.show(trees);
-    if (surprising) this.surprising.show(surprising);
   }
 
   clear() {

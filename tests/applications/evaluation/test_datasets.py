@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.datasets import find_sequences
-from catstream.errors import VideoError
+from catstream.applications.evaluation.datasets import find_sequences, read_attributes
+from catstream.errors import SettingsError, VideoError
 
 TRUTH = np.array([[10, 20, 30, 40], [12.5, 21, 30, 40], [np.nan] * 4, [15, 22, 31, 41.5]])
 
@@ -49,23 +49,15 @@ def test_otb_with_commas_tabs_and_blanks(tmp_path, sign):
     check(folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH, sign), file="%04d.jpg"))
 
 
-def test_otb_with_two_objects_is_two_sequences(tmp_path):
-    place = folder(tmp_path / "walk", "groundtruth_rect.1.txt", "img", lines(TRUTH))
-    (place / "groundtruth_rect.2.txt").write_text(lines(TRUTH + 1))
-    assert [sequence.name for sequence in find_sequences(place)] == ["walk.1", "walk.2"]
-    np.testing.assert_allclose(find_sequences(place)[1].boxes, TRUTH + 1)
-
-
-def test_an_otb_object_without_ground_truth_is_no_sequence(tmp_path):
+def test_otb_with_two_objects_is_two_sequences_if_both_have_a_ground_truth(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth_rect.2.txt", "img", lines(TRUTH))
     (place / "groundtruth_rect.1.txt").touch()
+    (place / "groundtruth_rect_old.txt").write_text(lines(TRUTH + 1))  # only named like one
     check(place)
-
-
-def test_a_file_that_is_only_named_like_a_ground_truth_is_of_no_sequence(tmp_path):
-    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH))
-    (place / "groundtruth_rect_old.txt").write_text(lines(TRUTH + 1))
-    check(place)
+    (place / "groundtruth_rect.1.txt").write_text(lines(TRUTH + 1))
+    first, second = find_sequences(place)
+    assert (first.name, second.name) == ("walk.1", "walk.2")
+    np.testing.assert_allclose(first.boxes, TRUTH + 1)
 
 
 def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
@@ -147,17 +139,13 @@ def test_a_malformed_ground_truth_is_an_error_with_the_line(tmp_path, text, mess
         find_sequences(place)
 
 
-def test_a_ground_truth_that_is_no_text_is_an_error(tmp_path):
-    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "")
-    (place / "groundtruth_rect.txt").write_bytes("1,2,3,4\n".encode("utf-16"))
+def test_a_ground_truth_that_is_no_text_or_a_link_to_nothing_is_an_error(tmp_path):
+    file = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "") / "groundtruth_rect.txt"
+    file.write_bytes("1,2,3,4\n".encode("utf-16"))
     with pytest.raises(VideoError, match=r"cannot be read .* expected a text file"):
-        find_sequences(place)
-
-
-def test_a_ground_truth_that_is_a_link_to_nothing_is_an_error_of_one_line(tmp_path):
-    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "")
-    (place / "groundtruth_rect.txt").unlink()
-    (place / "groundtruth_rect.txt").symlink_to("not-fetched")
+        find_sequences(tmp_path)
+    file.unlink()
+    file.symlink_to("not-fetched")
     with pytest.raises(VideoError, match=r"groundtruth_rect.txt' cannot be read .* No such file"):
         find_sequences(tmp_path)
 
@@ -172,3 +160,12 @@ def test_fewer_frames_than_boxes_are_an_error(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH), frames=3)
     with pytest.raises(VideoError, match="1 frame too few"):
         list(find_sequences(place)[0].frames())
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b'{"walk": "blur"}', b'{"a": [1]}', b'{"\xff": []}'])
+def test_a_file_of_attributes_in_another_form_is_an_error(tmp_path, content):
+    file = tmp_path / "attributes.json"
+    file.write_bytes(content)
+    for path in (file, tmp_path / "missing.json"):
+        with pytest.raises(SettingsError, match="cannot read the attributes"):
+            read_attributes(path)

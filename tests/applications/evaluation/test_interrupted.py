@@ -10,9 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 import psutil
 import pytest
 
-from catstream.applications.evaluation.workers import run_tasks
-from catstream.cli.interrupts import INTERRUPTED
-from catstream.services.start import sigint_blocked
+from catstream.applications.workers import run_tasks, sigint_blocked
+from catstream.cli.common import INTERRUPTED
 
 
 def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, tmp_path):

@@ -50,29 +50,18 @@ def test_a_model_file_that_opencv_cannot_read_is_one_line_of_error(tracker, tmp_
     assert capfd.readouterr().err == ""
 
 
-def test_a_box_across_the_edge_of_the_frame_is_clipped_for_opencv(sequence):
-    frame = next(iter(sequence.frames()))
-    peer = Peer("mil")
+def test_a_box_across_the_edge_of_the_frame_is_clipped_and_one_outside_it_is_an_error(sequence, monkeypatch):
+    frame, peer = next(iter(sequence.frames())), Peer("mil")
     peer.init(frame, (-8.0, 90.0, 40.0, 40.0))
-    found, _ = peer.update(frame)
-    assert found
+    assert peer.update(frame)[0]
     assert peer.score == 1
-
-
-def test_a_box_outside_the_frame_is_one_line_of_error(sequence):
     with pytest.raises(BoxError, match="outside the frame of 160 x 120"):
-        Peer("mil").init(next(iter(sequence.frames())), (-90, 0, 60, 60))
-
-
-def test_a_box_that_opencv_rejects_is_one_line_of_error(monkeypatch, sequence):
-    class Broken:
-        def init(self, *_):
-            raise cv2.error("assertion failed")
-
-    peer = Peer("mil")
-    monkeypatch.setattr(peer, "_create", Broken)
+        peer.init(frame, (-90, 0, 60, 60))
+    broken = create_autospec(cv2.TrackerMIL, instance=True)
+    broken.init.side_effect = cv2.error("assertion failed")
+    monkeypatch.setattr(peer, "_create", lambda: broken)
     with pytest.raises(BoxError, match="does not accept the box 1,2,30,40"):
-        peer.init(next(iter(sequence.frames())), (1, 2, 30, 40))
+        peer.init(frame, (1, 2, 30, 40))
 
 
 def test_a_tracker_missing_in_opencv_is_an_error_with_the_install_command(monkeypatch):

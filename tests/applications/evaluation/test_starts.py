@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.starts import (
+from catstream.applications.evaluation.datasets import (
     FIRST,
     SHIFTS,
+    Sequence,
     Start,
     choose_starts,
     jittered,
@@ -21,6 +20,7 @@ from catstream.applications.evaluation.starts import (
     spatial,
     temporal,
 )
+from catstream.applications.evaluation.onepass import evaluate
 from catstream.box import Box
 from catstream.errors import CatstreamError
 from catstream.settings import Settings
@@ -70,6 +70,8 @@ def test_every_choice_starts_when_the_object_appears(sequence):
 
 def test_each_option_of_the_command_chooses_its_starts(sequence):
     assert choose_starts()(sequence) == [FIRST]
+    starts = {*temporal(4)(sequence), *spatial(sequence), *jittered(7)(sequence)}
+    assert len({start.suffix for start in starts}) == len(starts) == 4 + 12 + 6  # each has a name of its own
     assert choose_starts(2)(sequence) == temporal(2)(sequence)
     assert choose_starts(boxes=2)(sequence) == jittered(2)(sequence)
     assert choose_starts(shifts=True)(sequence) == spatial(sequence)
@@ -93,12 +95,6 @@ def test_jittered_boxes_are_the_given_one_and_fixed_random_ones_within_two_perce
         dx, dy, dw, dh = np.random.default_rng(k).uniform(-0.02, 0.02, 4)
         wide, high = w * (1 + dw), h * (1 + dh)
         np.testing.assert_allclose(found[k], (x + w / 2 + dx * w - wide / 2, y + h / 2 + dy * h - high / 2, wide, high))
-
-
-def test_each_start_has_a_name_of_its_own(sequence):
-    starts = {*temporal(4)(sequence), *spatial(sequence), *jittered(7)(sequence)}
-    assert len({start.suffix for start in starts}) == len(starts) == 4 + 12 + 6
-    assert FIRST.suffix == ""
 
 
 @given(st.tuples(st.floats(0, 159.9), st.floats(0, 119.9)), st.tuples(st.floats(2, 320), st.floats(2, 240)), st.data())

@@ -12,7 +12,7 @@ import signal
 import pytest
 
 import catstream
-from catstream.applications.finding.log import SearchLog
+from catstream.applications.finding.found import FileResult
 
 
 @pytest.fixture
@@ -47,27 +47,29 @@ def test_the_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
 
 
 def test_a_command_that_was_interrupted_keeps_its_results_and_continues(run, video, tmp_path, monkeypatch):
-    step, steps = SearchLog.step, []
+    add, steps = FileResult.add, []
 
     def interrupted(*arguments):
-        steps.append(step(*arguments))
-        if len(steps) == 4:
+        steps.append(add(*arguments))
+        if len(steps) == 16:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(SearchLog, "step", interrupted)
-    code, output = run(video)
+    monkeypatch.setattr(FileResult, "add", interrupted)
+    files = [shutil.copy(video, tmp_path / name) for name in ("a.mp4", "b.mp4")]
+    code, output = run(*files)
     assert code == 130
     assert "the same command continues" in output
     early = rows(tmp_path / "found", "sightings.csv")
-    assert early
+    assert {row["file"] for row in early} == {str(file) for file in files}
     assert "searched in part" in (tmp_path / "found" / "report.html").read_text()
 
-    assert run(video)[0] == 0
+    assert run(*files)[0] == 0
     continued, count = rows(tmp_path / "found", "sightings.csv"), len(steps)
+    assert count == 16 + 11, "only the second file is searched again"
     assert continued[: len(early)] == early
-    assert run(video)[0] == 0
+    assert run(*files)[0] == 0
     assert len(steps) == count, "a complete file is not searched again"
-    assert run(video, "--overwrite")[0] == 0
+    assert run(*files, "--overwrite")[0] == 0
     assert rows(tmp_path / "found", "sightings.csv") == continued
 
 

@@ -4,51 +4,51 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.finding.sightings import FileResult, Sighting
+from catstream.applications.finding.find import Sighting, Step
+from catstream.applications.finding.found import FileResult
 from catstream.box import Box
+from catstream.video.frames import Frame
+
+IMAGE = np.zeros((60, 80, 3), np.uint8)
 
 
 def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):
     return Sighting(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
 
 
+def intervals_of(*steps):
+    """The intervals of the sightings of these steps."""
+    result = FileResult("walk.mp4", [], gap=1.0)
+    for number, step in enumerate(steps):
+        result.add(Step(Frame(number, step[0].time, IMAGE), step))
+    return result.intervals
+
+
 def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one():
-    result = FileResult("walk.mp4", [], gap_seconds=1.0)
-    result.add(0, 0.0, [sighting(0.0)])
-    result.add(0, 0.0, [sighting(0.2, x=300.0)])
-    result.add(0, 0.0, [sighting(0.4, size=80.0)])
-    result.add(0, 0.0, [sighting(1.2)])
-    result.add(0, 0.0, [sighting(2.5)])
-    assert [interval.count for interval in result.intervals] == [4, 1]
+    alone = sighting(0.0), sighting(0.2, x=300.0), sighting(0.4, size=80.0), sighting(1.2), sighting(2.5)
+    assert [interval.count for interval in intervals_of(*([each] for each in alone))] == [4, 1]
 
 
 def test_two_sightings_of_one_object_in_a_frame_are_in_one_interval():
-    result = FileResult("walk.mp4", [], gap_seconds=1.0)
-    for step in range(5):
-        result.add(0, 0.0, [sighting(0.2 * step, x=2.0 * step), sighting(0.2 * step, x=60.0 - 2 * step)])
-    assert [interval.count for interval in result.intervals] == [10]
+    pairs = [[sighting(0.2 * step, x=2.0 * step), sighting(0.2 * step, x=60.0 - 2 * step)] for step in range(5)]
+    assert [interval.count for interval in intervals_of(*pairs)] == [10]
 
 
-times = st.lists(st.floats(0, 30), min_size=1, max_size=40)
+seen = st.tuples(st.floats(0, 30), st.sampled_from(["anna", "ben"]), st.floats(0.5, 1))
 
 
-@given(st.data(), times)
-def test_every_sighting_is_in_one_interval_of_its_object(data, moments):
-    result = FileResult("walk.mp4", [], gap_seconds=1.0)
-    made = []
-    for time in sorted(moments):
-        name = data.draw(st.sampled_from(["anna", "ben"]))
-        made.append(sighting(time, x=data.draw(st.floats(0, 500)), name=name, score=data.draw(st.floats(0.5, 1))))
-        (interval,) = result.add(0, 0.0, [made[-1]])
-        assert interval.last is made[-1]
-        assert interval.first.object == name
-        since = [each for each in made if each.object == name and each.time >= interval.first.time]
-        assert interval.best.score == max(each.score for each in since)
-    assert sum(interval.count for interval in result.intervals) == len(made)
-    assert all(interval.first.time <= interval.best.time <= interval.last.time for interval in result.intervals)
+@given(st.lists(seen, min_size=1, max_size=40))
+def test_every_sighting_is_in_one_interval_of_its_object(facts):
+    made = [sighting(time, name=name, score=score) for time, name, score in sorted(facts)]
+    found = intervals_of(*([each] for each in made))
+    assert sum(interval.count for interval in found) == len(made)
     for name in ("anna", "ben"):
-        own = [interval for interval in result.intervals if interval.first.object == name]
-        assert all(one.last.time + result.gap_seconds < other.first.time for one, other in pairwise(own))
+        own = [interval for interval in found if interval.first.object == name]
+        assert all(one.last.time + 1.0 < other.first.time for one, other in pairwise(own))
+        for each in own:
+            within = [one for one in made if one.object == name and each.first.time <= one.time <= each.last.time]
+            assert (each.count, each.best.score) == (len(within), max(one.score for one in within))

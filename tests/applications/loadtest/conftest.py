@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from catstream.applications.loadtest.measures import Measures
+from catstream.applications.loadtest.latency import Measures
+from catstream.applications.loadtest.load_test import Result
 from catstream.applications.loadtest.plan import Plan
-from catstream.applications.loadtest.run import Result
 from catstream.box import Box
 from catstream.messages.kinds import Track
 from catstream.video.broadcast import Schedule
@@ -52,7 +52,7 @@ def result() -> Callable[..., Result]:
                     without_track=0,
                     success=success,
                     success_followed=success,
-                    lag=[(100.5, 3)],
+                    max_lag=3,
                 )
             )
         facts = {"usage": {}, "received": [], "missed": [], "frozen": 0.0}

@@ -1,0 +1,244 @@
+"""The accuracy of trackers from their runs: a row for each sequence and tracker, means, JSON, and a report in HTML."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from statistics import fmean, pstdev
+
+import numpy as np
+
+from catstream.applications.evaluation.runs import EvaluationRun, provenance
+from catstream.applications.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
+from catstream.applications.html.page import SHARES, Axis, plot, table, write_page
+from catstream.numerics.arrays import Float64
+from catstream.settings import Settings
+
+#: The measures of a row that are averaged, with their headings.
+MEASURES = {
+    "auc": "AUC",
+    "success": "success",
+    "precision": "precision",
+    "normalised_precision": "norm.",
+    "f_score": "F",
+    "fps": "frames/s",
+}
+
+#: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
+FLIP = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The measures of one tracker on one sequence: means over its runs.
+
+    `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of `scores.py`,
+    from 0 to 1. `lost` is the share of the runs that have lost the object in the end. `f_score` and its two components
+    are None if the object is never absent. The spreads are standard deviations over the runs. `flips` is None unless
+    the runs have different first boxes; it is true if their smallest and largest success differ by more than 0.25: then
+    chance decides.
+    """
+
+    name: str
+    tracker: str
+    frames: int
+    runs: int
+    auc: float
+    auc_spread: float
+    success: float
+    success_spread: float
+    precision: float
+    normalised_precision: float
+    lost: float
+    f_score: float | None
+    long_term_precision: float | None
+    long_term_recall: float | None
+    flips: bool | None
+    fps: float
+
+
+def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
+    """Return a row for each sequence and tracker, in order of first occurrence."""
+    groups: dict[tuple[str, str], list[EvaluationRun]] = {}
+    for run in runs:
+        groups.setdefault((run.sequence.name, run.tracker), []).append(run)
+    return [_row(name, tracker, group) for (name, tracker), group in groups.items()]
+
+
+def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
+    """Return the mean of each measure over the sequences, by tracker; that of the F-score over those that have one."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.tracker, []).append(row)
+    return {
+        tracker: {measure: _mean(getattr(row, measure) for row in group) for measure in MEASURES}
+        for tracker, group in groups.items()
+    }
+
+
+def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
+    """Return the measures of a row or a mean as text, in the order of `MEASURES`; with the spread of several runs."""
+    values = dataclasses.asdict(measured) if isinstance(measured, Row) else measured
+
+    def text(measure: str) -> str:
+        value, spread = values[measure], values.get(f"{measure}_spread")
+        if value is None:
+            return "-"
+        return f"{value:.3f}" if spread is None or values.get("runs") == 1 else f"{value:.3f} ±{spread:.3f}"
+
+    return [text(measure) if measure != "fps" else f"{values['fps']:.0f}" for measure in MEASURES]
+
+
+def by_attribute(
+    rows: Iterable[Row], attributes: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, dict[str, float | None]]]:
+    """Return the means of each tracker over the sequences with an attribute: {attribute: {tracker: {measure: mean}}}.
+
+    attributes : names of the sequences that have each attribute
+    """
+    rows = list(rows)
+    means = {attribute: mean_of(row for row in rows if row.name in names) for attribute, names in attributes.items()}
+    return {attribute: mean for attribute, mean in means.items() if mean}
+
+
+def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
+    """Return the names of the sequences that flip, by tracker; only trackers whose runs have different first boxes."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        if row.flips is not None:
+            found.setdefault(row.tracker, []).extend([row.name] if row.flips else [])
+    return found
+
+
+def describe_flips(rows: Iterable[Row]) -> list[str]:
+    """Return the number and the names of the sequences that flip, a sentence for each tracker as in `flips_of`."""
+    rows = list(rows)
+    count = len({row.name for row in rows})
+    return [
+        f"{tracker}: {len(names)} of {count} sequences flip with the first box (success differs by more than {FLIP})"
+        + (f": {', '.join(names)}" if names else "")
+        for tracker, names in flips_of(rows).items()
+    ]
+
+
+def to_json(rows: list[Row], settings: Settings, attributes: Mapping[str, Sequence[str]]) -> dict[str, object]:
+    """Return the JSON of `catstream evaluate --json`: rows, means, flips and attributes, and provenance."""
+    means = by_attribute(rows, attributes)
+    return {
+        **provenance(settings),
+        "sequences": [dataclasses.asdict(row) for row in rows],
+        "mean": mean_of(rows),
+        "flips": flips_of(rows),
+        "attributes": {
+            attribute: {"sequences": list(attributes[attribute]), "mean": mean} for attribute, mean in means.items()
+        },
+    }
+
+
+def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
+    scores = [run.score() for run in runs]
+    success = [score.success for score in scores]
+    long = [score.long_term for score in scores if score.long_term is not None]
+    return Row(
+        name=name,
+        tracker=tracker,
+        frames=len(runs[0].sequence),
+        runs=len(runs),
+        auc=fmean(score.auc for score in scores),
+        auc_spread=pstdev(score.auc for score in scores),
+        success=fmean(success),
+        success_spread=pstdev(success),
+        precision=fmean(score.precision for score in scores),
+        normalised_precision=fmean(score.normalised_precision for score in scores),
+        lost=fmean(score.lost for score in scores),
+        f_score=_mean(part.f_score for part in long),
+        long_term_precision=_mean(part.precision for part in long),
+        long_term_recall=_mean(part.recall for part in long),
+        flips=max(success) - min(success) > FLIP if any(run.start.variation.name for run in runs) else None,
+        fps=fmean(run.fps for run in runs),
+    )
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if known else None
+
+
+def write_report(
+    path: Path, runs: list[EvaluationRun], settings: Settings, attributes: Mapping[str, Sequence[str]]
+) -> Path:
+    """Write the report of an evaluation as one self-contained HTML file.
+
+    attributes : names of the sequences that have each attribute
+    """
+    rows = rows_of(runs)
+    sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
+    body = [
+        "<h1>Accuracy</h1>",
+        f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
+        "the object count only for F. ± is the standard deviation over the runs of a sequence.</p>",
+        *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
+        _plots(runs),
+        "<h2>Sequences</h2>",
+        _table(rows),
+        *(["<h2>Attributes</h2>", _attribute_table(rows, attributes)] if attributes else []),
+        "<h2>Settings that are not the default</h2>",
+        f"<pre>{escape(chr(10).join(settings.changed())) or 'none'}</pre>",
+    ]
+    return write_page(path, "evaluation", body)
+
+
+def _plots(runs: list[EvaluationRun]) -> str:
+    """Plot success and precision of each tracker, averaged over the sequences."""
+
+    def curves(
+        places: np.ndarray, measure: Callable[..., Float64], at: Callable[[Float64], float]
+    ) -> dict[str, tuple[np.ndarray, Float64]]:
+        by_tracker: dict[str, dict[str, list[Float64]]] = {}
+        for run in runs:  # as in the table, the mean is taken first over the starts of a sequence
+            by_tracker.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(
+                measure(run.boxes, run.truth)
+            )
+        means = {
+            tracker: np.mean([np.mean(plots, axis=0) for plots in sequences.values()], axis=0)
+            for tracker, sequences in by_tracker.items()
+        }
+        ranked = sorted(means.items(), key=lambda item: -at(item[1]))
+        return {f"{tracker}  {at(curve):.3f}": (places, curve) for tracker, curve in ranked}
+
+    overlap, distance = (
+        dataclasses.replace(SHARES, label="overlap threshold"),
+        Axis.upto(PIXELS[-1], "distance in pixels"),
+    )
+    success = curves(OVERLAPS, success_plot, lambda curve: float(curve.mean()))
+    precision = curves(PIXELS, precision_plot, lambda curve: float(curve[20]))
+    left = plot("Success (AUC)", overlap, SHARES, success)
+    right = plot("Precision (at 20 pixels)", distance, SHARES, precision)
+    return f'<div class="plots">{left}{right}</div>'
+
+
+def _table(rows: list[Row]) -> str:
+    lines = [[escape(row.name), row.tracker, row.frames, *_shaded(cells(row))] for row in rows]
+    means = mean_of(rows)
+    lines += [["mean", tracker, "", *_shaded(cells(mean))] for tracker, mean in means.items()]
+    return table(("sequence", "tracker", "frames", *MEASURES.values()), lines, texts=2, means=len(means))
+
+
+def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
+    lines = [
+        [escape(attribute), tracker, len(attributes[attribute]), *_shaded(cells(mean))]
+        for attribute, means in by_attribute(rows, attributes).items()
+        for tracker, mean in means.items()
+    ]
+    return table(("attribute", "tracker", "sequences", *MEASURES.values()), lines, texts=2, means=0)
+
+
+def _shaded(texts: list[str]) -> list[str]:
+    """Give the measures from 0 to 1 a background that is darker for a higher value."""
+    shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:-1]]
+    style = "background: rgb(47 158 68 / {:.0f}%); padding: .1rem .3rem"
+    shown = [f'<span style="{style.format(each)}">{text}</span>' for each, text in zip(shades, texts, strict=False)]
+    return [*shown, texts[-1]]

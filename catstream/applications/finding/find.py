@@ -1,0 +1,330 @@
+"""The search of files for the objects of saved models: frames in equal distances of time, and what is seen in them."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from catstream.applications.finding.scan import SIZES, THRESHOLD, Scan, Seen
+from catstream.box import Box
+from catstream.errors import SettingsError, VideoError
+from catstream.run.learned import Learned
+from catstream.settings import RunSettings
+from catstream.video.ahead import read_ahead
+from catstream.video.frames import Frame, without_password
+from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
+
+_One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
+#: A frame that is searched, and the name of its file in a folder of images.
+_Searched = tuple[Frame, str]
+#: Is called with the number of frames of a file, if it is known, before the first one.
+Opened = Callable[[int | None], None]
+#: Is called with the reason for each image that cannot be read, and at the end of a video of which frames were skipped.
+Damaged = Callable[[str], None]
+
+#: Seconds of a video between two frames that are searched.
+EVERY = 0.2
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """An object that was found in a frame.
+
+    Attributes
+    ----------
+    object : str
+        Name of the object.
+    file : str
+        The video, the image, or the folder of images.
+    frame : int
+        Number of the frame, or of the image in its folder; the first one is 0.
+    time : float
+        Seconds since the start of the video.
+    box : Box
+        Box of the object in pixels of the frame.
+    score : float
+        About 1 on the object, near 0 elsewhere; at least the threshold of the search.
+    image : str
+        Name of the file in a folder of images, otherwise empty.
+    """
+
+    object: str
+    file: str
+    frame: int
+    time: float
+    box: Box
+    score: float
+    image: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A video, a folder of images, or a single image.
+
+    path  of the file, or of the folder
+    kind  "video", "images" or "image"
+    """
+
+    path: Path
+    kind: Literal["video", "images", "image"]
+
+    @property
+    def signature(self) -> list[int]:
+        """Number of files, their total size, and the newest time of modification: it differs if the file changed."""
+        states = [path.stat() for path in self.paths() if path.exists()]  # a dead link is a damaged image
+        newest = max((state.st_mtime_ns for state in states), default=0)
+        return [len(states), sum(state.st_size for state in states), newest]
+
+    def paths(self) -> list[Path]:
+        """The video, or the images in order."""
+        return image_files(self.path) if self.kind == "images" else [self.path]
+
+    def frames(self, every: float, settings: RunSettings, opened: Opened, damaged: Damaged) -> Generator[_Searched]:
+        """Yield the frames to search: all images; of a video one in `every` seconds, the first and the last.
+
+        A video that is damaged raises VideoError after the frames before the damage.
+        """
+        if self.kind == "video":
+            with open_source(self.path, skip_damaged=settings.skip_damaged) as source:
+                opened(source.frames)
+                interval, last = max(1, round(every * source.rate)), None
+                with closing(read_ahead(source)) as frames:
+                    for frame in frames:
+                        last = frame if frame.number % interval else None
+                        if last is None:
+                            yield frame, ""
+                if last is not None:
+                    yield last, ""
+                if skipped := source.counters.get("damaged"):
+                    damaged(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
+            return
+        images = self.paths()
+        opened(len(images))
+        for number, path in enumerate(images):
+            image = read_image(path)
+            if image is None:
+                damaged(f"cannot read the image {str(path)!r}: it is left out")
+            else:
+                yield Frame(number, number / settings.image_rate, image), path.name if self.kind == "images" else ""
+
+
+def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
+    """Return the files to search, in order and each once; folders are searched with all their subfolders.
+
+    The images of one folder are one file, in natural order (2.png before 10.png).
+    """
+    found: dict[File, None] = {}
+    for path in paths:
+        if is_live(str(path)):
+            raise VideoError(
+                f"{without_password(str(path))} is a live source: record it to a video first, and give the video"
+            )
+        found |= dict.fromkeys(_files(Path(path)))
+    return list(found)
+
+
+def _files(path: Path) -> list[File]:
+    if path.is_file():
+        return [File(path, "image" if path.suffix.lower() in IMAGES else "video")]
+    if not path.is_dir():
+        raise VideoError(f"there is no file or folder {str(path)!r}: give videos, images, or folders of them")
+    found = list(_files_below(path))
+    if not found:
+        raise VideoError(
+            f"the folder {str(path)!r} and its subfolders hold neither images nor videos: give another folder"
+        )
+    return found
+
+
+def _files_below(folder: Path) -> Iterator[File]:
+    entries = sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_order)
+    if any(entry.suffix.lower() in IMAGES and entry.is_file() for entry in entries):
+        yield File(folder, "images")
+    for entry in entries:
+        if entry.is_dir() and not entry.is_symlink():
+            try:
+                yield from _files_below(entry)
+            except PermissionError as error:
+                _log.warning("%s is left out (%s)", error.filename, error.strerror)
+        elif entry.suffix.lower() in VIDEOS and entry.is_file():
+            yield File(entry, "video")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A frame that was searched, and the objects that were found in it."""
+
+    frame: Frame
+    sightings: list[Sighting]
+
+
+@dataclass(slots=True)
+class Search:
+    """Searches files for the objects of several models, in as many threads as there are cores.
+
+    models      name of each object -> its model
+    settings    for reading files: the frame rate of images, and whether damage is skipped
+    threshold   least score of a sighting
+    every       seconds of a video between two frames that are searched, 0 for every frame
+    sizes       smallest and largest size that is searched, as multiples of the learned size
+    """
+
+    models: Mapping[str, Learned]
+    settings: RunSettings = field(default_factory=RunSettings)
+    threshold: float = THRESHOLD
+    every: float = EVERY
+    sizes: tuple[float, float] = SIZES
+    _scan: Scan = field(init=False)
+
+    def __post_init__(self) -> None:
+        low, high = self.sizes
+        if not 0 < low <= high < 100:
+            raise SettingsError(f"expected two positive sizes, the smaller one first, got {low:g},{high:g}: give 0.5,2")
+        self._scan = Scan(self.models.values(), self.threshold, self.sizes)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Models and options, as values of JSON: two searches with the same description have the same results."""
+        return {
+            "models": {name: _digest(learned) for name, learned in self.models.items()},
+            "threshold": self.threshold,
+            "every": self.every,
+            "sizes": list(self.sizes),
+            "image_rate": self.settings.image_rate,
+            "skip_damaged": self.settings.skip_damaged,
+        }
+
+    def file(self, file: File, *, opened: Opened = lambda _: None, damaged: Damaged = lambda _: None) -> Iterator[Step]:
+        """Search a file. At damage of a video, VideoError is raised after the steps before it."""
+        frames = file.frames(self.every, self.settings, opened, damaged)
+        with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
+            for (frame, image), found in scanned:
+                place = str(file.path), frame.number, frame.time
+                sightings = [
+                    Sighting(name, *place, each.box, each.score, image)
+                    for name, seen in zip(self.models, found, strict=True)
+                    for each in seen
+                ]
+                yield Step(frame, sightings)
+
+
+def find(
+    models: str | os.PathLike[str] | Learned | Iterable[str | os.PathLike[str] | Learned],
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    *,
+    threshold: float = THRESHOLD,
+    every: float = EVERY,
+    sizes: tuple[float, float] = SIZES,
+    skip_damaged: bool = False,
+) -> Iterator[Sighting]:
+    """Find the objects of saved models in videos, folders and images.
+
+    Parameters
+    ----------
+    models : path, or iterable of paths
+        Files that `catstream save` wrote. An object without a name gets that of its file.
+    paths : path, or iterable of paths
+        Videos, images, and folders, which are searched with all their subfolders.
+    threshold : float
+        Least score of a sighting; the score is about 1 on the object.
+    every : float
+        Seconds of a video between two frames that are searched, 0 for every frame.
+    sizes : two floats
+        Smallest and largest size that is searched, as multiples of the size that was learned.
+    skip_damaged : bool
+        Continue after a damaged place in a video.
+
+    Yields
+    ------
+    Sighting
+        Files in the order of `paths`, frames in order, objects in the order of `models`, highest score first.
+
+    Raises
+    ------
+    ServiceError, ProtocolError
+        If a model does not exist, or is damaged or of other features.
+    SettingsError
+        If two models have one name, or the sizes are not positive, the smaller one first.
+    VideoError
+        If a path does not exist or has nothing to search; after all other files, for the first file that is damaged.
+
+    Examples
+    --------
+    >>> for sighting in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
+    ...     print(sighting.file, sighting.time, sighting.box, sighting.score)
+    """
+    search = Search(load_models(_several(models)), RunSettings(skip_damaged=skip_damaged), threshold, every, sizes)
+    return _sightings(search, find_files(_several(paths)))
+
+
+def load_models(models: Iterable[str | os.PathLike[str] | Learned]) -> dict[str, Learned]:
+    """Load models; return each by the name of its object, or of its file."""
+    named: dict[str, Learned] = {}
+    for number, each in enumerate(models, 1):
+        learned = each if isinstance(each, Learned) else Learned.load(each)
+        name = learned.object or (f"object-{number}" if isinstance(each, Learned) else Path(each).stem)
+        if name in named:
+            raise SettingsError(f"two models are named {name!r}: rename the file of one, or save it under another name")
+        named[name] = learned
+    if not named:
+        raise SettingsError("a search needs at least one model: `catstream save` and `track --save-model` write one")
+    return named
+
+
+def _digest(learned: Learned) -> str:
+    """Identifies what is searched with: weights, bias and size."""
+    digest = hashlib.sha256(learned.model.weights.tobytes())
+    digest.update(np.array([learned.model.bias, *learned.box[2:]]).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _sightings(search: Search, files: list[File]) -> Iterator[Sighting]:
+    problems: list[VideoError] = []
+    for file in files:
+        unread: list[str] = []
+        try:
+            for step in search.file(file, damaged=unread.append):
+                yield from step.sightings
+        except VideoError as error:
+            problems.append(error)
+        if file.kind != "video":  # of a video, the caller asked to skip them
+            problems += map(VideoError, unread)
+    if problems:
+        raise problems[0]
+
+
+def _several(given: _One | Iterable[_One]) -> Iterable[_One]:
+    """One value or several, as several."""
+    return [given] if isinstance(given, str | os.PathLike | Learned) else given
+
+
+def _scanned(scan: Scan, frames: Iterator[_Searched]) -> Generator[tuple[_Searched, list[list[Seen]]]]:
+    """Scan frames in several threads, and yield the results in order; an error of the source comes after them."""
+    workers = len(os.sched_getaffinity(0))
+    pending: deque[tuple[_Searched, Future[list[list[Seen]]]]] = deque()
+    problem: VideoError | None = None
+    with ThreadPoolExecutor(workers, "scan") as pool:
+        try:
+            for searched in frames:
+                pending.append((searched, pool.submit(scan, searched[0].image)))
+                if len(pending) > workers:
+                    first, found = pending.popleft()
+                    yield first, found.result()
+        except VideoError as error:
+            problem = error
+        for searched, found in pending:
+            yield searched, found.result()
+    if problem is not None:
+        raise problem

@@ -1,0 +1,68 @@
+"""Processes that run a function of this program: the workers of an evaluation, and those of a load test.
+
+They end with their parent. SIGINT stays blocked in them, because on Ctrl-C their parent ends them in order: a worker
+that ended first would be reported as killed.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import TypeVar
+
+from catstream.errors import ServiceError
+from catstream.services.loop import die_with
+
+_Result = TypeVar("_Result")
+
+#: The start method of all of them.
+SPAWN = multiprocessing.get_context("spawn")
+
+
+@contextmanager
+def sigint_blocked() -> Iterator[None]:
+    """Block SIGINT in the processes that are started inside a `with`; a Ctrl-C that arrives inside is handled after it.
+
+    The mask alone does not hold it back: the signal arrives in another thread, and Python handles it in the main one. A
+    process whose start is interrupted would wait for its arguments.
+    """
+    resource_tracker.ensure_running()  # its start would unblock the signal
+    received: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()  # the thread in which Python handles signals
+    handler = signal.signal(signal.SIGINT, lambda number, _: received.append(number)) if is_main else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+            if received:
+                signal.raise_signal(signal.SIGINT)
+
+
+def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Generator[_Result]:
+    """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
+
+    If the caller stops early, for example on Ctrl-C, all workers are killed.
+    """
+    others = set(multiprocessing.active_children())
+    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),)) as pool:
+        try:
+            with sigint_blocked():  # the workers are started here
+                futures = [pool.submit(work, *task) for task in tasks]
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool:
+            raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
+        except BaseException:
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+            raise

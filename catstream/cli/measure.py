@@ -1,0 +1,295 @@
+"""`catstream evaluate` and `loadtest`: measure the accuracy of trackers, and the latency of pipelines under load."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+from rich.table import Table
+
+from catstream.cli.common import (
+    INTERRUPTS,
+    complain,
+    line_of,
+    messages,
+    screen,
+    stopped,
+    table,
+    text,
+    with_json_file,
+    write_json,
+)
+from catstream.errors import CatstreamError
+from catstream.messages.storage import writing
+from catstream.services.options import FOLDER, PATH, NumberRange, with_settings
+from catstream.settings import Settings
+
+if TYPE_CHECKING:
+    from catstream.applications.evaluation.accuracy import Row
+    from catstream.applications.loadtest.load_test import Result
+    from catstream.applications.loadtest.plan import Limit
+
+_FAILED = 1  # exit code if a limit was not met or a stream failed
+_QUIET_CORES = 0.25  # load by other processes above which a warning is printed
+_FIND = ("p99=0.1", "skipped=0.01")  # limits of a search if none are given
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
+@click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see above.")
+@click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
+@click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
+@click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")
+@click.option("--attributes", type=PATH, help="JSON file {sequence: [attribute]}.")
+@click.option("--peer-models", type=PATH, help="Folder of model files for nano and vit.")
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
+@click.option("--output", type=PATH, help="Folder for results and report.html.")
+@with_json_file
+@with_settings
+def evaluate(
+    settings: Settings,
+    paths: tuple[Path, ...],
+    trackers: str,
+    starts: int | None,
+    shifts: bool,
+    jitter: int | None,
+    attributes: Path | None,
+    peer_models: Path | None,
+    jobs: int,
+    output: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Measure trackers on annotated sequences.
+
+    PATH is a sequence or a folder of sequences. A sequence is a folder with
+    images or one video, and a text file with the box of the object in each
+    frame: groundtruth_rect.txt (x,y,w,h; nan if the object is absent). The
+    layouts of OTB, TLD, VOT and Princeton can be read.
+
+    \b
+    TRACKERS
+      catstream        this one, in one process
+      mil              OpenCV's, always available
+      csrt, kcf, tld   OpenCV's, with pip install "catstream[peers]"
+      nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER
+
+    \b
+    MEASURES, over the frames with the object
+      AUC        area under the success plot: overlap with the ground truth, all thresholds
+      success    share of frames with an overlap above 0.5
+      precision  share of frames whose centre is at most 20 pixels off
+      norm.      normalised precision: the same, relative to the size of the object
+      F          F-score of VOT-LT, if the object is absent in some frames
+
+    --starts, --shifts and --jitter make several runs of each sequence; mean and
+    standard deviation are printed. With --output, results are stored in the
+    layouts of the got10k and VOT toolkits, complete runs are not repeated, and
+    report.html shows plots. With --attributes, the report and --json also have
+    the means over the sequences that share an attribute.
+
+    \b
+    EXAMPLES
+      catstream evaluate sequences/
+      catstream evaluate sequences/ --tracker catstream,csrt --jobs 4 --output results
+      catstream evaluate sequences/walk --jitter 7 --set coreset.size=128
+    """
+    # Imported here so that --help and the other commands start faster.
+    with INTERRUPTS.leaving():
+        from catstream.applications.evaluation.accuracy import describe_flips, mean_of, rows_of, to_json, write_report
+        from catstream.applications.evaluation.datasets import (
+            choose_starts,
+            find_sequences,
+            read_attributes,
+            with_attributes,
+        )
+        from catstream.applications.evaluation.onepass import evaluate as run_all
+
+    if (starts is not None) + shifts + (jitter is not None) > 1:
+        raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
+    if attributes is not None and output is None and json_file is None:
+        raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
+    names = [name.strip() for name in trackers.split(",") if name.strip()]
+    sequences = [sequence for path in paths for sequence in find_sequences(path)]
+    seen = {} if attributes is None else read_attributes(attributes)
+
+    errors: list[CatstreamError] = []
+    try:
+        columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
+        with line_of(messages(), *columns) as progress:
+            task = progress.add_task("starting", total=None)
+            runs = run_all(
+                sequences,
+                names,
+                settings,
+                starts=choose_starts(starts, jitter, shifts=shifts),
+                peer_models=peer_models,
+                jobs=jobs,
+                output=output,
+                begin=lambda frames: progress.update(task, total=frames),
+                done=lambda run: progress.update(task, advance=len(run.boxes), description=f"{run.tracker} {run.name}"),
+                failed=errors.append,
+            )
+    except KeyboardInterrupt:
+        stopped("" if output is None else f"complete runs are in {str(output)!r}; the same command continues")
+
+    for error in errors:
+        complain(error)
+    if not runs:
+        raise CatstreamError("all runs have failed: see above")
+    rows = rows_of(runs)
+    screen().print(_table(rows, mean_of(rows)))
+    for line in describe_flips(rows):
+        click.echo(line)
+    if json_file is not None or output is not None:
+        shared = with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
+        write_json(json_file, to_json(rows, settings, shared))
+        if output is not None:
+            click.echo(f"report: {write_report(output / 'report.html', runs, settings, shared)}")
+    if errors:
+        raise CatstreamError(
+            f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
+        )
+
+
+def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
+    """Return a table of the sequences and the means."""
+    from catstream.applications.evaluation.accuracy import MEASURES, cells
+
+    numbers = ("frames", *MEASURES.values())
+    made = table("sequence", "tracker", *numbers, right=numbers)
+    for row in rows:
+        made.add_row(row.name, row.tracker, str(row.frames), *cells(row))
+    made.add_section()
+    for tracker, mean in means.items():
+        made.add_row("mean", tracker, "", *cells(mean), style="bold")
+    return made
+
+
+def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if not found or min(size := (int(found[1]), int(found[2]))) < 64:
+        raise click.BadParameter(f"a size is WIDTHxHEIGHT, 64x64 to 9999x9999, got {text!r}: for example 640x480")
+    return size
+
+
+@click.command()
+@click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
+@click.option("--objects", type=click.IntRange(1, 16), default=1, show_default=True, help="Objects of each pipeline.")
+@click.option(
+    "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
+)
+@click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="How many of them are slow or frozen.")
+@click.option(
+    "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
+)
+@click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
+@click.option(
+    "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
+)
+@click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
+@click.option(
+    "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
+)
+@with_json_file
+@click.option("--output", type=FOLDER, help="Folder for report.html.")
+@with_settings
+def loadtest(
+    find_limit: bool, limits: tuple[str, ...], json_file: Path | None, output: Path | None, **plan: Any
+) -> None:
+    """Run pipelines under load, and measure latency and losses.
+
+    The load test sends a rendered video with ground truth over HTTP on the
+    loopback interface; a pipeline of its own tracks each stream. The camera
+    does not wait: frame i is due at start + i / RATE, and latency counts from
+    then. The latency of a skipped frame ends with the track of a newer one.
+    Slow subscribers read two tracks per second; half of them are frozen
+    instead.
+
+    \b
+    LIMITS, of the worst stream
+      p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
+      model-p50 ... model-max   seconds from a frame to the model trained on it, at most
+      skipped                   share of frames that were not tracked, at most
+      missed                    share of frames whose tracks fast subscribers missed, at most
+      success                   share of frames with an overlap above 0.5, at least
+
+    With --find-limit, the search begins with RATE, each rate runs for DURATION,
+    and the limits are p99=0.1 and skipped=0.01 if none are given. The exit code
+    is 1 if a limit was not met or a stream failed.
+
+    \b
+    EXAMPLES
+      catstream loadtest --rate 30 --limit p99=0.1
+      catstream loadtest --objects 8 --limit skipped=0.01
+      catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
+      catstream loadtest --find-limit --size 320x240
+    """
+    # Imported here so that --help and the other commands start faster.
+    from catstream.applications.loadtest.latency import percentiles
+    from catstream.applications.loadtest.load_report import milliseconds, to_json, write_report
+    from catstream.applications.loadtest.load_test import run_load_test
+    from catstream.applications.loadtest.plan import Limit, Plan, violations
+
+    asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
+    parameters = Plan(**plan)
+    if output is not None:
+        with writing(output):
+            output.mkdir(parents=True, exist_ok=True)
+    with line_of(
+        messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
+    ) as progress:
+        task = progress.add_task("starting", total=1.0, figures="")
+
+        def report(activity: str, share: float, figures: str) -> None:
+            progress.update(task, description=activity, completed=share, figures=figures)
+
+        def done(result: Result) -> None:
+            if find_limit:
+                verdict = "; ".join(violations(asked, result)) or "met"
+                click.echo(
+                    f"{result.plan.rate:g} frames/s due, {result.followed:.1f} tracked, "
+                    f"p99 {milliseconds(percentiles(result.track)['p99'])} ms: {verdict}"
+                )
+
+        load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
+    if load_test.results:
+        _print_run(load_test.result, asked)
+        write_json(json_file, to_json(load_test))
+        if output is not None:
+            click.echo(f"report: {write_report(output / 'report.html', load_test)}")
+    if load_test.interrupted:
+        stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
+    if load_test.highest_rate:
+        click.echo(
+            f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest_rate:g} frames/s a stream"
+        )
+    for line in load_test.violations:
+        complain(f"broken: {line}")
+    if load_test.violations:
+        sys.exit(_FAILED)
+
+
+def _print_run(result: Result, limits: list[Limit]) -> None:
+    from catstream.applications.loadtest.load_report import milliseconds, tables
+
+    click.echo(
+        f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
+        f"{milliseconds(result.camera_late)} ms late"
+    )
+    for each in tables(result):
+        heads = list(each.rows[0])
+        made = table(*heads, right=heads[1:])
+        for row in each.rows:
+            made.add_row(*(row.get(head, "") for head in heads))
+        screen().print(made)
+    if result.other_load > _QUIET_CORES:
+        click.echo(
+            f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"
+        )
+    for limit in limits:
+        if limit.is_met(result):  # the others are an error
+            click.echo(f"{click.style('met', 'green')}: {limit.describe(result)}")

@@ -1,0 +1,221 @@
+"""`catstream find` and `merge`: find the objects of saved models, and make one saved model of several."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from catstream.cli.common import INTERRUPTS, check_file, complain, line_of, messages, screen, stopped, table, text
+from catstream.errors import CatstreamError, VideoError
+from catstream.messages.names import counted
+from catstream.numerics.threads import one_thread
+from catstream.run.learned import Learned
+from catstream.run.learned import merge as merged
+from catstream.services.options import PATH, NumberRange, with_overwrite, with_skip_damaged
+from catstream.settings import RunSettings
+
+if TYPE_CHECKING:
+    from catstream.applications.finding.find import File, Search
+    from catstream.applications.finding.found import FileResult, SearchLog
+
+_SHOWN = 12  # intervals that are printed
+
+
+def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, float]:
+    try:
+        low, high = map(float, text.split(","))
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not 0 < low <= high < 100:
+        raise click.BadParameter(f"{text!r} is not two positive numbers, the smaller one first: for example 0.5,2")
+    return low, high
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
+@click.option(
+    "--model",
+    "models",
+    type=PATH,
+    multiple=True,
+    required=True,
+    metavar="FILE",
+    help="Model of an object, written by `catstream save`; may be repeated.",
+)
+@click.option("--output", type=PATH, default="found", show_default=True, help="Folder for the results.")
+@with_overwrite
+@click.option(
+    "--threshold",
+    type=NumberRange(0, 2),
+    default=0.5,
+    show_default=True,
+    metavar="N",
+    help="Least score of a sighting.",
+)
+@click.option(
+    "--every",
+    type=NumberRange(0, 3600),
+    default=0.2,
+    show_default=True,
+    metavar="SECONDS",
+    help="Time between two frames of a video that are searched; 0 for every frame.",
+)
+@click.option(
+    "--sizes",
+    default="0.4,2.5",
+    show_default=True,
+    callback=_sizes,
+    metavar="LOW,HIGH",
+    help="Smallest and largest size, as multiples of the learned size.",
+)
+@click.option("--fps", type=float, default=25.0, show_default=True, metavar="N", help="Images of a folder per second.")
+@with_skip_damaged
+def find(
+    paths: tuple[Path, ...],
+    models: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    threshold: float,
+    every: float,
+    sizes: tuple[float, float],
+    fps: float,
+    skip_damaged: bool,
+) -> None:
+    """Find the objects of saved models in videos, folders and images.
+
+    PATH is a video, an image, or a folder, which is searched with all its
+    subfolders. The images of one folder are treated as one sequence.
+
+    Of a video, one frame in 0.2 seconds is searched. After Ctrl-C, the same
+    command continues with the file that was not finished; finished files are
+    not searched again, unless they have changed or --overwrite is given.
+
+    \b
+    Writes
+      OUTPUT/report.html     timelines, and pictures of the best sightings
+      OUTPUT/sightings.csv   a row for each sighting: file, object, frame, time, box, score
+      OUTPUT/intervals.csv   a row for each interval: file, object, begin, end
+      OUTPUT/found.json      both, by file
+      OUTPUT/search.ndjson   the log from which a search is continued
+
+    The score is about 1 on the object. If another thing is taken for the object,
+    raise --threshold. If the object is missed, lower it, or track it longer.
+
+    \b
+    EXAMPLES
+      catstream track walk.mp4 --box 120,80,64,48 --save-model anna.safetensors
+      catstream find --model anna.safetensors holiday.mp4
+      catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output found
+      catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
+    """
+    # Imported here so that --help and the other commands start faster.
+    with INTERRUPTS.leaving():
+        from catstream.applications.finding.find import Search, find_files, load_models
+        from catstream.applications.finding.found import SearchLog, write_report, write_tables
+
+    reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
+    search = Search(load_models(models), reading, threshold, every, sizes)
+    files = find_files(paths)
+    with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
+        try:
+            with one_thread(opencv=True):
+                _search(search, files, log)
+            interrupted = False
+        except KeyboardInterrupt:
+            interrupted = True
+        with INTERRUPTS.deferred():
+            results = list(log.results.values())
+            write_tables(output, results, search.description)
+            report = write_report(output / "report.html", list(search.models), results)
+    _print(results, report)
+    if interrupted:
+        stopped("the results so far are kept; the same command continues")
+    problems = [problem for result in results for problem in result.problems]
+    for problem in problems:
+        complain(problem)
+    if problems:
+        found = f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}"
+        raise CatstreamError(f"{found}: what could be read was searched")
+
+
+def _search(search: Search, files: list[File], log: SearchLog) -> None:
+    """Search all files that are not complete, and show the progress."""
+    columns = (
+        text("file {task.fields[number]}/{task.total}"),
+        text("{task.fields[frame]}  {task.fields[sightings]} sightings  {task.description}", last=True),
+    )
+    with line_of(messages(), *columns) as progress:
+        task = progress.add_task("", total=len(files), number=0, frame="", sightings=0)
+        for number, file in enumerate(files, 1):
+            result = log.begin(file)
+            if result.complete:
+                continue
+
+            def opened(frames: int | None, result: FileResult = result) -> None:
+                result.frames = frames
+
+            try:
+                for step in search.file(file, opened=opened, damaged=result.problems.append):
+                    with INTERRUPTS.deferred():
+                        result.add(step)
+                    frame = f"frame {step.frame.number + 1}/{result.frames or '?'}"
+                    found = len(result.sightings)
+                    progress.update(task, description=file.path.name, number=number, frame=frame, sightings=found)
+            except VideoError as error:
+                result.problems.append(str(error))
+            with INTERRUPTS.deferred():
+                log.end(result)
+
+
+def _print(results: list[FileResult], report: Path) -> None:
+    """Print the best intervals, and the path of the report."""
+    from catstream.applications.html.page import clock
+
+    intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)
+    numbers = ("from", "to", "sightings", "score")
+    best = table("object", "file", *numbers, right=numbers)
+    for each in intervals[:_SHOWN]:
+        times = clock(each.first.time), clock(each.last.time)
+        best.add_row(each.first.object, each.first.file, *times, str(each.count), f"{each.best.score:.2f}")
+    if intervals:
+        screen().print(best)
+    if len(intervals) > _SHOWN:
+        click.echo(f"and {len(intervals) - _SHOWN} more intervals")
+    if not intervals:
+        click.echo("nothing was found")
+    click.echo(f"report: {report}")
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
+@click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="File to write.")
+@with_overwrite
+@click.option("--force", is_flag=True, help="Merge models although their objects look different.")
+def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -> None:
+    """Merge saved models of one object, for example from two cameras.
+
+    The coreset trees of all files are merged, and a model is trained from them.
+    Its scores are those of one tree that has seen all the videos, within the
+    bound of the coreset. The files must be of the same object and settings, and
+    no two of them may contain the same frames. Models that look like those of
+    different objects are rejected; in case of doubt there is a warning.
+
+    \b
+    EXAMPLES
+      catstream merge door.safetensors yard.safetensors -o anna.safetensors
+    """
+    check_file(output, overwrite=overwrite)
+    parts = [Learned.load(file) for file in files]
+    with warnings.catch_warnings(record=True, action="always", category=UserWarning) as doubts:
+        whole = merged(parts, force=force)
+    for doubt in doubts:
+        complain(f"warning: {doubt.message}")
+    whole.save(output)
+    tree = whole.trees["object"]
+    click.echo(
+        f"{output}: {len(files)} saved models, {len(whole.origins)} videos, {tree.rows_seen} rows of the object in "
+        f"{len(tree.nodes)} nodes"
+    )

@@ -1,0 +1,65 @@
+"""The counters of a pipeline, or of the streams and nodes of a fleet, in Prometheus's text format.
+
+Each counter of the health reports is a metric `catstream_PROCESS_COUNTER`, with the label `object` if it is one of each
+object; it begins again at 0 with a restarted process, which `rate` and `increase` of Prometheus take into account.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from time import time
+
+from prometheus_client import CollectorRegistry, Gauge, generate_latest
+
+from catstream.messages.kinds import NodeStatus, StreamStatus
+from catstream.web.feed import Feed, FleetFeed, PipelineFeed
+
+#: A sample: name, value and labels.
+_Sample = tuple[str, float, dict[str, str]]
+
+
+def text(feed: Feed) -> bytes:
+    """Return the current metrics of what a feed shows."""
+    samples = _of_fleet(feed) if isinstance(feed, FleetFeed) else _of_pipeline(feed.pipeline(""))
+    registry, metrics = CollectorRegistry(), dict[str, Gauge]()
+    for name, value, labels in [("viewers", feed.viewers, {}), *samples]:
+        if name not in metrics:
+            metrics[name] = Gauge(f"catstream_{name}", name.replace("_", " "), list(labels), registry=registry)
+        (metrics[name].labels(**labels) if labels else metrics[name]).set(value)
+    return generate_latest(registry)
+
+
+def _of_pipeline(feed: PipelineFeed) -> Iterator[_Sample]:
+    """The samples of a pipeline; only `up` while it does not run."""
+    running = feed.dashboard.phase == "running"
+    yield "up", running, {}
+    for process, report in feed.dashboard.health.items() if running else ():
+        yield f"{process}_age_seconds", max(0.0, time() - report.time), {}
+        of_objects = {counter for counters in report.objects.values() for counter in counters}
+        for counter in report.counters.keys() - of_objects:  # their sums are left to Prometheus
+            yield f"{process}_{counter}", report.counters[counter], {}
+        for name, counters in report.objects.items():
+            for counter, value in counters.items():
+                yield f"{process}_{counter}", value, {"object": name}
+
+
+def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
+    """The samples of a fleet: each number that it says of a stream or a node; only `fleet_up` if it does not answer."""
+    running, status = feed.dashboard.phase == "running", feed.dashboard.status
+    yield "fleet_up", running, {}
+    for stream in status.streams.values() if running else ():
+        labels = {"stream": stream.name, "node": stream.node}
+        yield from _of_status("stream", stream, labels)
+        yield "stream_trouble", bool(stream.trouble), labels
+        for name, version in stream.models.items():
+            yield "stream_model_version", version, labels | {"object": name}
+    for node in status.nodes.values() if running else ():
+        yield from _of_status("node", node, {"node": node.name})
+
+
+def _of_status(kind: str, status: StreamStatus | NodeStatus, labels: dict[str, str]) -> Iterator[_Sample]:
+    yield f"{kind}_state", 1, labels | {"state": status.state}
+    for field in fields(status):
+        if isinstance(value := getattr(status, field.name), int | float):
+            yield f"{kind}_{field.name}", value, labels

@@ -1,0 +1,72 @@
+"""The report: the figures and the limits that were not met, on one page that needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+
+import pytest
+
+from catstream.applications.loadtest.load_report import to_json, write_report
+from catstream.applications.loadtest.load_test import LoadTest
+from catstream.applications.loadtest.plan import Limit
+
+
+def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result, tmp_path):
+    runs = [result([seconds] * 50) for seconds in (0.01, 0.3, 0.02)]
+    for run, rate in zip(runs, (25.0, 50.0, 37.5), strict=True):
+        run.plan = replace(run.plan, rate=rate)
+    load_test = LoadTest([Limit("p99", 0.1)], is_search=True, results=runs, highest_rate=37.5)
+    assert (load_test.result.plan.rate, load_test.violations) == (37.5, [])
+    page = write_report(tmp_path / "report.html", load_test).read_text()
+    assert "The highest rate that meets the limits: 37.5 frames/s" in page
+    assert page.count(">met<") == 2
+    assert "p99 is 0.3, limit at most 0.1" in page
+    assert [step["rate"] for step in to_json(load_test)["steps"]] == [25.0, 50.0, 37.5]
+    load_test = LoadTest([Limit("p99", 0.1)], is_search=True, results=runs[1:2])
+    assert load_test.violations == ["no rate meets p99=0.1: the lowest tried was 50"]
+    assert "No rate meets the limits" in write_report(tmp_path / "report.html", load_test).read_text()
+
+
+@pytest.mark.parametrize(
+    ("followed", "told"),
+    [
+        (1.0, "Sustained: 2 streams of 25 frames/s, at most 0.0 %"),
+        (0.8, "stream 0 skipped 20.0 % of its frames, the first after 4.0 s"),
+    ],
+)
+def test_the_report_begins_with_whether_the_rate_was_sustained(result, tmp_path, followed, told):
+    run = result([0.01] * 50, [0.01] * 50, followed=followed)
+    page = write_report(tmp_path / "report.html", LoadTest([], False, [run])).read_text()
+    assert told in page
+    assert page.index("ustained") < page.index("<h2>Streams</h2>")
+
+
+def test_every_stream_and_process_has_its_row(result, tmp_path):
+    run = result(
+        [0.01] * 50,
+        [0.02] * 50,
+        usage={"detector 0": [(0.5, 10**8)], "detector 1": [(0.7, 10**8)]},
+        errors=["stream 1: <it> died"],
+    )
+    page = write_report(tmp_path / "report.html", LoadTest([], False, [run])).read_text()
+    for row in ("detector 0", "detector 1"):
+        assert f'<td class="text">{row}</td>' in page
+    assert "stream 1: &lt;it&gt; died" in page
+    assert '<tr class="mean"><td class="text">all</td>' in page
+    plots = [ElementTree.fromstring(plot) for plot in re.findall(r"<svg.*?</svg>", page, re.DOTALL)]
+    titles = ["From frame to track", "From frame to the model trained on it", "Latency to the track over time"]
+    assert [plot.get("aria-label") for plot in plots] == titles
+    for plot in page.split("<svg")[1:]:
+        assert [len(set(curve.split())) > 1 for curve in re.findall(r'points="([^"]*)"', plot)] == [True, True]
+
+
+def test_the_json_report_contains_only_valid_json(result):
+    text = json.dumps(to_json(LoadTest([Limit("max", 0.001)], False, [result([0.01] * 5)])), allow_nan=False)
+    figures = json.loads(text)
+    assert figures["limits"] == {"max": {"value": 0.001, "met": False}}
+    (stream,) = figures["streams"]
+    assert stream["frames"] == 5
+    assert stream["track"]["max"] == 0.01

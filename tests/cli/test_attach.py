@@ -1,0 +1,173 @@
+"""`catstream watch` and `catstream status`, beside a pipeline that runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import select
+import signal
+import time
+
+import pytest
+
+from catstream.cli.attach import _format, _summary
+from catstream.features.layout import row_length
+from catstream.messages.kinds import End, Health, Track
+from catstream.pipeline import Pipeline
+from catstream.services.start_server import NAMES
+from catstream.settings import Settings
+from catstream.wire.channels import HEALTH, TRACKS
+from catstream.wire.newest import Publisher
+
+SECONDS = 60  # that anything may take on a busy machine
+
+
+def pipeline(video):
+    """A pipeline that continues only if its tracks are received."""
+    source, box = video
+    return Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1}))
+
+
+@pytest.fixture(scope="module")
+def resting(video):
+    """A pipeline that has learned its first model, and waits."""
+    with pipeline(video) as running:
+        for track in running:
+            if track.model_version:
+                break
+        yield running
+
+
+def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(long_video, catstream):
+    with pipeline(long_video) as running:
+        place = ["--endpoint", running.endpoint]
+        features = catstream("watch", "features", "--count", 3, *place)
+        tracks = catstream("watch", "tracks", "--json", *place)
+        for _ in running:
+            for watcher in (features, tracks):
+                select.select([watcher.stdout], [], [], 0.3)  # while it starts, few pass
+        shown, _ = features.communicate(timeout=SECONDS)
+        output, errors = tracks.communicate(timeout=SECONDS)
+    found = [json.loads(line) for line in output.splitlines()]
+    assert found[0].keys() == {field.name for field in dataclasses.fields(Track)}
+    assert [track["frame"] for track in found] == list(range(60 - len(found), 60))
+    assert errors.startswith(f"{len(found)} tracks, {60 - len(found)} missed"), "those before it came"
+    assert errors.endswith(": the source has ended\n")
+    lines = shown.splitlines()
+    assert len(lines) == 3
+    assert all(word in lines[0] for word in ("frame ", "training (", "appearance (", "labels "))
+    assert (tracks.returncode, features.returncode) == (0, 0)
+
+
+@pytest.fixture
+def two_objects(endpoint, turning):
+    """The endpoint of a pipeline of anna and an object without a name, whose source ends after four frames."""
+    frames = [(seq, name) for seq in range(1, 5) for name in ("anna", "")]
+    messages = [Track(seq, seq - 1, 0.1, "absent", None, 0.0, 0, object=name) for seq, name in frames]
+    messages.append(End(5, "the source has ended"))
+
+    def turn():
+        health.send(Health("detector", time.time()))
+        tracks.serve_late_joiners()
+        while messages and len(tracks._subscribed) == 2:  # to its tracks, and to their end
+            tracks.send(messages.pop(0))
+
+    with Publisher(TRACKS, endpoint) as tracks, Publisher(HEALTH, endpoint, "detector") as health, turning(turn):
+        yield endpoint
+
+
+@pytest.mark.parametrize(
+    ("options", "objects"),
+    [((), ["anna", ""] * 4), (("--object", "anna"), ["anna"] * 4), (("--object", ""), [""] * 4)],
+    ids=["all", "anna", "without a name"],
+)
+def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
+    code, output, errors = said("watch", "tracks", *options, "--endpoint", two_objects, "--json")
+    assert (code, errors) == (0, f"{len(objects)} tracks, 0 missed: the source has ended\n")
+    assert [json.loads(line)["object"] for line in output.splitlines()] == objects
+
+
+def test_a_line_has_the_fields_that_are_not_empty(two_objects, said):
+    _, output, _ = said("watch", "tracks", "--endpoint", two_objects)
+    line = "seq 1  frame 0  time 0.1  state absent  score 0.0  model_version 0"
+    assert [each.partition("  began")[0] for each in output.splitlines()[:2]] == [f"{line}  object anna", line]
+
+
+def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
+    code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
+    model = json.loads(output)
+    assert model["version"] >= 1
+    assert model["weights"].keys() == {"dtype", "shape", "norm"}
+    assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [row_length()])
+    assert (code, errors) == (0, "1 models, 0 missed\n")
+
+
+@pytest.mark.parametrize(("channel", "word"), [("samples", "  levels "), ("health", "  counters (")])
+def test_each_message_is_one_line(resting, succeed, channel, word):
+    output, _ = succeed("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
+    (line,) = output.splitlines()
+    assert word in line
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_is_no_error(resting, catstream, number):
+    process = catstream("watch", "health", "--endpoint", resting.endpoint)
+    assert process.stdout.readline()
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=SECONDS)
+    assert (process.returncode, "Traceback" in errors) == (0, False)
+
+
+def test_a_silent_endpoint_is_one_line_of_error(fail, tmp_path):
+    error = fail("watch", "tracks", "--endpoint", tmp_path, "--wait", 0.2)
+    assert error == f"catstream: no health arrived from {tmp_path} within 0.2 s: is a pipeline running there?"
+
+
+def test_status_shows_all_processes(resting, said, until):
+    command = ["status", "--endpoint", resting.endpoint, "--wait", SECONDS]
+    until(lambda: "trees" in said(*command)[1])  # the compressor may have reported before there was a box
+    code, output, errors = said(*command)
+    assert (code, errors) == (0, "")
+    assert [line.split()[0] for line in output.splitlines()] == [
+        "pipeline", "state", "frames", "learning", "model", "trees", "rejected", "reports",
+    ]  # fmt: skip
+    assert all(name in output for name in NAMES)
+
+
+def test_status_has_a_json_form(resting, succeed, until):
+    def at_rest():
+        output, _ = succeed("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
+        return (found := json.loads(output))["frames_per_second"] == 0 and found["leaves"] and found
+
+    found = until(at_rest)  # nobody takes its tracks
+    assert found["ok"]
+    assert found["frames"] >= 1
+    assert found["model_version"] >= 1
+    assert found["leaves"] >= 4, "one in each tree"
+    assert found["processes"].keys() == set(NAMES)
+
+
+def test_status_fails_and_names_a_silent_process(resting, said):
+    os.kill(resting.pids["trainer"], signal.SIGSTOP)
+    try:
+        code, output, errors = said("status", "--endpoint", resting.endpoint, "--wait", 3)
+    finally:
+        os.kill(resting.pids["trainer"], signal.SIGCONT)
+    assert code == 1
+    assert "trainer" not in output
+    assert errors == f"catstream: no health report at {resting.endpoint} within 3 s from: trainer\n"
+
+
+def test_the_lines_of_status_that_depend_on_the_source_and_the_trees():
+    counters = {"sent": 9.0, "taken": 9.0, "stored": 9.0, "skipped": 2.0}
+    reports = {"detector": [Health("detector", 1.0, counters)], "compressor": [Health("compressor", 1.0, {"seq": 1.0})]}
+    lines = _format(_summary("run", reports)).splitlines()
+    assert "source     available, 2 frames skipped" in lines, "a demo is never opened again"
+    assert not [line for line in lines if line.startswith("trees")], "there are none before the first box"
+    counters["reopened"] = counters["skipped"] = 1.0
+    trees = {"leaves": 7.0, "nodes": 5.0, "level": 1.0, "bytes": 4.6e6}
+    reports["compressor"] = [Health("compressor", 1.0, trees)]
+    lines = _format(_summary("run", reports)).splitlines()
+    assert "source     available, 1 frame skipped, reopened 1 time" in lines
+    assert "trees      7 leaves, 5 nodes, level 1, 4.6 MB" in lines

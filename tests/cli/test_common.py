@@ -1,0 +1,117 @@
+"""What the commands share: the progress line and the summary of a run, and Ctrl-C between frames and within one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from io import StringIO
+from types import SimpleNamespace
+
+import pytest
+from rich.console import Console
+
+from catstream.box import Box
+from catstream.cli.common import INTERRUPTED, Interrupts, RunProgress
+from catstream.messages.kinds import Track
+
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["file", "live"])
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
+    health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
+    seen = {"health": health, "lost_seconds": 0, "holding": "", "totals": {}}
+    pipeline = SimpleNamespace(live=live, frames=None if live else 30000, **seen)
+    written = StringIO()
+    console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
+    run = RunProgress(pipeline)
+    with run.progress(console) as progress:
+        run.show(progress, {"": Track(1, 0, 0.0, "bootstrapping", None, -12.25, 12345)})
+        progress.refresh()
+    lines = [part for part in written.getvalue().replace("\x1b[2K", "\r").split("\r") if "bootstrapping" in part]
+    shown = lines[-1].split("\n")[0].split("\x1b")[0].rstrip()
+    assert len(shown) <= width
+    assert shown.startswith("bootstrapping")
+    assert ("1/30000" in shown) != live
+    assert ("12345" in shown) == (width >= 80)
+
+
+def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_each():
+    pipeline = SimpleNamespace(live=False, frames=9, health={}, lost_seconds=0, holding="", totals={}, restarts=0)
+    written = StringIO()
+    console = Console(file=written, width=120, force_terminal=True, color_system=None, soft_wrap=True)
+    run = RunProgress(pipeline, ["carl"])
+    with run.progress(console) as progress:
+        for box in (Box(1, 2, 30, 40), None):
+            seen = {"anna": Track(1, 0, 0.0, "present", box, 0.9, 7, object="anna")}
+            run.show(progress, seen | {"ben": Track(1, 0, 0.0, "absent", None, 0.1, 4, object="ben")})
+        progress.refresh()
+    assert "1/2 present" in written.getvalue()
+    assert "anna +0.90  ben +0.10" in written.getvalue()
+    assert run.summary([]).splitlines()[1:] == [
+        "  1 carl: present in 0 of 0 frames, model version 0",
+        "  2 anna: present in 1 of 2 frames, model version 7",
+        "  3 ben: present in 0 of 2 frames, model version 4",
+    ]
+
+
+@pytest.fixture
+def interrupts():
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    one = Interrupts()
+    one.install()
+    yield one
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_takes_effect_after_the_current_frame(interrupts, number):
+    results, video = [], []
+
+    def follow():
+        for frame in range(10):
+            with interrupts.deferred():
+                results.append(frame)
+                if frame == 3:
+                    signal.raise_signal(number)
+                video.append(frame)
+
+    with pytest.raises(KeyboardInterrupt):
+        follow()
+    assert results == video == [0, 1, 2, 3]
+
+
+def test_between_frames_a_signal_takes_effect_at_once(interrupts):
+    with interrupts.deferred():
+        pass
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_during_imports_a_signal_ends_the_process_at_once(interrupts, monkeypatch, capfd):
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit, match=str(INTERRUPTED)), interrupts.leaving():
+        signal.raise_signal(signal.SIGINT)
+    assert capfd.readouterr().err == "stopped\n"
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_ignored_signals_stay_ignored(interrupts):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    interrupts.install()
+    with interrupts.leaving():
+        signal.raise_signal(signal.SIGHUP)
+
+
+def test_a_second_signal_does_not_disturb_the_end_of_a_command():
+    send = "import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT)"
+    command = [sys.executable, "-P", "-c", f"{send}; from catstream.cli import main; main()", "--version"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stderr == ""
