@@ -191,10 +191,6 @@ def add(
     """Add a stream, or change the one of that name.
 
     To keep the change, put it into the file of the fleet too.
-
-    \b
-    EXAMPLE
-      catstream fleet add cam-7 --source rtsp://10.0.0.7/1 --box 120,80,64,48 --label site=north
     """
     from catstream.fleet.spec import StreamSpec
 
@@ -216,12 +212,7 @@ def add(
 @click.option("--forget", is_flag=True, help="Remove what they have learned, too.")
 @with_fleet
 def remove(running: Fleet, names: tuple[str, ...], forget: bool) -> None:
-    """Remove streams; what they have learned stays in the store.
-
-    \b
-    EXAMPLE
-      catstream fleet remove cam-7
-    """
+    """Remove streams; what they have learned stays in the store."""
     for line in running.remove(*names, forget=forget):
         click.echo(line)
 
@@ -234,10 +225,6 @@ def drain(running: Fleet, node: str, undo: bool) -> None:
     """Move all streams from a NODE and place none there, before it is switched off.
 
     Streams wait if the other nodes have no room for them.
-
-    \b
-    EXAMPLE
-      catstream fleet drain node-2
     """
     click.echo(running.drain(node, undo=undo))
 
@@ -262,8 +249,7 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
     seconds old. Frames that several states contain are counted once.
 
     \b
-    EXAMPLES
-      catstream fleet merge --object anna
+    EXAMPLE
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
     if output is not None:

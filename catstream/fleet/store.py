@@ -238,7 +238,7 @@ class _Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Listing:
+class Contents:
     """What is below the folder of a stream.
 
     claims  tokens of the claims
@@ -249,11 +249,11 @@ class Listing:
     states: set[_Place]
 
     @classmethod
-    def of(cls, names: Iterable[str]) -> Listing:
+    def of(cls, names: Iterable[str]) -> Contents:
         """The listing of these names, each without the folder; names of other things are passed over.
 
-        >>> Listing.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
-        Listing(claims={1}, states={_Place(token=1, number=7)})
+        >>> Contents.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
+        Contents(claims={1}, states={_Place(token=1, number=7)})
         """
         claims, states = set[int](), set[_Place]()
         for name in names:
@@ -319,9 +319,9 @@ class States:
             claim.write({}, {"removed": True})
             self.remove_up_to(claim.token, self.listed(), kept=1)
 
-    def listed(self) -> Listing:
+    def listed(self) -> Contents:
         """What is below the folder now."""
-        return Listing.of(self._objects.names(self.folder))
+        return Contents.of(self._objects.names(self.folder))
 
     def holder(self, token: int) -> str:
         """The name of the holder with a token, for messages."""
@@ -334,7 +334,7 @@ class States:
         arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
         self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
 
-    def remove_up_to(self, token: int, found: Listing, kept: int) -> None:
+    def remove_up_to(self, token: int, found: Contents, kept: int) -> None:
         """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
         before = sorted(place for place in found.states if place.token <= token)
         stay = before[len(before) - kept :]
@@ -391,7 +391,7 @@ class Claim:
         with contextlib.suppress(StoreError):  # they are removed after the next write
             self._states.remove_up_to(self.token, found, _KEPT)
 
-    def check(self) -> Listing:
+    def check(self) -> Contents:
         """Raise FencedError if there is a claim with a higher token, or this one was removed."""
         found = self._states.listed()
         if self.token in found.claims and max(found.claims) == self.token:

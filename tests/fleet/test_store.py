@@ -20,7 +20,7 @@ from obstore.store import S3Store
 
 from catstream.errors import FencedError, FleetError, StoreError
 from catstream.fleet import store as module
-from catstream.fleet.store import Listing, Objects, Store
+from catstream.fleet.store import Contents, Objects, Store
 
 STATE = {"job.safetensors": secrets.token_bytes(300), "trees/12.safetensors": b""}
 SECRETS = {
@@ -62,7 +62,7 @@ def store(url):
 
 
 def listed(store, stream="cam-7"):
-    found = Listing.of(store._objects.names(f"streams/{stream}"))
+    found = Contents.of(store._objects.names(f"streams/{stream}"))
     return sorted(found.claims), sorted(map(tuple, found.states))
 
 
