@@ -63,7 +63,7 @@ def local(file, until, *options):
         try:
             until(lambda: up.poll() is not None or name in fleets())
             with Registry(name, timeout=60) as registry:
-                until(lambda: registry.streams().streams["gate"].state == "running")
+                until(lambda: [each.state for each in registry.streams().streams.values()] == ["running"])
             yield up
         finally:
             if up.poll() is None:
