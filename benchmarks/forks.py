@@ -35,7 +35,7 @@ from catstream.messages.kinds import Features, Level
 from catstream.messages.names import UNNAMED
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
-from catstream.video.image import as_bgr
+from catstream.video.frames import as_bgr
 
 LOST = 0.5  #: success of the best run, below which the sequence counts as lost
 APART, TOGETHER = 0.3, 5  #: overlap at most, and number of successive frames in which two runs have parted

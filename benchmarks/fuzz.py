@@ -28,14 +28,13 @@ COMPILED = [f"catstream.features.{name}" for name in ("cells", "colours", "compi
 with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
     from catstream.box import Box, Window
     from catstream.compression.forest import Forest
-    from catstream.errors import CatstreamError, ProtocolError, RecordingError, ServiceError, SettingsError
+    from catstream.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
     from catstream.messages import storage
     from catstream.messages.heads import GROUPS
-    from catstream.messages.kinds import DetectorState, End, Features, Model, ObjectFeatures, Run, Track, TrainingRows
+    from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
     from catstream.messages.schema import Array, ByObject, Bytes, Field, Name, Named, OnlyWith, fields
     from catstream.run.learned import Learned
     from catstream.settings import Settings
-    from catstream.sinks.recording.file import Recording, RecordingWriter
     from catstream.wire.codec import KINDS, decode, encode, topic_of
     from catstream.wire.keys import Keys, create
 
@@ -118,9 +117,6 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     forest = grown()
     forest.save(folder / "checkpoint")
     Learned.of(forest.compressors["anna"], SETTINGS).save(folder / "learned")
-    with RecordingWriter(folder / "recording", Run("0.1.0", {})) as writer:
-        for kind in (Track, Features, Model, End):
-            writer.write(seeds[kind.__name__.lower()][0])
     create(folder / "keys")
     found |= {
         "any message": Decoder(
@@ -137,12 +133,6 @@ def decoders(folder: Path) -> dict[str, Decoder]:
             (folder / "checkpoint").read_bytes(),
         ),
         "saved model": filed(folder / "e", forged(narrow), CatstreamError, (folder / "learned").read_bytes()),
-        "recording": filed(
-            folder / "c",
-            lambda path: list(Recording(path).messages()),
-            RecordingError,
-            (folder / "recording").read_bytes(),
-        ),
         "settings": filed(
             folder / "d.toml",
             lambda path: Settings.load(file=path, environment={}),

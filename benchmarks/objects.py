@@ -17,19 +17,23 @@ from journey import travel
 from sequences import scratch
 from table import Cell, Table, benchmark, command
 
+from catstream.applications.loadtest import crowd
 from catstream.box import Box
 from catstream.multi import MultiTracker
 from catstream.settings import Settings
-from catstream.video import crowd
 from catstream.video.source import open_source
+from catstream.video.writer import VideoWriter
 
 COUNTS = (1, 2, 4, 8)
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     counts, frames, runs = ((1, 2), 8, 1) if options.quick else (COUNTS, options.frames, options.runs)
-    path, truth = crowd.write(scratch(), counts[-1], frames)
-    starts = {name: box for name, box in truth[0].items() if box is not None}
+    path, starts = scratch() / "crowd.mp4", {}
+    with VideoWriter(path, 25, crowd.SIZE) as video:
+        for image, boxes in crowd.render(counts[-1], frames):
+            video.write(image)
+            starts = starts or {name: box for name, box in boxes.items() if box is not None}
     for title, measure in (("One process", in_one_process), ("Three processes", in_three_processes)):
         yield Table(
             f"Objects: {title.lower()}",

@@ -259,7 +259,7 @@ _ROBUSTNESS = """
     How much the accuracy depends on the start, on the first box and on the components of the tracker, and where runs
     lose the object. Written by `make results` from the records in `benchmarks/results`."""
 _OBJECTS = """
-    The rendered video of `catstream demo --objects 8`, tracked with one to eight of its objects. All share the decoded
+    A rendered video of eight objects, tracked with one to eight of its objects. All share the decoded
     frame and its pyramid; each has a detector, coreset trees and models of its own. The search uses threads where
     cores are free. See [decision 57](../docs/decisions/parameters.md)."""
 _REDUCTION = """
@@ -283,12 +283,6 @@ _FORKS = """
     of score between the two highest peaks of the local search; the size is a multiple of that of the ground truth. The
     last columns are the frames that were taught among the ten before, and the mean overlap of the box in these with the
     ground truth."""
-_SUMMARIES = """
-    The energy ||A P||^2 / ||A||^2 that k selected images keep of a collection, computed with all rows. `catstream`
-    reads the images once, and keeps 128 rows as a sketch and at most 256 candidates. The greedy choice has all rows at
-    once; no k images can keep more than the best subspace of dimension k. The mixed collection has every tenth frame of
-    all 44 sequences. The most memory depends on the number of rows since the last reduction, at most 127, and not on
-    that of all images. See [Summarise images and runs](../docs/how-to/summaries.md)."""
 _SAVED = """
     Each model of `merge.py` is learned from a third of a sequence, and tried in the last third; `one tree` has seen
     both. `best` is the share of frames in which the best window of the whole frame overlaps the object by half, and
@@ -434,7 +428,6 @@ DETAILS = (
 MORE = (
     Section("Several objects", _OBJECTS, (Shown("objects", every),)),
     Section("Frequent directions", _REDUCTION, (Shown("reduction", every),)),
-    Section("Summaries", _SUMMARIES, (Shown("summary", every),)),
     Section("Saved models", _SAVED, (Shown("merge", merged), Shown("saved_models", means_only))),
     Section("Across cameras", _ACROSS, (Shown("across_cameras", across),)),
     Section("A fleet under faults", _FLEET, (Shown("fleet_faults", every), Shown("fleet_faults-free", select(1)))),

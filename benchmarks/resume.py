@@ -23,8 +23,8 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
 from catstream.run.state import TREES
 from catstream.settings import Settings
-from catstream.sinks.formats import CsvSink
-from catstream.video.demo import write
+from catstream.sinks.track_log import read_frames
+from catstream.video.rendered import write
 
 _REST = 200  # frames after the last kill: a fast pipeline continues until the kill takes effect
 TRACK = [sys.executable, "-P", "-c", "from catstream.cli import main; main()", "track"]
@@ -44,7 +44,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     seconds = [watched(resumed, out, chance.randrange(most)) for _ in range(moments - 1)]
     seconds.append(watched(resumed, out, None))
 
-    rows = [(track.frame, track.object) for track in CsvSink.tracks(out / f"{video.stem}.csv")]
+    log = read_frames(out / f"{video.stem}.csv")
+    rows = [(track.frame, track.object) for frame, _ in log for track in frame.tracks]
     lost, twice = frames * len(boxes) - len(set(rows)), len(rows) - len(set(rows))
     stored = CheckpointStore(kept / TREES).load(Settings()).seq
     columns = ("killed", "frames", "objects", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")

@@ -77,7 +77,7 @@ def wait(process: subprocess.Popen[bytes], output: Path, version: int, begin: fl
 def versions(tracks: Path) -> list[int]:
     """Return the model version of each complete row."""
     lines = tracks.read_text().split("\n")[1:-1] if tracks.exists() else []
-    return [int(line.rsplit(",", 2)[1]) for line in lines]
+    return [int(line.rsplit(",", 3)[1]) for line in lines]
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@
 
 `catstream.Tracker` tracks in one process, frame by frame, like a `cv2.Tracker`, and `catstream.MultiTracker` tracks
 several objects. While a pipeline runs, other processes receive its messages with `catstream.subscribe` and send
-commands to it with `catstream.control`. `catstream.summarize` selects the images that represent a collection.
+commands to it with `catstream.control`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from catstream.applications.finding.find import Sighting, find
-    from catstream.applications.summaries.images import summarize
-    from catstream.applications.summaries.selection import Selection
     from catstream.box import Box
     from catstream.client.control import Control, control
     from catstream.client.subscription import Subscription, subscribe
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
     from catstream.pipeline import Pipeline
     from catstream.run.learned import Learned, merge
     from catstream.settings import Settings
-    from catstream.sinks.adapters import to_supervision
     from catstream.tracker import Tracker
 
 __all__ = [
@@ -41,7 +38,6 @@ __all__ = [
     "Learned",
     "MultiTracker",
     "Pipeline",
-    "Selection",
     "Settings",
     "Sighting",
     "Subscription",
@@ -52,8 +48,6 @@ __all__ = [
     "find",
     "merge",
     "subscribe",
-    "summarize",
-    "to_supervision",
 ]
 
 __version__ = "0.1.0"
@@ -66,7 +60,6 @@ _HOMES = {
     "Learned": "run.learned",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
-    "Selection": "applications.summaries.selection",
     "Settings": "settings",
     "Sighting": "applications.finding.find",
     "Subscription": "client.subscription",
@@ -76,8 +69,6 @@ _HOMES = {
     "find": "applications.finding.find",
     "merge": "run.learned",
     "subscribe": "client.subscription",
-    "summarize": "applications.summaries.images",
-    "to_supervision": "sinks.adapters",
 }
 
 

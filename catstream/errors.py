@@ -53,10 +53,6 @@ class ProtocolError(CatstreamError, ValueError):
         self.reason = reason
 
 
-class RecordingError(CatstreamError):
-    """A recording cannot be written or read, or required messages are missing from it."""
-
-
 class ServiceError(CatstreamError):
     """A process of the pipeline failed or cannot start."""
 
@@ -93,9 +89,8 @@ class StoreError(FleetError):
 EXTRAS = {
     "view": ("the web page", ("prometheus_client", "starlette", "uvicorn")),
     "loadtest": ("the load test", ("psutil",)),
-    "record": ("a recording", ("mcap",)),
+    "mcap": ("an MCAP file", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
-    "supervision": ("to_supervision", ("supervision",)),
     "fleet": ("a fleet", ("ray", "obstore")),
     "s3": ("a store on S3", ("boto3",)),
 }

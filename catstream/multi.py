@@ -37,7 +37,7 @@ from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
-from catstream.video.image import as_bgr
+from catstream.video.frames import as_bgr
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from catstream.errors import ProtocolError, RecordingError, ServiceError, SettingsError, require_extra
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages.kinds import Health, Position, Track
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
@@ -67,8 +67,9 @@ class Pipeline:
         from the file.
     part : slice
         The frames of a file or folder to track: `slice(100, 200, 2)` for 100, 102 ... 198.
-    record : path
-        File to record all messages to, see `catstream replay`. No features are missing in it.
+    paused : bool
+        Whether the run starts paused, so that subscribers can connect before its first frame, until
+        `catstream.control(...).resume()`.
     state : path
         Folder for checkpoints, written once a second and at the end, from which the run can be resumed.
     resume : path
@@ -105,10 +106,6 @@ class Pipeline:
     BoxError, ObjectError, VideoError
         From the constructor, if a box is not in the frame, a name is not valid, there are too many objects, or the
         source cannot be read.
-    RecordingError
-        From the constructor, if the file to record to exists.
-    MissingExtraError
-        From the constructor, if `record` is given and its extra is not installed.
     SettingsError
         From the constructor, if the settings do not suit the source: a live one in lockstep.
     ServiceError, ProtocolError
@@ -129,7 +126,7 @@ class Pipeline:
         *,
         model: Models | None = None,
         part: slice = ALL_FRAMES,
-        record: str | os.PathLike[str] | None = None,
+        paused: bool = False,
         state: str | os.PathLike[str] | None = None,
         resume: str | os.PathLike[str] | None = None,
         after: Position | None = None,
@@ -159,16 +156,15 @@ class Pipeline:
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
             results=job.results if results is None else results.after(job.results),
             read=None,
+            paused=paused,
         )
         saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
         for file in saved_models.values():
             if reason := why_not_writable(file):
                 raise ServiceError(reason)
-        self._record = Path(record).absolute() if record is not None else None
-        _check(job, self._record, is_new=self._resumed_job is None)
+        _check(job)
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
-        image_rate, skip_damaged = job.settings.run.image_rate, job.settings.run.skip_damaged
-        with open_source(job.source, part=job.part, image_rate=image_rate, skip_damaged=skip_damaged) as first:
+        with open_source(job.source, part=job.part, settings=job.settings.run) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
             self.live = first.live
         check_boxes(job.boxes, *self.size)
@@ -245,7 +241,6 @@ class Pipeline:
             self._job,
             endpoint=endpoint,
             owned=True,
-            record=self._record,
             state=self._state,
             resume=self._resumed_job is not None,
             since=time.monotonic() - max(0.0, time.time() - self._job.started),
@@ -395,11 +390,11 @@ class Pipeline:
     @cached_property
     def _held_at_start(self) -> dict[str, bool]:
         """The reasons for which the run starts without tracking; those of a resumed run are in its folder."""
-        waiting, paused = not self._job.boxes and not self._job.models, False
+        waiting, paused = not self._job.boxes and not self._job.models, self._job.paused
         if self._resumed_job is not None and self._state is not None:
             with suppress(ProtocolError):  # the detector reports it, and starts with the objects of the job
                 desired = DesiredState.load(self._state / DESIRED)
-                waiting, paused = not desired.objects, desired.paused
+                waiting, paused = not desired.objects, paused or desired.paused
         return {"waiting": waiting, "paused": paused}
 
     @property
@@ -430,13 +425,9 @@ def _store_position(state: Path, job: Job, reader: RunReader) -> None:
         replace(job, read=reader.position).save(state)
 
 
-def _check(job: Job, record: Path | None, *, is_new: bool) -> None:
+def _check(job: Job) -> None:
     """Raise an error if a run cannot start, before anything is opened."""
     if not job.source:
         raise SettingsError("a new run needs a source: give one")
     if job.settings.run.lockstep and is_live(job.source):
         raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
-    if record is not None:
-        require_extra("record")
-        if record.exists() and is_new:
-            raise RecordingError(f"{record} exists already: give another name, or remove it")

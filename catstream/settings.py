@@ -88,7 +88,7 @@ class RunSettings(_Group):
     seed: Annotated[int, _about("Seed of all random numbers.", ge=0)] = 0
     image_rate: Annotated[
         float,
-        _about("Frames per second of a folder or a pattern of images, which have no timestamps.", ge=1e-9, le=1000),
+        _about("Frames per second of a folder or a pattern of images, and of a live demo.", ge=1e-9, le=1000),
     ] = 25.0
     skip_damaged: Annotated[
         bool,

@@ -13,7 +13,6 @@ from catstream.messages.kinds import End, Features
 from catstream.run.learned import begun
 from catstream.run.state import TREES, locked
 from catstream.services.loop import Process
-from catstream.services.recorder import Recorder
 from catstream.services.saved_models import SavedModels
 from catstream.services.stored_part import StoredPart
 from catstream.services.timing import (
@@ -23,10 +22,7 @@ from catstream.services.timing import (
     MODEL_SECONDS,
     SENDER_SECONDS,
     STORE_SECONDS,
-    TRACKS_END_SECONDS,
-    TURN_SECONDS,
 )
-from catstream.sinks.recording.file import RecordingWriter
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import FEATURES, SAMPLES
 from catstream.wire.newest import Publisher
@@ -60,7 +56,7 @@ def main(process: Process) -> None:
 
 
 class CompressorLoop:
-    """A forest, its checkpoints, its recording, and the sockets that it is connected to."""
+    """A forest, its checkpoints, and the sockets that it is connected to."""
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
         job, settings, endpoint = process.job, process.settings, process.endpoint
@@ -71,10 +67,6 @@ class CompressorLoop:
         self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
         position = self._forest.position
         self._stored = StoredPart(position, time.monotonic())
-        self._recorder = None
-        if job.record is not None:
-            writer = stack.enter_context(RecordingWriter(job.record, process.run, resume=True))
-            self._recorder = stack.enter_context(Recorder(writer, endpoint))
         self._features = stack.enter_context(
             Receiver(FEATURES, endpoint, position, settings.run.unstored_frames, check=self._check)
         )
@@ -91,15 +83,10 @@ class CompressorLoop:
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
-        message = self._features.receive(MESSAGE_SECONDS)
-        if self._recorder is not None:
-            self._recorder.receive()
-        return message
+        return self._features.receive(MESSAGE_SECONDS)
 
     def insert(self, features: Features) -> None:
         """Insert features into the trees, and send the sample if there is a new one."""
-        if self._recorder is not None:  # before a checkpoint: the recording then contains all of its features
-            self._recorder.write(features)
         before = self._forest.compressors.keys()
         if any(part.model for part in features.objects.values()):
             self._process.watchdog.allow(MODEL_SECONDS)
@@ -135,25 +122,12 @@ class CompressorLoop:
         """Serve late joiners, send the trees to subscribers, and publish the health."""
         self._samples.serve_late_joiners()
         self._saved_models.turn(self._forest.compressors, self._process.watchdog.beat)
-        trouble = [self._checkpoints.trouble if self._checkpoints is not None else ""]
-        if self._recorder is not None and self._recorder.failed:
-            trouble.append(f"{self._recorder.failed}: the run continues without it")
-        self._process.trouble = "; ".join(filter(None, trouble))
+        self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
         self._process.beat(self._counters, self._forest.object_counters, now=last)
 
     def end(self, end: End) -> None:
-        """Send the end of the stream, and wait for the end of the tracks if they are recorded.
-
-        The detector sends that one after the owner of the run has received its own, which may take any time.
-        """
+        """Send the end of the stream."""
         self._samples.send(end)
-        deadline = time.monotonic() + TRACKS_END_SECONDS
-        while self._recorder is not None and self._recorder.end is None and time.monotonic() < deadline:
-            if self._features.window.connected and not self._process.stop_requested:
-                deadline = time.monotonic() + TRACKS_END_SECONDS
-            self._features.receive(TURN_SECONDS)  # a detector that did not receive the last acknowledgement asks again
-            self._recorder.receive()
-            self._process.beat(self._counters, self._forest.object_counters)
 
     def stop(self) -> None:
         """Store all received messages; the sender continues with the next compressor."""
@@ -168,7 +142,4 @@ class CompressorLoop:
 
     def _counters(self) -> dict[str, float]:
         """The counters for the health of the process."""
-        own: dict[str, float] = {"stored": self._stored.stored}
-        if self._recorder is not None:
-            own |= {"recorded": self._recorder.written, "unrecorded": float(self._recorder.failed != "")}
-        return self._forest.counters() | own
+        return self._forest.counters() | {"stored": self._stored.stored}

@@ -39,8 +39,7 @@ from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
 from catstream.services.timing import CLOSE_SECONDS, MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
 from catstream.video import source
-from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame, Source, without_password
+from catstream.video.frames import Frame, Source, read_ahead, without_password
 from catstream.video.source import is_live, open_source
 from catstream.wire.channels import CONTROL, MODELS
 from catstream.wire.commands import Responder
@@ -204,9 +203,7 @@ class DetectorLoop:
                 part=job.part,
                 since=job.since,
                 idle=self._idle,
-                image_rate=settings.run.image_rate,
-                skip_damaged=settings.run.skip_damaged,
-                resize=settings.run.resize,
+                settings=settings.run,
             )
         )
         if not self._source.live:
@@ -466,14 +463,15 @@ def _desired(process: Process, models: ModelFiles) -> DesiredState:
     job = process.job
     if job.resume and job.state is not None and (job.state / DESIRED).exists():
         try:
-            return DesiredState.load(job.state / DESIRED)
+            desired = DesiredState.load(job.state / DESIRED)
+            return replace(desired, paused=desired.paused or job.paused)
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)
             _log.warning("%s", error)
     boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
     saved = {name: models.add(Learned.load(file)) for name, file in job.models.items()}
     sought = {name: DesiredObject(each.box, 1, each.name, each.size) for name, each in saved.items()}
-    return DesiredState(boxes | sought)
+    return DesiredState(boxes | sought, paused=job.paused)
 
 
 def _shown(source: str) -> str:

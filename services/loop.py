@@ -132,7 +132,7 @@ def run(
     service.prepare()
     try:
         job = Job.load(job) if isinstance(job, Path) else job
-        job = replace(job, resume=job.resume or restarted)
+        job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
         process = Process(name, job, watchdog)
         try:
             service.main(process)

@@ -9,7 +9,7 @@ import numpy as np
 from catstream.box import Box
 from catstream.messages.kinds import Preview
 from catstream.services.timing import PREVIEW_SECONDS
-from catstream.video.image import jpeg
+from catstream.video.frames import jpeg
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher

@@ -31,7 +31,7 @@ from catstream.cli import main
 from catstream.client.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
 from catstream.numerics.threads import one_thread
-from catstream.video.demo import render, write
+from catstream.video.rendered import render, write
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder

@@ -26,6 +26,8 @@ import catstream
 from catstream.cli import COMMANDS, load_command
 from catstream.fleet import life
 from catstream.settings import PRESETS, describe
+from catstream.sinks.destinations import EXPORTS, SINKS
+from catstream.sinks.run_files import places_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -151,12 +153,13 @@ def test_the_page_of_the_command_line_shows_every_command_and_option():
             assert max(option.opts, key=len) in sections[words] or isinstance(option, click.Argument)
 
 
-def test_every_file_that_track_writes_is_explained():
-    from catstream.sinks.results import result_files
-
-    for of, objects in (("docs/tutorial.md", [""]), ("docs/how-to/several-objects.md", ["anna"])):
-        for name in [*result_files("NAME", objects), "NAME.mp4"]:
-            assert f"`{name}`" in page(of), f"{of} does not say what is in {name}"
+def test_every_destination_and_format_of_tracks_is_explained():
+    shown = page("docs/how-to/sinks.md")
+    for name in places_of("NAME", Path(), video=True):
+        assert f"`{name}`" in shown
+        assert f"`{name}`" in page("docs/tutorial.md")
+    for key in [*(f"FILE{key}" if key[0] == "." else key for key in SINKS), *EXPORTS]:
+        assert f"`{key}`" in shown, f"docs/how-to/sinks.md does not say what {key} is"
 
 
 def errors_on(check: Callable[[Path], Iterator[str]]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import select
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ from catstream.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
+from catstream.video.source import open_source
 from catstream.wire.keys import create
 
 pytestmark = pytest.mark.system
@@ -153,3 +156,31 @@ def test_the_example_of_several_objects_prints_when_two_meet_and_part(demo_video
     assert turns == ["meet", "part"] * (len(turns) // 2) + ["meet"] * (len(turns) % 2)
     assert flower == "flower: present in 60 of 60 frames"
     assert re.fullmatch(r"sky: present in \d+ of 60 frames", sky)
+
+
+def test_the_images_that_represent_a_folder_keep_a_share_of_the_energy_within_the_bounds(demo_video, tmp_path):
+    example = runpy.run_path(str(EXAMPLES / "summarise_images.py"))
+    summary, rows = example["Summary"](size=8), {}
+    with open_source(demo_video(60)[0]) as frames:
+        for frame in frames:
+            cv2.imwrite(str(tmp_path / f"{frame.number:02d}.png"), frame.image)
+            summary.add(f"{frame.number:02d}.png", frame.image)
+            rows[f"{frame.number:02d}.png"] = example["describe"](frame.image).astype(float)
+    shares, kept, kept_at_most = summary.result(4)
+    assert len(summary.rows) < 16
+    basis = np.linalg.qr(np.array([rows[name] for name in shares]).T)[0]
+    whole = np.array([*rows.values()])
+    assert kept <= np.sum((whole @ basis) ** 2) / np.sum(whole**2) <= kept_at_most
+    run = subprocess.run([*command("summarise_images.py"), tmp_path, "4"], capture_output=True, text=True, timeout=60)
+    assert run.stdout.count(".png") == 4, run.stderr
+    assert "of the energy of all images is kept" in run.stdout
+
+
+def test_tracks_become_detections_of_supervision():
+    pytest.importorskip("supervision")
+    detections = runpy.run_path(str(EXAMPLES / "to_supervision.py"))["detections"]
+    track = Track(1, 0, 0.0, "present", catstream.Box(1, 2, 3, 4), 1.5, 0, object="anna")
+    found = detections([track, Track(1, 0, 0.0, "absent", None, 0.1, 0, object="ben")])
+    np.testing.assert_array_equal(found.xyxy, [[1, 2, 4, 6]])
+    assert found.confidence.tolist() == [1.0]
+    assert len(detections([])) == 0

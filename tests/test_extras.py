@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from catstream.errors import EXTRAS, MissingExtraError, install_command, require_extra
-from catstream.pipeline import Pipeline
-from catstream.sinks.recording.file import Recording
+from catstream.sinks.destinations import export_of, sink_of
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
 OPTIONAL = PROJECT["optional-dependencies"]
@@ -47,13 +46,12 @@ def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch, packa
         importlib.import_module(package)
 
 
-def test_a_recording_without_its_extra_is_an_error_with_the_install_command(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    message = r'a recording needs packages .* "catstream\[record\]"'
-    with pytest.raises(MissingExtraError, match=message):
-        Recording(tmp_path / "run.mcap")
-    with pytest.raises(MissingExtraError, match=message):
-        Pipeline("walk.mp4", (10, 10, 32, 32), record=tmp_path / "run.mcap")
+@pytest.mark.parametrize(("name", "extra"), [("t.mcap", "mcap"), ("t.parquet", "parquet")])
+def test_a_format_without_its_extra_is_an_error_with_the_install_command(monkeypatch, tmp_path, name, extra):
+    monkeypatch.setitem(sys.modules, EXTRAS[extra][1][0], None)
+    row = sink_of(name) if name == "t.mcap" else export_of(tmp_path / name, None)
+    with pytest.raises(MissingExtraError, match=rf'{EXTRAS[extra][0]} needs packages .* "catstream\[{extra}\]"'):
+        row.load()
 
 
 @pytest.mark.parametrize("extra", EXTRAS)

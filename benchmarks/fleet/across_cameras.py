@@ -31,7 +31,7 @@ from table import Table, publish
 from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.run.learned import Learned, merge
 from catstream.settings import Settings
-from catstream.video.sprite import cut_out_dahlia, load_photograph
+from catstream.video.rendered import cut_out_dahlia, load_photograph
 from catstream.video.writer import VideoWriter
 
 _CAMERAS = 4

@@ -42,7 +42,7 @@ from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.run.state import restore
 from catstream.settings import Settings
-from catstream.video import demo
+from catstream.video import rendered
 from catstream.video.live_demo import first_box
 from catstream.wire.keys import allow
 
@@ -74,6 +74,7 @@ class Trial:
     """A fleet under faults.
 
     live      sources of the live streams, by name
+    rate      frames per second of the live streams
     lockstep  names of the films, which are tracked in lockstep
     recovery  seconds from a fault until the streams that it hit went on, by the name of the fault
     noticed   the same from the moment at which Ray has noticed that a node or a process died
@@ -81,7 +82,8 @@ class Trial:
     """
 
     def __init__(self, stack: ExitStack, seed: int, live: int, films: int, rate: float) -> None:
-        self.live = {f"live-{number}": f"demo:{number}?rate={rate:g}" for number in range(1, live + 1)}
+        self.live = {f"live-{number}": f"demo:{number}" for number in range(1, live + 1)}
+        self.rate = rate
         self.lockstep = tuple(f"film-{number}" for number in range(1, films + 1))
         self.random = np.random.default_rng(seed)
         self.recovery: dict[str, list[float]] = defaultdict(list)
@@ -91,7 +93,7 @@ class Trial:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cs-")))
         os.environ |= VARIABLES | {"XDG_STATE_HOME": str(folder)}
         self.link = self._open_store(stack)
-        demo.write(folder, FILM, (320, 240))
+        rendered.write(folder, FILM, (320, 240))
         self.film = folder / "demo.mp4"
         self.box = Box(*np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",", max_rows=1).tolist())
         self.calm = fingerprint(undisturbed(str(self.film), {"": self.box})[1])
@@ -157,7 +159,7 @@ class Trial:
 
     def _streams(self) -> Iterator[StreamSpec]:
         for name, source in self.live.items():
-            yield StreamSpec(name, source, {"": first_box(source)}, cores=NEED)
+            yield StreamSpec(name, source, {"": first_box(source)}, settings={"run.image_rate": self.rate}, cores=NEED)
         for name in self.lockstep:
             yield StreamSpec(name, str(self.film), {"": self.box}, settings={"run.lockstep": True}, cores=NEED)
 

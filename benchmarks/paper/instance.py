@@ -43,7 +43,7 @@ from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.services.start import SPAWN
 from catstream.tracker import Tracker
-from catstream.video import demo
+from catstream.video import rendered
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 
@@ -275,7 +275,7 @@ def _each(answers: dict[str, dict[str, list[Answer]]]) -> Table:
 def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
     """Learned before a plain background, searched before others and in other lights."""
     rng = np.random.default_rng(0)
-    image, box = next(demo.render(1))
+    image, box = next(rendered.render(1))
     assert box is not None
     flower = cut(image, box)
     plain = [np.full((240, 320, 3), 190, np.uint8) for _ in range(learning)]
@@ -347,7 +347,7 @@ def _scans(options: argparse.Namespace, found: list[Sequence]) -> Table:
     picked = [sequence for sequence in found if sequence.name not in CHECK]
     picked = picked[:: max(1, len(picked) // 10)][:10]
     learned = [learn([next(iter(each.frames()))], Box(*each.boxes[0].tolist())) for each in picked]
-    frames = [image for image, _ in demo.render(2 if options.quick else 150)]
+    frames = [image for image, _ in rendered.render(2 if options.quick else 150)]
     rows = []
     for count in (1, 3) if options.quick else (1, 3, 10):
         models = [learned[number % len(learned)] for number in range(count)]

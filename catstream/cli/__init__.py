@@ -21,9 +21,8 @@ COMMANDS = {
     "loadtest": "Run pipelines under load, and measure latency and losses.",
     "watch": "Print the messages of a running pipeline.",
     "view": "Watch and control a running pipeline in a browser.",
-    "sink": "Write the tracks of a running pipeline to files.",
-    "record": "Record the messages of a running pipeline in one file.",
-    "replay": "Replay a recording to subscribers, or train on it again.",
+    "sink": "Write the tracks of a running pipeline to files and elsewhere.",
+    "export": "Make other formats from the log of a run.",
     "status": "Show the state of a running pipeline.",
     "set-box": "Set the box of an object in a running pipeline.",
     "search": "Search for the object of a saved model in a running pipeline.",
@@ -35,7 +34,6 @@ COMMANDS = {
     "stop": "Stop a running pipeline as if its source had ended.",
     "fleet": "Run many streams on one machine or many.",
     "keys": "Manage the keys of a pipeline and its clients.",
-    "summary": "Choose the images that represent a collection, or the frames that taught most.",
     "settings": "List all settings with their defaults and descriptions.",
 }
 

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +35,6 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDTH = 140  # columns of a table that is not printed to a terminal
 _SHORTEST_SECONDS = 1.0  # of a run whose rate is told
 _REFRESH_SECONDS = 0.1  # between two updates of the progress
-_STDOUT = Path("-")
 
 
 def screen() -> Console:
@@ -198,17 +197,14 @@ class _State(ProgressColumn):
 
 
 class RunProgress:
-    """Counts the tracks of a run, and shows them during the run and at its end.
+    """Counts the tracks of a run, and shows them during the run and at its end."""
 
-    names : the objects of the earlier part of a resumed run, in the order in which they appeared
-    """
-
-    def __init__(self, pipeline: Pipeline, names: Iterable[str] = ()) -> None:
+    def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
         self._started = time.perf_counter()
         self._first = self._shown = 0.0
         self.frames = 0
-        self._objects = {name: _Counted() for name in names}
+        self._objects: dict[str, _Counted] = {}
 
     def progress(self, console: Console) -> Progress:
         total = "" if self._pipeline.live else f"/{self._pipeline.frames or '?'}"
@@ -271,15 +267,15 @@ class RunProgress:
             )
         if self._pipeline.restarts:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
-        if written := [_shown(file) for file in results if file != _STDOUT]:
-            lines.append(f"results: {', '.join(written)}")
+        if results:
+            lines.append(f"results: {', '.join(map(_shown, results))}")
         return "\n".join(lines)
 
     def _of_each(self) -> Iterator[str]:
-        """A line for each object; the numbers are the ids in MOT text."""
-        for number, (name, each) in enumerate(self._objects.items(), 1):
+        """A line for each object."""
+        for name, each in self._objects.items():
             frames = f"present in {each.present} of {each.frames} frames, model version {each.version}"
-            yield f"  {number} {name or '(no name)'}: {frames}"
+            yield f"  {name or '(no name)'}: {frames}"
 
     def _detector(self, counter: str) -> float:
         """A counter of the detector: the final one, or before the end that of its last report."""

@@ -14,9 +14,10 @@ import click
 from rich.console import Console
 
 from catstream.box import Box
-from catstream.cli.common import INTERRUPTS, RunProgress, check_file, messages, stopped
+from catstream.cli.common import INTERRUPTS, RunProgress, messages, stopped
+from catstream.cli.export import with_table
 from catstream.cli.view import PORT, Address, AddressType, with_token
-from catstream.errors import RecordingError, ServiceError, require_extra
+from catstream.errors import require_extra
 from catstream.messages.names import UNNAMED, doubtful, listed
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results
@@ -30,9 +31,8 @@ from catstream.services.options import (
     with_part,
     with_reading,
 )
-from catstream.sinks.recording.file import Recording
-from catstream.sinks.run import RunFiles
-from catstream.sinks.sink import STDOUT
+from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file
+from catstream.sinks.run_files import RunFiles, places_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,13 +53,13 @@ class _Request:
     part: slice
     output: Path | None
     video: bool
-    write: tuple[Path, ...]
+    write: tuple[str, ...]
     overwrite: bool
     saved: dict[str, Path]
-    record: Path | None
     view: Address | None
     token: str | None
     lockstep: bool
+    paused: bool
     state: Path | None
     resume: Path | None
 
@@ -90,39 +90,32 @@ class _Request:
             model=self.models or None,
             part=self.part,
             state=self.state,
-            record=self.record,
             resume=self.resume,
+            paused=self.paused,
             results=Results(  # absolute, to resume from any folder
                 output=self.output and self.output.absolute(),
                 video=self.video,
-                write=tuple(file.absolute() for file in self.write if file != STDOUT),
+                write=tuple(str(Path(it).absolute()) if is_file(it) else it for it in self.write if it != STDOUT),
                 models={name: file.absolute() for name, file in self.saved.items()},
             ),
         )
 
     def files(self, pipeline: Pipeline) -> RunFiles:
-        """The files to which the tracks are written, including the standard output if requested."""
-        results = pipeline.results
-        return RunFiles(
-            pipeline.name,
-            pipeline.source,
-            pipeline.part,
-            results.output,
-            results.video,
-            [*results.write, *([STDOUT] if STDOUT in self.write else [])],
-            pipeline.settings.run.image_rate,
-            [*self.boxes, *self.models],
-        )
+        """Everything that the tracks are written to, including the standard output if requested."""
+        results, settings = pipeline.results, pipeline.settings.run
+        places = [*places_of(pipeline.name, results.output, results.video), *results.write]
+        places += [STDOUT] if STDOUT in self.write else []
+        origin = Origin(pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys)
+        return RunFiles(origin, results.output, [*dict.fromkeys(places)])
 
 
 @click.command()
 @click.argument("source", required=False)
 @click.option("--output", type=PATH, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
-@click.option("--write", type=PATH, multiple=True, metavar="FILE", help="Also write the tracks to FILE; - for stdout.")
+@click.option("--write", multiple=True, metavar="DEST", help="Also write the tracks to DEST; may be repeated.")
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
-@click.option("--record", type=PATH, help="Record the run to a file for `catstream replay`.")
 @click.option(
     "--view",
     type=AddressType(),
@@ -133,12 +126,14 @@ class _Request:
 )
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
+@click.option("--paused", is_flag=True, help="Start paused, until `catstream resume`.")
 @click.option("--state", type=PATH, help="Folder for checkpoints, to resume the run from.")
 @click.option("--resume", type=FOLDER, help="Resume the run of such a folder.")
 @with_object
 @with_part
 @with_given
 @with_reading
+@with_table(sinks=True)
 def track(**options: Any) -> None:
     """Track one or several objects in a video.
 
@@ -167,30 +162,18 @@ def track(**options: Any) -> None:
 
     \b
     Writes
-      OUTPUT/NAME.txt               x,y,w,h of each frame, nan if the object is absent
-      OUTPUT/NAME_confidence.value  score of each frame
-      OUTPUT/NAME_time.txt          seconds for each frame
-      OUTPUT/NAME.csv               frame, seconds, state, box, score, model version, object
-      OUTPUT/NAME.mp4               with --video
+      OUTPUT/NAME.ndjson   one JSON object for each track, with all its fields
+      OUTPUT/NAME.csv      a row for each object and frame: frame, seconds, state, box,
+                           score, model version, object, processing time
+      OUTPUT/NAME.mp4      with --video
 
     NAME is the name of the source, so that several sources can share a folder;
-    a/walk.mp4 and b/walk.mp4 need a folder each. NAME.csv has a row for each
-    object and frame. The first three files are of one object: NAME-anna.txt is
-    that of anna.
+    a/walk.mp4 and b/walk.mp4 need a folder each. `catstream export` makes MOT
+    text, the files of benchmarks, SQLite and Parquet from these.
 
-    \b
-    --write FILE, may be repeated; each file contains every object and frame
-      .ndjson .jsonl   one JSON object per line, with the fields of a track
-      -                the same, on standard output
-      .csv             as OUTPUT/NAME.csv
-      .txt             MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1
-      .mp4             the frames with their tracks drawn in
-      .json            one array of the JSON objects
-      .sqlite          the table tracks
-      .parquet         the same table; needs pip install "catstream[parquet]"
+    --write DEST, may be repeated; the suffix selects the format
 
-    The last three are made at the end, from an .ndjson file of the same name,
-    which is kept: --resume continues from it.
+    {table}
 
     Existing files are not replaced without --overwrite.
 
@@ -198,13 +181,13 @@ def track(**options: Any) -> None:
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --output out --video
       catstream track frames/ --box 120,80,64,48 --output out --set coreset.size=128
-      catstream track walk.mp4 --box 120,80,64,48 --write tracks.parquet
       catstream track walk.mp4 --box 120,80,64,48 --write - | jq .box
       catstream track walk.mp4 --box anna=120,80,64,48 --box ben=300,90,60,150 --video --output out
       catstream track walk.mp4 --box 120,80,64,48 --save-model walker.safetensors
       catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
-      catstream track walk.mp4 --box 120,80,64,48 --record walk.mcap
+      catstream track walk.mp4 --box 120,80,64,48 --write walk.mcap
+      catstream track walk.mp4 --box 120,80,64,48 --paused --set run.endpoint=run
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
@@ -229,23 +212,13 @@ def track(**options: Any) -> None:
 
 def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None:
     """Raise an error before the run if one of its files could not be written."""
-    if files.video and files.output is None:
+    if pipeline.results.video and files.output is None:
         raise click.UsageError("--video requires --output, the folder for the video")
-    if pipeline.live and (files.video or any(file.suffix == ".mp4" for file in files.files)):
-        raise click.UsageError(
-            "a video needs the frames once more, and a live source cannot repeat them: omit the video"
-        )
     earlier = pipeline.earlier_results
-    files.check_writable(
-        overwrite=request.overwrite,
-        resumable=request.folder is not None,
-        known=[*earlier.write, *([earlier.output] if earlier.output is not None else [])],
-    )
-    files.check_source_kept(request.saved.values())
+    continued = [*places_of(pipeline.name, earlier.output, earlier.video), *earlier.write]
+    files.check(overwrite=request.overwrite, earlier=continued)
     for file in request.saved.values():
-        check_file(file, overwrite=request.overwrite, made=files.output)
-        if [*request.saved.values(), *request.write, request.record].count(file) > 1:
-            raise ServiceError(f"{file} is named twice: give each file once")
+        check_file(file, may_exist=request.overwrite, source=pipeline.source, made=files.output)
 
 
 def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
@@ -261,8 +234,7 @@ class _Run:
 
     def __init__(self, request: _Request, pipeline: Pipeline, files: RunFiles, console: Console) -> None:
         self._request, self._pipeline, self._files, self._console = request, pipeline, files, console
-        self._progress = RunProgress(pipeline, files.names() if request.resume is not None else ())
-        self._recording: Recording | None = None
+        self._progress = RunProgress(pipeline)
 
     def execute(self) -> None:
         """Run to the end, or until Ctrl-C or a signal; then the exit code is `INTERRUPTED`."""
@@ -285,10 +257,6 @@ class _Run:
             lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
             hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
             stopped(f"the results so far are kept{lost}{hint}")
-        if self._recording is not None and not self._recording.complete:
-            raise RecordingError(
-                f"{request.record} is not complete: see why above, and record the run again if you need it whole"
-            )
 
     def _run(self) -> bool:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
@@ -301,8 +269,7 @@ class _Run:
                 if self._pipeline.holding == "waiting":
                     self._console.print(f"waiting for a box: {self._ways_to_set_box()}")
                 elif self._pipeline.holding:
-                    place = f"--endpoint {self._pipeline.endpoint}"
-                    self._console.print(f"paused, as it was before: to continue, catstream resume {place}")
+                    self._console.print(f"paused: to continue, catstream resume --endpoint {self._pipeline.endpoint}")
                 self._write_tracks(files)
         except KeyboardInterrupt:
             return True
@@ -327,21 +294,17 @@ class _Run:
     def _write_tracks(self, stack: ExitStack) -> None:
         """Write every track to all files, which the stack closes, and show the progress."""
         with self._progress.progress(self._console) as progress:
-            resume = self._request.resume is not None
-            # A frame that arrives while the files are written again would be in none of them after Ctrl-C.
-            write = stack.enter_context(self._files.opened(resume=True)) if resume else None
+            resume, endpoint = self._request.resume is not None, self._pipeline.endpoint
+            write = stack.enter_context(self._files.opened(endpoint, resume=True)) if resume else None
             moment = time.perf_counter()
             for tracks in self._pipeline.by_frame():
                 # New files are opened with the first track: a run that cannot start does not change older results.
-                write = write or stack.enter_context(self._files.opened())
+                write = write or stack.enter_context(self._files.opened(endpoint))
                 before, moment = moment, time.perf_counter()
                 with INTERRUPTS.deferred():  # so that a frame is in all results or in none
-                    write(tracks, moment - before)
+                    write(TrackedFrame([*tracks.values()], moment - before))
                     self._progress.show(progress, tracks)
 
     def _print_summary(self) -> None:
-        folder = [self._files.output] if self._files.output is not None else []
-        self._console.print(self._progress.summary([*folder, *self._files.files]))
-        if self._request.record is not None:
-            self._recording = Recording(self._request.record)
-            self._console.print(f"recording: {self._request.record}, {self._recording}")
+        output = [] if self._files.output is None else [self._files.output]
+        self._console.print(self._progress.summary([*output, *map(Path, self._pipeline.results.write)]))

@@ -37,13 +37,13 @@ class Results:
 
     output      folder of the results files, None for none
     video       whether an annotated video is among the results files
-    write       further files of tracks
+    write       further destinations of tracks, see `catstream.sinks.destinations`
     models      files for what was learned of each object, by name; a file without a name is for the only object
     """
 
     output: Path | None = None
     video: bool = False
-    write: tuple[Path, ...] = ()
+    write: tuple[str, ...] = ()
     models: dict[str, Path] = field(default_factory=dict)
 
     def after(self, earlier: Results) -> Results:
@@ -75,6 +75,7 @@ class Job:
     endpoint  where the processes meet; the setting of the same name if this is empty
     state     folder of the checkpoints and of the desired state; None if nothing is kept
     resume    whether the processes continue from that state
+    paused    whether the run starts paused
     record    file that the compressor records all messages to
     run       id of this start of the run, which its messages carry; empty if the processes were started by hand
     owned     whether the process that started the run receives every track on the channel `results`
@@ -93,6 +94,7 @@ class Job:
     endpoint: str = ""
     state: Path | None = None
     resume: bool = False
+    paused: bool = False
     record: Path | None = None
     run: str = ""
     owned: bool = False

@@ -1,9 +1,10 @@
-"""Draws tracks over their frames, for people to look at."""
+"""Draws tracks over their frames, for people to look at, and gives each object a colour."""
 
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import cv2
@@ -12,15 +13,20 @@ import numpy as np
 from catstream.box import Box
 from catstream.messages.kinds import Preview, Track
 from catstream.messages.names import UNNAMED
-from catstream.video.image import jpeg
-from catstream.video.palette import Colours, rgb
+from catstream.video.frames import jpeg
+
+#: Colours as #rrggbb: distinguishable for colour-blind people, and light enough for dark text on them. In a picture,
+#: draw each beside a dark line, so that it is visible on a light ground too.
+PALETTE = (
+    "#ff922b", "#3586ff", "#fedd38", "#e123c2", "#bae0b4", "#fd0304", "#76c6fe", "#5a8667", "#b7a59c",
+)  # fmt: skip
 
 #: Blue, green, red.
 _Point = tuple[float, float]
 _Colour = tuple[int, int, int]
 
 _COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
-_WHITE, _GREY, _DARK, _BLACK = (245, 245, 245), (110, 110, 110), (32, 32, 32), (17, 17, 17)
+_WHITE, _DARK, _BLACK = (245, 245, 245), (32, 32, 32), (17, 17, 17)
 _ORANGE = (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -28,11 +34,42 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TEXT_HEIGHT, _MIN_UNIT = 26, 0.75
 
 
+class Colours:
+    """Gives each object a colour, which does not change until the object is dropped.
+
+    An object gets the first of the colours that the fewest objects have.
+
+    Examples
+    --------
+    >>> colours = Colours()
+    >>> [colours.of(name) for name in ("anna", "ben", "anna")]
+    ['#ff922b', '#3586ff', '#ff922b']
+    >>> colours.keep(["ben"])
+    >>> colours.of("carl")
+    '#ff922b'
+    """
+
+    def __init__(self) -> None:
+        self._colours: dict[str, str] = {}
+
+    def of(self, name: str) -> str:
+        """Return the colour of an object as #rrggbb."""
+        if name not in self._colours:
+            used = Counter(self._colours.values())
+            self._colours[name] = min(PALETTE, key=lambda colour: used[colour])
+        return self._colours[name]
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Drop all objects except these; their colours may be given again."""
+        kept = set(names)
+        self._colours = {name: colour for name, colour in self._colours.items() if name in kept}
+
+
 def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.ndarray:
     """Draw the boxes over a copy of a frame, and a line of text below it.
 
-    An object that is alone and has no name is drawn in the colour of its state; its state, score and model version are
-    below the frame. Other objects have a colour each and their names at their boxes; their scores are below the frame.
+    An object that is alone and has no name is drawn in the colour of its state. Other objects have a colour each and
+    their names at their boxes. Their scores are below the frame.
 
     Parameters
     ----------
@@ -58,10 +95,7 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
     for track, colour in drawn:  # over all boxes
         if track.box is not None:
             _draw_name(picture, track, colour, unit)
-    if is_alone:
-        _draw_text(canvas[height:], *drawn[0], unit)
-    else:
-        _draw_scores(canvas[height:], drawn, unit)
+    _draw_scores(canvas[height:], drawn, unit)
     return canvas
 
 
@@ -78,15 +112,19 @@ def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) ->
     -------
     JPEG file, of the same size with and without tracks
     """
+    image = preview_image(preview, tracks, colours)
+    return preview.jpeg if image is None else jpeg(image)
+
+
+def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -> np.ndarray | None:
+    """The same as an image, uint8 (h, w, 3), blue green red; None if the preview cannot be decoded."""
     image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        return preview.jpeg
+        return None
     if not tracks:
-        image = np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
-    else:
-        scale = image.shape[1] / preview.width
-        image = draw(image, [_scaled(track, scale) for track in tracks], colours)
-    return jpeg(image)
+        return np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
+    scale = image.shape[1] / preview.width
+    return draw(image, [_scaled(track, scale) for track in tracks], colours)
 
 
 def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
@@ -103,11 +141,6 @@ def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int)
     JPEG file
     """
     boxes = [(one, colour) for one, colour in ((truth, _WHITE), (box, _ORANGE)) if np.isfinite(one).all()]
-    return _small(image, boxes, width)
-
-
-def _small(image: np.ndarray, boxes: Sequence[tuple[np.ndarray, _Colour]], width: int) -> bytes:
-    """Return a JPEG file of an image at this width, with boxes x, y, w, h in pixels of the image and their colours."""
     scale = width / image.shape[1]
     small = cv2.resize(image, (width, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
     for box, colour in boxes:
@@ -123,7 +156,8 @@ def _scaled(track: Track, scale: float) -> Track:
 
 
 def _bgr(colour: str) -> _Colour:
-    red, green, blue = rgb(colour)
+    """Return blue, green and red of a colour #rrggbb."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
     return blue, green, red
 
 
@@ -179,17 +213,16 @@ def _write(canvas: np.ndarray, text: str, left: int, unit: float) -> None:
 
 def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
     """Write the name and score of each object, with a ring in place of the disc if it is absent, and the frame number;
-    if there is not enough room, the number of objects that are left out."""
-    height, width = canvas.shape[:2]
+    if there is not enough room, the number of objects that are left out. An object without a name has its state."""
+    width = canvas.shape[1]
     canvas[:] = _DARK
-    middle = height // 2
-    gap, left = round(12 * unit), round(8 * unit)
+    middle, gap, left = canvas.shape[0] // 2, round(12 * unit), round(8 * unit)
     end = f"frame {drawn[0][0].frame}"
     right = width - _text_width(end, unit) - gap
     if right > left:
         _write(canvas, end, right, unit)
     for count, (track, colour) in enumerate(drawn):
-        text, rest = f"{_plain(track.object)} {track.score:.2f}".strip(), f"+{len(drawn) - count}"
+        text, rest = f"{_plain(track.object) or track.state} {track.score:.2f}", f"+{len(drawn) - count}"
         is_last = count == len(drawn) - 1
         if left + gap + _text_width(text, unit) + (0 if is_last else gap + _text_width(rest, unit)) > right - gap:
             if left + _text_width(rest, unit) < right:
@@ -199,25 +232,3 @@ def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], uni
         cv2.circle(canvas, (left + round(4 * unit), middle), round(4 * unit), colour, disc, cv2.LINE_AA)
         _write(canvas, text, left + gap, unit)
         left += 2 * gap + _text_width(text, unit)
-
-
-def _draw_text(canvas: np.ndarray, track: Track, colour: _Colour, unit: float) -> None:
-    """Draw the state, the score as a bar and a number, the model version and the frame number; in a narrow image only
-    the first of these."""
-    height, width = canvas.shape[:2]
-    canvas[:] = _DARK
-    middle = height // 2
-    cv2.circle(canvas, (round(14 * unit), middle), round(5 * unit), colour, cv2.FILLED, cv2.LINE_AA)
-    _write(canvas, track.state, round(26 * unit), unit)
-    bar, right, half, score = round(132 * unit), round(222 * unit), max(2, round(3 * unit)), f"{track.score:.2f}"
-    number = right + round(8 * unit)
-    if number + _text_width(score, unit) > width:
-        return
-    filled = bar + round((right - bar) * min(max(track.score, 0.0), 1.0))
-    cv2.rectangle(canvas, (bar, middle - half), (right, middle + half), _GREY, cv2.FILLED)
-    cv2.rectangle(canvas, (bar, middle - half), (filled, middle + half), colour, cv2.FILLED)
-    _write(canvas, score, number, unit)
-    end = f"model {track.model_version}   frame {track.frame}"
-    start = width - _text_width(end, unit) - round(10 * unit)
-    if start > number + _text_width(score, unit):
-        _write(canvas, end, start, unit)

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING
 import cv2
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, without_password
+from catstream.video.frames import (
+    RATE,
+    Frame,
+    Source,
+    UprightConverter,
+    ffmpeg_reason,
+    video_stream,
+    without_password,
+)
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -45,11 +53,6 @@ class LiveSource(Source):
     Iteration waits for a frame that was not returned yet. If the source reconnects with another image size, its frames
     are scaled to the size of the first one.
 
-    Attributes
-    ----------
-    skipped : number of frames that were replaced by a newer one before they were returned
-    reopened : number of times that the source was lost and came back
-
     Raises
     ------
     VideoError
@@ -58,9 +61,7 @@ class LiveSource(Source):
 
     live = True
 
-    def __init__(
-        self, text: str, start: int = 0, *, since: float | None = None, idle: Callable[[], bool] | None = None
-    ) -> None:
+    def __init__(self, text: str, start: int, *, since: float | None, idle: Callable[[], bool] | None) -> None:
         super().__init__(_name(text), RATE, (0, 0))
         self.skipped = self.reopened = 0
         self._text, self._address = text, without_password(text)
@@ -80,7 +81,8 @@ class LiveSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`skipped`, `reopened`, and `lost_seconds`: seconds since the source was lost, 0 while it is not."""
+        """`skipped`: frames that were replaced by a newer one before they were returned; `reopened`: number of times
+        that the source came back; `lost_seconds`: seconds since it was lost, 0 while it is not."""
         silent = monotonic() - self._last_frame_time
         # FFmpeg has no time-out for a device that hangs, so a long silence counts as a loss too.
         lost = silent if self._problem or silent > _OPEN_SECONDS else 0.0
@@ -161,13 +163,15 @@ class LiveSource(Source):
         import av
 
         with _open_container(self._text) as container:
-            stream = container.streams.video[0]
+            stream = video_stream(container)
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
             due = monotonic() + _OPEN_SECONDS
-            for packet in container.demux(stream):
+            for packet in container.demux():
                 if self._closed or monotonic() > due:  # a packet that was cut off by a time-out is incomplete
                     return
+                if packet.stream_index != stream.index:  # sound may go on while the picture does not
+                    continue
                 decoded: list[VideoFrame] = []
                 with contextlib.suppress(av.FFmpegError):  # the packet is damaged; the next may be whole
                     decoded = stream.codec_context.decode(packet)
@@ -198,16 +202,16 @@ def _open_container(text: str) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     import av
 
-    kind = text.partition(":")[0].rstrip("s") if "://" in text else ""
-    where = f"/dev/video{text}" if text.isdigit() else text
+    kind = text.partition(":")[0].lower().rstrip("s") if "://" in text else ""
     container = av.open(
-        where,
+        f"/dev/video{text}" if text.isdigit() else text,
         format=None if kind else "v4l2",
         options=_OPTIONS.get(kind, {}),
         timeout=(_OPEN_SECONDS, _SILENT_SECONDS),
+        metadata_errors="replace",
     )
     problem = ""
-    if not container.streams.video or container.streams.video[0].codec_context is None:
+    if video_stream(container) is None:
         problem = "it has no video"
     elif kind == "http" and container.duration:
         problem = f"it is a recording of {container.duration / 1e6:.0f} s: download it, and give the file"

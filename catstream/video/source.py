@@ -15,10 +15,10 @@ The text is one of these:
     a live demo         demo:1; it needs no camera, see `catstream.video.live_demo`
     a file:// address   file:///home/me/walk.mp4
 
-Files and images are read to the last frame, and no frame is skipped. If a file
-is damaged, the frames before the damage are returned and then `VideoError` is
-raised; with `skip_damaged`, reading continues after the damage. The others
-are live: see `catstream.video.live`.
+Files and images are read to the last frame, and no frame is skipped. If FFmpeg
+cannot decode a place in a file, the frames before it are returned and then
+`VideoError` is raised; with `run.skip_damaged`, reading continues at the next
+key frame. The others are live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
@@ -28,103 +28,80 @@ import os
 import re
 import sys
 from collections.abc import Callable, Generator, Iterator
-from functools import cached_property, partial
+from dataclasses import replace
+from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 import cv2
 import numpy as np
 
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, time_base, video_stream
+from catstream.settings import RunSettings
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, video_stream
 
 if TYPE_CHECKING:
-    from av import Packet, VideoFrame, VideoStream
-    from av.container import InputContainer
-    from av.stream import Stream
+    from av import Packet, VideoFrame
 
 #: All frames of a source.
 ALL_FRAMES = slice(None)
 
-#: Suffixes of the files that are read as images, and as videos.
-IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
-VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm", ".wmv"}
+#: Suffixes of the files in a folder that are read as images, and as videos. A file that is named may have any.
+_IMAGES = "avif bmp jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
+_VIDEOS = (
+    "264 265 3g2 3gp asf avi divx dv f4v flv gif h264 h265 hevc m2t m2ts m2v m4v mjpeg mjpg mkv mov mp4 mpe mpeg mpg "
+    "mts mxf nut ogm ogv qt rm rmvb ts vob webm wmv wtv y4m"
+)
+IMAGES, VIDEOS = ({f".{suffix}" for suffix in suffixes.split()} for suffixes in (_IMAGES, _VIDEOS))
 _FOLDERS = ("img", "imgs", "color", "rgb")
 _EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
 _LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+|demo:.*")
 
-#: A video that ends this many seconds before its stated duration was cut off. Rounding and audio cause less.
-_CUT_OFF_SECONDS = 0.5
-
-#: After this many consecutive read errors without a packet, the container is treated as ended.
+#: After so many errors of the container without a packet between them, a file is treated as ended.
 _MAX_FAILURES = 3
-
-#: If more bytes than this lie between two packets of a Matroska file, data is damaged. Cluster and block headers are
-#: far smaller.
-_MAX_BYTES_BETWEEN_PACKETS = 4096
 
 #: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
 _MAX_COUNTED_BYTES = 1 << 30
 
 
 class _FileSource(Source):
-    """A video file or a set of images. No frame is skipped; the constructor decodes the first frame.
+    """The frames of a `part` of a file or of images, from number `start` on. The constructor decodes the first one."""
 
-    Parameters
-    ----------
-    stream : the frames of `part`, starting with number `start` within the part
-    total : function that returns the number of frames of the whole source, or None if it is unknown
-    rate : frames per second of the whole source
-    damage : counter of the damaged frames in the file that `stream` reads
-
-    Raises
-    ------
-    VideoError
-        From the constructor if there is no first frame; from the iterator at the first damage, after the frames before
-        it.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        stream: Generator[Frame],
-        total: Callable[[], int | None],
-        part: slice,
-        start: int,
-        rate: float,
-        damage: _Damage | None = None,
-    ) -> None:
-        self._stream, self._total, self._part, self._damage = stream, total, part, damage
-        self._first: Frame | None = next(stream, None)
+    def __init__(self, name: str, reader: _Images | _Video, part: slice, start: int) -> None:
+        self._reader, self._part = reader, part
+        wanted = range(sys.maxsize)[part]
+        self._frames = reader.frames(wanted, start)
+        self._first: Frame | None = next(self._frames, None)
         if self._first is None:
-            number = range(sys.maxsize)[part][start:].start
             raise VideoError(
-                f"{name} has {total() or 'no'} frames, numbered from 0, and none from frame {number} on: "
-                "give an earlier first frame, or another source"
+                f"{name} has {reader.count() or 'no'} frames, numbered from 0, and none from frame "
+                f"{wanted[start:].start} on: give an earlier first frame, or another source"
             )
         height, width = self._first.image.shape[:2]
-        super().__init__(name, rate / (part.step or 1), (width, height))
+        super().__init__(name, reader.rate / (part.step or 1), (width, height))
+        self.pixel_aspect = reader.pixel_aspect
 
     @cached_property
     def frames(self) -> int | None:
-        total = self._total()
+        total = self._reader.count()
         return len(range(total)[self._part]) if total else None
 
     @property
     def counters(self) -> dict[str, float]:
-        """`damaged`: number of frames that could not be decoded and were left out."""
-        return {"damaged": self._damage.frames} if self._damage is not None and self._damage.frames else {}
+        """`damaged`: number of packets, which is that of their frames, that were left out."""
+        return {"damaged": self._reader.damaged} if self._reader.damaged else {}
 
     def __next__(self) -> Frame:
         if self._first is not None:
             frame, self._first = self._first, None
             return frame
-        return next(self._stream)
+        return next(self._frames)
 
     def close(self) -> None:
         self._first = None
-        self._stream.close()
+        self._frames.close()
 
 
 def is_live(text: str | Path) -> bool:
@@ -143,9 +120,8 @@ def open_source(
     part: slice = ALL_FRAMES,
     since: float | None = None,
     idle: Callable[[], bool] | None = None,
-    image_rate: float = RATE,
-    skip_damaged: bool = False,
-    resize: bool = False,
+    settings: RunSettings | None = None,
+    **single: Any,
 ) -> Source:
     """Open the source that `text` names; the docstring of the module lists the kinds.
 
@@ -159,16 +135,16 @@ def open_source(
     idle : function that is called ten times a second while a live source gives no frame; if it returns True, iteration
         ends. With it, opening a live source never fails: iteration waits for the first frame for any length of time,
         and the size is known with that frame
-    image_rate : frames per second of a folder of images
-    skip_damaged : continue after damage in a video file. The frames that cannot be decoded are left out; the next good
-        frame gets the next number and keeps its own time stamp
-    resize : scale images that have another size than the first one of `part` to that size
+    settings : the settings of a run, of which `image_rate`, `skip_damaged` and `resize` are used
+    single : single ones of them by name, in the place of those in `settings`
 
     Raises
     ------
     VideoError
-        If the source does not exist or cannot be read.
+        If the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the frames
+        before it.
     """
+    settings = replace(settings or RunSettings(), **single)
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if part.stop is not None and part.stop <= (part.start or 0):
@@ -180,39 +156,47 @@ def open_source(
         from catstream.video.live import LiveSource
         from catstream.video.live_demo import PREFIX, LiveDemo
 
-        return (LiveDemo if str(text).startswith(PREFIX) else LiveSource)(str(text), start, since=since, idle=idle)
+        if str(text).startswith(PREFIX):
+            return LiveDemo(str(text), start, settings.image_rate, since=since, idle=idle)
+        return LiveSource(str(text), start, since=since, idle=idle)
     if str(text) == "-":
         raise VideoError(
             "standard input is not a source, because a restarted process cannot read it again: "
             "write the video to a file, or serve it as a stream"
         )
-    path = Path(source_text(text))
-    images = partial(_open_images, part=part, start=start, rate=image_rate, resize=resize)
-    video = partial(_open_video, part=part, start=start, skip_damaged=skip_damaged)
     try:
-        if path.is_dir():
-            return _open_folder(path, images, video)
-        if path.is_file():
-            return video(path)
-        if re.search(r"%0?\d*d|[*?\[]", path.name):
-            return images(path.parent.resolve().name, image_files(path))
+        name, reader = _opened(Path(source_text(text)), settings)
     except OSError as error:
         raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {_EXPECTED}") from None
+    return _FileSource(name, reader, part, start)
+
+
+def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
+    """Open a file, a folder or a pattern; return its name for results, and what reads it."""
+    if path.is_dir():
+        name = path.resolve().name
+        for folder in (*(path / inner for inner in _FOLDERS), path):
+            if folder.is_dir() and _visible(folder, IMAGES):
+                return name, _Images(image_files(folder), settings)
+        videos = _visible(path, VIDEOS)
+        if len(videos) == 1:
+            return videos[0].stem, _Video(videos[0], settings)
+        content = f"{len(videos)} videos" if videos else "neither images nor a video"
+        raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
+    if path.is_file():
+        return path.stem, _Video(path, settings)
+    if re.search(r"%0?\d*d|[*?\[]", path.name):
+        return path.parent.resolve().name, _Images(image_files(path), settings)
     if path.exists():
         raise VideoError(
-            f"{str(text)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
+            f"{str(path)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
             "write the video to a file, or serve it as a stream"
         )
-    raise VideoError(f"there is no video or folder {str(text)!r}: {_EXPECTED}")
+    raise VideoError(f"there is no video or folder {str(path)!r}: {_EXPECTED}")
 
 
 def source_text(source: object) -> str:
-    """The text of a source that a program has given; of a file:// address its path.
-
-    Raises
-    ------
-    VideoError
-        If it is neither a path, an address nor a number, or if the address names another machine.
+    """The text of a source that a program has given; of a file:// address of this machine its path.
 
     >>> source_text("file:///videos/a%20walk.mp4"), source_text(Path("walk.mp4")), source_text(0)
     ('/videos/a walk.mp4', 'walk.mp4', '0')
@@ -232,13 +216,7 @@ def source_text(source: object) -> str:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the image files in a folder, or those that match a pattern (%05d, *), in natural order.
-
-    Raises
-    ------
-    VideoError
-        If there are no images.
-    """
+    """Return the image files in a folder, or those that match a pattern (%05d, *), in natural order, at least one."""
     if path.is_dir():
         files = _visible(path, IMAGES)
     elif number := re.search(r"%0?(\d*)d", path.name):
@@ -264,54 +242,66 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _open_folder(path: Path, images: Callable[..., Source], video: Callable[..., Source]) -> Source:
-    name = path.resolve().name
-    for folder in (*(path / inner for inner in _FOLDERS), path):
-        if folder.is_dir() and _visible(folder, IMAGES):
-            return images(name, image_files(folder))
-    videos = _visible(path, VIDEOS)
-    if len(videos) == 1:
-        return video(videos[0])
-    content = f"{len(videos)} videos" if videos else "neither images nor a video"
-    raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
+class _Images:
+    """Image files that are read as frames."""
 
+    damaged, pixel_aspect = 0, Fraction(1)
 
-def _open_images(name: str, files: list[Path], *, part: slice, start: int, rate: float, resize: bool) -> Source:
-    frames = _read_images(files, range(len(files))[part], start, rate, resize)
-    return _FileSource(name, frames, lambda: len(files), part, start, rate)
+    def __init__(self, files: list[Path], settings: RunSettings) -> None:
+        self.files, self.settings, self.rate = files, settings, settings.image_rate
 
+    def count(self) -> int:
+        return len(self.files)
 
-def _read_images(files: list[Path], wanted: range, start: int, rate: float, resize: bool) -> Generator[Frame]:
-    def read(number: int) -> np.ndarray:
-        image = read_image(files[number])
+    def frames(self, wanted: range, start: int) -> Generator[Frame]:
+        """Yield the frames with these numbers, from the one at index `start` on."""
+        numbers, resize = range(len(self.files))[wanted.start : wanted.stop : wanted.step], self.settings.resize
+        # The size is that of the first image of the run, if it is resumed too.
+        shape = self._read(numbers[0]).shape if resize and start and numbers else None
+        for index, number in enumerate(numbers[start:], start):
+            image = self._read(number)
+            shape = shape or image.shape
+            yield Frame(index, number / self.rate, _of_one_size(image, shape, resize, self.files[number], number))
+
+    def _read(self, number: int) -> np.ndarray:
+        image = read_image(self.files[number])
         if image is None:
-            raise VideoError(f"cannot read the image {str(files[number])!r} (frame {number}): replace or remove it")
+            name = str(self.files[number])
+            raise VideoError(f"cannot read the image {name!r} (frame {number}): replace or remove it")
         return image
 
-    shape = read(wanted[0]).shape if resize and start and wanted else None  # that of the run, if it is resumed
-    for count, number in enumerate(wanted[start:], start):
-        image = read(number)
-        shape = shape or image.shape
-        if image.shape != shape:
-            if not resize:
-                raise VideoError(
-                    f"all images of a source need one size: {str(files[number])!r} (frame {number}) is "
-                    f"{image.shape[1]}x{image.shape[0]}, the first {shape[1]}x{shape[0]}: "
-                    "--resize (run.resize=true) scales it to that"
-                )
-            image = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
-        yield Frame(count, number / rate, image)
+
+def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: Path, number: int) -> np.ndarray:
+    """Return an image in the size of the first one. Raises VideoError if it has another, unless it is to be scaled."""
+    if image.shape == shape:
+        return image
+    if resize:
+        return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    raise VideoError(
+        f"all images of a source need one size: {str(path)!r} (frame {number}) is {image.shape[1]}x{image.shape[0]}, "
+        f"the first {shape[1]}x{shape[0]}: --resize (run.resize=true) scales it to that"
+    )
 
 
 def read_image(path: Path) -> np.ndarray | None:
     """Return an image as uint8 (h, w, 3), or None if it cannot be read; OpenCV's warnings are suppressed."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.imread(str(path), cv2.IMREAD_COLOR)
-    except cv2.error:  # it states more pixels than OpenCV reads
+        # Not by cv2.imread, which crashes at a name that is not UTF-8, and decodes the half of a JPEG.
+        data = path.read_bytes()
+        return None if _is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):  # also if it is empty, or states more pixels than OpenCV reads
         return None
     finally:
         cv2.utils.logging.setLogLevel(level)
+
+
+def _is_cut_off(data: bytes) -> bool:
+    """Whether this is a JPEG in which no end of the image (FF D9) follows its first scan (FF DA)."""
+    place = 2
+    while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
+        place += 2 + int.from_bytes(data[place + 2 : place + 4])
+    return data.startswith(b"\xff\xd8\xff") and data[place : place + 1] == b"\xff" and b"\xff\xd9" not in data[place:]
 
 
 def prepare() -> None:
@@ -319,168 +309,119 @@ def prepare() -> None:
     import av.video.reformatter  # noqa: F401
 
 
-def _open_video(path: Path, *, part: slice, start: int, skip_damaged: bool) -> Source:
-    import av  # imported here because it takes 0.1 s and folders do not need it
+class _Video:
+    """A video file that is read once. `damaged` is the number of packets that were left out."""
 
-    try:
-        container = av.open(str(path.absolute()))
-    except (av.FFmpegError, OSError) as error:
-        raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_EXPECTED}") from None
-    stream = video_stream(container)
-    # FFmpeg opens any text file as a video of its text (format "tty").
-    if stream is None or stream.codec_context is None or container.format.name == "tty":
-        container.close()
-        raise VideoError(f"there is no video in {str(path)!r}: {_EXPECTED}")
-    rate = float(stream.average_rate or stream.guessed_rate or RATE)
-    stated, damage = stream.frames, _Damage(path, skip_damaged)
-    images = _read_video(path, container, rate, range(sys.maxsize)[part], start, damage)
-    source = _FileSource(path.stem, images, lambda: stated or _count_frames(path, rate), part, start, rate, damage)
-    source.sound = path
-    return source
+    def __init__(self, path: Path, settings: RunSettings) -> None:
+        import av  # imported here because it takes 0.1 s and folders do not need it
 
+        self.path, self.settings, self.damaged = path, settings, 0
+        try:
+            # Text in the file, as its title, may be in any encoding.
+            self.container = av.open(str(path.absolute()), metadata_errors="replace")
+        except (av.FFmpegError, OSError) as error:
+            raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_EXPECTED}") from None
+        self.stream = video_stream(self.container)
+        # FFmpeg opens any text file as a video of its text (format "tty").
+        if self.stream is None or self.container.format.name == "tty":
+            self.container.close()
+            raise VideoError(f"there is no video in {str(path)!r}: {_EXPECTED}")
+        self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
+        # A stream without a container, as raw H.264, has no time stamps, but may state its rate. An AVI has the times
+        # of decoding only, and FFmpeg gives them to pictures that are in another order.
+        has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
+        self._is_avi = self.container.format.name == "avi"
+        self.pixel_aspect = self.stream.sample_aspect_ratio or Fraction(1)
+        self._clock = ("dts" if self._is_avi else "pts") if has_times else ""
+        self.rate = float((has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
 
-def _count_frames(path: Path, rate: float) -> int | None:
-    """Count the frames of a video whose container does not state their number, by its packets, without decoding."""
-    import av
+    def count(self) -> int | None:
+        """Return the number of frames: the stated one, or else that of the packets."""
+        # The header of an AVI counts packets without data, which repeat the frame before, too.
+        if self.stream.frames and not self._is_avi:
+            return int(self.stream.frames)
+        video = _Video(self.path, self.settings)
+        with video.container:
+            if self.path.stat().st_size > _MAX_COUNTED_BYTES:
+                return round((video.container.duration or 0) / 1e6 * self.rate) or None
+            return sum(1 for packet in video._packets() if not isinstance(packet, str)) - 1 or None
 
-    with av.open(str(path.absolute())) as container:
-        stream = video_stream(container)
-        if path.stat().st_size > _MAX_COUNTED_BYTES:
-            return round(_stated_duration(container, stream) * rate) or None
-        count = 0
-        with contextlib.suppress(av.FFmpegError):  # damage is reported later, when the frames are read
-            count = sum(1 for packet in container.demux(stream) if packet.size)
-        return count or None
+    def frames(self, wanted: range, start: int) -> Generator[Frame]:
+        """Yield the frames with these numbers, from the one at index `start` on."""
+        zero, time, shape, upright, rest = None, -1.0, None, UprightConverter(), wanted[start:]
+        with self.container:
+            for number, frame in enumerate(self._decoded()):
+                ticks = getattr(frame, self._clock) if self._clock else None
+                zero = ticks if zero is None else zero
+                stated = number / self.rate if ticks is None else float((ticks - (zero or 0)) * self.stream.time_base)
+                # Where files were joined, the time stamps begin again, but time goes on.
+                time = stated if stated > time else time + 1 / self.rate
+                if number in rest or (number in wanted and shape is None):
+                    image = upright(frame)
+                    shape = shape or image.shape
+                    image = _of_one_size(image, shape, self.settings.resize, self.path, number)
+                    if number in rest:
+                        yield Frame(wanted.index(number), time, image)
+                if number + 1 >= wanted.stop:  # damage after the part must not be an error
+                    return
 
+    def _decoded(self) -> Iterator[VideoFrame]:
+        """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next key frame."""
+        import av
 
-def _read_video(
-    path: Path, container: InputContainer, rate: float, wanted: range, start: int, damage: _Damage
-) -> Generator[Frame]:
-    stream = video_stream(container)
-    stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
-    number, time, zero, shape, upright = 0, 0.0, None, None, UprightConverter()
-    with container:
-        for frame in _good_frames(container, stream, rate, damage):
-            zero = frame.pts if zero is None else zero
-            time = number / rate if frame.pts is None else float((frame.pts - (zero or 0)) * time_base(stream))
-            if number in wanted[start:]:
-                image = upright(frame)
-                if shape is not None and image.shape != shape:
-                    raise VideoError(
-                        f"{str(path)!r} changes from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]} "
-                        f"pixels at frame {number}: split it there"
-                    )
-                shape = image.shape
-                yield Frame(wanted.index(number), time, image)
-            number += 1
-            if number >= wanted.stop:  # damage after the part must not be an error
-                return
-
-
-class _Damage:
-    """Counts the frames lost to damage in a video file, or raises at the first damage unless it is to be skipped.
-
-    frames  number of frames that were left out, by the time stamps around the damage
-    """
-
-    def __init__(self, path: Path, skip: bool) -> None:
-        self._path, self._skip = path, skip
-        self.frames = 0
-
-    def report(self, problem: str, good: int) -> None:
-        """Report damage after `good` undamaged frames.
-
-        Raises
-        ------
-        VideoError
-            Unless damage is to be skipped.
-        """
-        if not self._skip:
-            raise VideoError(
-                f"{str(self._path)!r} is damaged at frame {good} ({problem}): "
-                "--skip-damaged (run.skip_damaged=true) continues after the damage"
-            )
-
-
-def _good_frames(container: InputContainer, stream: VideoStream, rate: float, damage: _Damage) -> Iterator[VideoFrame]:
-    """Yield the undamaged frames in order, and report each damage between them to `damage`."""
-    import av
-
-    count, last, since_damage, waits_for_key = 0, None, False, False
-    for packet, problem in _packets(container, stream, rate):
-        if waits_for_key and packet is not None and packet.size and not packet.is_keyframe:
-            continue
-        waits_for_key = False
-        frames: list[VideoFrame] = []
-        if not problem:
+        decoder, skip, good = self.stream.codec_context, self.settings.skip_damaged, 0
+        waits_for_key = is_spoilt = False  # of the packets after an error, and of the frames after a damaged one
+        for packet in self._packets():
+            if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
+                self.damaged += 1
+                continue
+            frames: list[VideoFrame] = []
+            problem = packet if isinstance(packet, str) else ""
             try:
-                frames = stream.codec_context.decode(packet)
+                frames = [] if problem else decoder.decode(packet)
             except av.FFmpegError as error:
                 problem = ffmpeg_reason(error)
-        if problem:  # fetch the good frames that are still in the decoder's reorder buffer
-            with contextlib.suppress(av.FFmpegError):
-                frames = stream.codec_context.decode(None)
-        for frame in frames:
-            gap = 1.0
-            if last is not None and frame.pts is not None:
-                gap = float((frame.pts - last) * time_base(stream)) * rate
-            if frame.is_corrupt or (problem and gap > 1.5):
-                problem = problem or "its picture is damaged"
+            waits_for_key = bool(problem)
+            if problem and skip:
+                self.damaged += 1
+                with contextlib.suppress(av.FFmpegError):  # the decoder still holds frames before it
+                    frames = decoder.decode(None)
+                decoder.flush_buffers()
+            for frame in frames:
+                is_spoilt = frame.is_corrupt or (is_spoilt and not frame.key_frame)
+                if is_spoilt and not skip:
+                    problem = "its picture is damaged"
+                    break
+                if is_spoilt:
+                    self.damaged += 1
+                else:
+                    yield frame
+                    good += 1
+            if problem and not skip:
+                raise VideoError(
+                    f"{str(self.path)!r} is damaged at frame {good} ({problem}): "
+                    "--skip-damaged (run.skip_damaged=true) continues at the next key frame"
+                )
+
+    def _packets(self) -> Iterator[Packet[Any] | str | None]:
+        """Yield the packets that hold data, the reason of each error of the container, and None at the end."""
+        import av
+
+        packets, failures = self.container.demux(self.stream), 0
+        while failures < _MAX_FAILURES:
+            try:
+                packet = next(packets, None)
+            except av.FFmpegError as error:
+                packets = self.container.demux(self.stream)  # continues at the current position
+                if not isinstance(error, av.BlockingIOError):  # that asks to try again
+                    failures += 1
+                    yield ffmpeg_reason(error)
+                continue
+            if packet is None:
                 break
-            if since_damage:
-                damage.frames += max(0, round(gap) - 1)
-            last, since_damage = frame.pts, False
-            yield frame
-            count += 1
-        if problem:
-            damage.report(problem, count)
-            since_damage = waits_for_key = True
-            stream.codec_context.flush_buffers()
-    if since_damage and last is not None:  # the rest of the file, by its stated duration
-        rest = _stated_duration(container, stream) - float((last - (stream.start_time or 0)) * time_base(stream))
-        damage.frames += max(0, round(rest * rate) - 1)
-
-
-def _packets(
-    container: InputContainer, stream: VideoStream, rate: float
-) -> Iterator[tuple[Packet[Stream] | None, str]]:
-    """Yield each packet with a description of the damage before or in it, "" if there is none. The last packet is the
-    empty one that flushes the decoder."""
-    import av
-
-    end, place, failures, stated = 0.0, 0, 0, _stated_duration(container, stream)
-    matroska = "matroska" in container.format.name
-    packets = container.demux()
-    while True:
-        try:
-            packet = next(packets)
-        except av.FFmpegError as error:
-            failures += 1
-            yield None, ffmpeg_reason(error)
-            if failures == _MAX_FAILURES:
-                return
-            packets = container.demux()  # continues at the current position
-            continue
-        failures = 0
-        # FFmpeg skips damaged parts of a Matroska file without an error.
-        missing = matroska and 0 < place < (packet.pos or 0) - _MAX_BYTES_BETWEEN_PACKETS
-        place = max(place, (packet.pos or 0) + packet.size)
-        if packet.stream is not stream:
-            continue
-        if packet.dts is None and not packet.size:
-            short = stated - end > max(_CUT_OFF_SECONDS, 2 / rate)
-            yield packet, f"its stated duration is {stated:.1f} s, it ends at {end:.1f} s" if short else ""
-            return
-        if packet.pts is not None:
-            end = max(end, float((packet.pts + (packet.duration or 0) - (stream.start_time or 0)) * time_base(stream)))
-        yield packet, "data is missing" if packet.is_corrupt or missing else ""
-
-
-def _stated_duration(container: InputContainer, stream: VideoStream) -> float:
-    """Return the duration that the container states for the video stream in seconds, 0 if it states none."""
-    if stream.duration:
-        return float(stream.duration * time_base(stream))
-    if clock := re.fullmatch(r"(\d+):(\d+):([\d.]+)", stream.metadata.get("DURATION", "")):
-        return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3])
-    # The container's duration is that of its longest stream, so it counts only if the video is the only stream.
-    return (container.duration or 0) / 1e6 if len(container.streams) == 1 else 0.0
+            if packet.size:
+                failures = 0
+                # MPEG-TS counts again from 0 where files were joined. This is no damage; what the decoder lacks is.
+                packet.is_corrupt = False
+                yield packet
+        yield None

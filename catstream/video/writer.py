@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from catstream.errors import VideoError
-from catstream.video.sound import Sound
 
 #: Steps of the video's time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100
@@ -24,15 +23,15 @@ _LARGE_PIXELS = 1920 * 1200
 class VideoWriter:
     """Writes an MP4; a context manager, which leaves no file if an error or Ctrl-C ends its block.
 
-    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed, and gets its final
-    name then. If no frame was written, or writing failed, no file is left: an MP4 without its index cannot be read.
+    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed. If no frame was
+    written, or writing failed, no file is left: an MP4 without its index cannot be read.
 
     Parameters
     ----------
     path : file to write
     rate : frames per second, on average
     size : (width, height) of the frames in pixels
-    sound : video file whose sound is copied, None for no sound
+    pixel_aspect : width of a pixel divided by its height
 
     Raises
     ------
@@ -40,7 +39,9 @@ class VideoWriter:
         From the constructor if the file cannot be written; later if a write fails.
     """
 
-    def __init__(self, path: str | Path, rate: float, size: tuple[int, int], *, sound: Path | None = None) -> None:
+    def __init__(
+        self, path: str | Path, rate: float, size: tuple[int, int], *, pixel_aspect: Fraction = Fraction(1)
+    ) -> None:
         import av  # imported here because only the writing of videos needs it
 
         self.path = Path(path)
@@ -69,7 +70,7 @@ class VideoWriter:
         self._stream.pix_fmt = "yuv420p"
         # Both encoders subsample colour by 2x2 pixels, so an odd side is padded by one pixel.
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
-        self._sound = Sound(sound, self._container)
+        self._stream.codec_context.sample_aspect_ratio = pixel_aspect
 
     def write(self, image: np.ndarray, time: float | None = None) -> None:
         """Add a frame.
@@ -91,7 +92,6 @@ class VideoWriter:
         frame = av.VideoFrame.from_ndarray(even, format="bgr24")
         frame.pts, frame.time_base = self._last_tick, self._stream.codec_context.time_base
         with self._reporting_errors():
-            self._sound.copy(self._first_time, time)
             self._container.mux(self._stream.encode(frame))
         self.frames += 1
 
@@ -105,7 +105,6 @@ class VideoWriter:
                 if self.frames:
                     self._part.replace(self.path)
         finally:
-            self._sound.close()
             with contextlib.suppress(OSError):  # the disk may have become read-only
                 self._part.unlink(missing_ok=True)
 

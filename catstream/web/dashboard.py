@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, FleetStatus, Health, Model, NodeStatus, Preview, State, StreamStatus, Track
-from catstream.video.palette import Colours
+from catstream.video.annotate import Colours
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")

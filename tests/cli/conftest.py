@@ -27,14 +27,13 @@ def whole_run(video, once, program):
 
     out     its results, with a video
     model   what it has learned
-    rec     its recording
     stdout  its tracks, as `--write -` prints them
     stderr  what it told
     """
 
     def run(folder):
         source, box = video
-        files = ["--output", "out", "--video", "--save-model", "model", "--record", "rec", "--write", "-"]
+        files = ["--output", "out", "--video", "--save-model", "model", "--write", "-"]
         with (folder / "stdout").open("w") as output, (folder / "stderr").open("w") as errors:
             command = [*program, "track", source, "--box", box, *files, "--lockstep"]
             subprocess.run(command, cwd=folder, stdout=output, stderr=errors, check=True)

@@ -43,7 +43,7 @@ def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_e
     pipeline = SimpleNamespace(live=False, frames=9, health={}, lost_seconds=0, holding="", totals={}, restarts=0)
     written = StringIO()
     console = Console(file=written, width=120, force_terminal=True, color_system=None, soft_wrap=True)
-    run = RunProgress(pipeline, ["carl"])
+    run = RunProgress(pipeline)
     with run.progress(console) as progress:
         for box in (Box(1, 2, 30, 40), None):
             seen = {"anna": Track(1, 0, 0.0, "present", box, 0.9, 7, object="anna")}
@@ -52,9 +52,8 @@ def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_e
     assert "1/2 present" in written.getvalue()
     assert "anna +0.90  ben +0.10" in written.getvalue()
     assert run.summary([]).splitlines()[1:] == [
-        "  1 carl: present in 0 of 0 frames, model version 0",
-        "  2 anna: present in 1 of 2 frames, model version 7",
-        "  3 ben: present in 0 of 2 frames, model version 4",
+        "  anna: present in 1 of 2 frames, model version 7",
+        "  ben: present in 0 of 2 frames, model version 4",
     ]
 
 

@@ -21,13 +21,5 @@ def test_render_only_starts_no_pipeline(succeed, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["demo.mp4", "groundtruth_rect.txt"]
 
 
-def test_several_objects_are_followed_and_measured(succeed, tmp_path):
-    output, _ = succeed("demo", "--objects", 3, "--output", tmp_path, "--frames", 20)
-    rates = re.findall(r"success rate of \w+: ([\d.]+)", output)
-    assert len(rates) == 3
-    assert sum(map(float, rates)) > 2.4  # the three processes are not in lockstep, so it varies
-    assert (tmp_path / "tracks" / "crowd.mp4").exists()
-
-
 def test_the_box_of_a_live_demo_is_printed(succeed):
     assert succeed("demo", "--live", "demo:1") == ("184,88,57,58\n", "")

@@ -1,4 +1,4 @@
-"""`catstream sink`, beside a pipeline that runs."""
+"""`catstream sink`, beside a pipeline that runs, and `catstream export` of what it has written."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ import signal
 import sqlite3
 import time
 from contextlib import closing
+from dataclasses import replace
 
-from catstream.messages.kinds import Health, Run, Track
+import pytest
+from mcap.reader import make_reader
+
+from catstream.messages.kinds import Health, Track
 from catstream.messages.names import counted
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.source import open_source
-from catstream.wire.channels import HEALTH, TRACKS, TRAINING
+from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.newest import Publisher
 
-FILES = ["tracks.ndjson", "tracks.sqlite", "walk.mp4", "t.parquet"]
+FILES = ["tracks.ndjson", "t.csv", "walk.mp4", "walk.mcap"]
 
 
 def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_path):
@@ -27,8 +31,7 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
         sinks = {}
         for folder in (whole, stopped):
             folder.mkdir()
-            files = [folder / name for name in FILES]
-            sinks[folder] = catstream("sink", *files, "--source", source, "--endpoint", pipeline.endpoint)
+            sinks[folder] = catstream("sink", *(folder / name for name in FILES), "--endpoint", pipeline.endpoint)
         waiting = set(sinks)
         for track in pipeline:
             if waiting := {folder for folder in waiting if not holds(folder) and sinks[folder].poll() is None}:
@@ -36,6 +39,7 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
             if track.frame > 30 and stopped not in waiting and sinks[stopped].poll() is None:
                 sinks[stopped].send_signal(signal.SIGINT)
                 sinks[stopped].wait(60)
+            time.sleep(0.02)  # pictures are sent ten times a second
         told = {folder: sink.communicate(timeout=60)[1] for folder, sink in sinks.items()}
     for folder, sink in sinks.items():
         assert sink.returncode == 0, told[folder]
@@ -54,11 +58,13 @@ def written(folder, errors):
     frames = [json.loads(line)["frame"] for line in (folder / "tracks.ndjson").read_text().splitlines()]
     assert frames == list(range(frames[0], frames[0] + len(frames)))
     assert f"{counted(len(frames), 'track')}, {frames[0]} missed" in errors, "those before it came"
-    with closing(sqlite3.connect(folder / "tracks.sqlite")) as database:
-        assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == frames
+    assert len((folder / "t.csv").read_text().splitlines()) == len(frames) + 1
     with open_source(str(folder / "walk.mp4")) as shown:
-        assert sum(1 for _ in shown) == len(frames)
-    assert (folder / "t.parquet").stat().st_size > 0
+        assert 0 < sum(1 for _ in shown) < len(frames)
+    with (folder / "walk.mcap").open("rb") as file:
+        found = [(channel.topic, json.loads(message.data)) for _, channel, message in make_reader(file).iter_messages()]
+    assert [fields["frame"] for topic, fields in found if topic == "tracks"] == frames
+    assert {topic for topic, _ in found} >= {"tracks", "models", "previews"}
     return frames
 
 
@@ -66,25 +72,19 @@ def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_end
     catstream, endpoint, tmp_path, until
 ):
     file = tmp_path / "tracks.ndjson"
-    with (
-        Publisher(HEALTH, endpoint, "detector") as health,
-        Publisher(TRACKS, endpoint) as tracks,
-        Publisher(
-            TRAINING, endpoint, first_message=Run.from_settings(Settings(run={"unstored_frames": 100}).portable())
-        ) as training,
-    ):
+    with Publisher(HEALTH, endpoint, "detector") as health:
         sink = catstream("sink", file, "--endpoint", endpoint)
         until(file.exists, lambda: health.send(Health("detector", time.time())))
 
-        def follow(first, last, written):
-            for frame in range(first, last):
-                tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
-            until(lambda: len(file.read_text().splitlines()) == written, training.serve_late_joiners)
+        def follow(run, *parts, written):
+            with Publisher(TRACKS, replace(endpoint, run=run)) as tracks:
+                until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
+                for frame in (frame for part in parts for frame in range(*part)):
+                    tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
+                until(lambda: len(file.read_text().splitlines()) == written, tracks.serve_late_joiners)
 
-        until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
-        follow(0, 300, written=300)
-        follow(205, 310, written=310)
-        follow(0, 200, written=310)
+        follow("first", (0, 300), (205, 310), written=310)
+        follow("second", (0, 200), written=310)
         errors = sink.communicate(timeout=60)[1]
     assert sink.returncode == 0, errors
     frames = [json.loads(line)["frame"] for line in file.read_text().splitlines()]
@@ -96,3 +96,23 @@ def test_without_a_pipeline_no_file_is_left(fail, tmp_path):
     error = fail("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
     assert "is a pipeline running there?" in error
     assert not (tmp_path / "tracks.csv").exists()
+
+
+def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, tmp_path):
+    log = whole_run / "out" / "demo.csv"
+    succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
+    with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
+        assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == list(range(32))
+    for _ in range(2):
+        succeed("export", log, tmp_path / "otb", "--format", "otb")
+    for name in ("demo.txt", "demo_confidence.value", "times/demo_time.txt"):
+        assert len((tmp_path / "otb" / name).read_text().splitlines()) == 32
+    assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
+
+
+@pytest.mark.parametrize(("log", "words"), [("none.csv", "is no log"), ("a.txt", "is no log"), ("a.csv", "no tracks")])
+def test_a_file_that_is_no_log_is_not_exported(fail, tmp_path, log, words):
+    for name in ("a.txt", "a.csv"):
+        (tmp_path / name).write_text("frame\nsomething else\n")
+    assert words in fail("export", tmp_path / log, tmp_path / "t.sqlite")
+    assert not (tmp_path / "t.sqlite").exists()

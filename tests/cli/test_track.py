@@ -14,35 +14,37 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from pyarrow import parquet
 
 from catstream.cli.common import RunProgress
+from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
-from catstream.sinks.lines import LineFile
+from catstream.sinks.track_log import LineSink, read_frames
 from catstream.video.source import open_source
 
-FILES = ["demo.csv", "demo.mp4", "demo.txt", "demo_confidence.value", "demo_time.txt"]
+FILES = ["demo.csv", "demo.mp4", "demo.ndjson"]
 
 
 def table(path):
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
-def test_it_writes_five_files_with_a_row_a_frame(whole_run):
+def frames_of(folder, name="demo"):
+    """The frames whose tracks are in the log."""
+    return [frame.number for frame, _ in read_frames(folder / f"{name}.ndjson")]
+
+
+def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
     out = whole_run / "out"
     assert "32 messages sent, 32 stored" in (whole_run / "stderr").read_text()
     assert sorted(file.name for file in out.iterdir()) == FILES
-    boxes = np.loadtxt(out / "demo.txt", delimiter=",")
-    assert boxes.shape == (32, 4)
-    assert np.loadtxt(out / "demo_confidence.value").shape == (32,)
-    assert (np.loadtxt(out / "demo_time.txt") >= 0).sum() == 32
     rows = table(out / "demo.csv")
-    assert list(rows[0]) == ["frame", "seconds", "state", "x", "y", "w", "h", "score", "model_version", "object"]
+    assert all(float(row["processing"]) >= 0 for row in rows)
     assert [int(row["frame"]) for row in rows] == list(range(32))
     assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
-    assert [row["x"] == "" for row in rows] == list(np.isnan(boxes[:, 0]))
+    assert (out / "demo.ndjson").read_text() == (whole_run / "stdout").read_text()
+    assert frames_of(out) == list(range(32))
     with open_source(out / "demo.mp4") as film:
         assert sum(1 for _ in film) == 32
 
@@ -60,13 +62,13 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
             assert np.median(difference) < 8
 
 
-def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, succeed, tmp_path):
+def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, catstream, tmp_path):
     source, box = video
     results = ["--output", tmp_path / "out", "--write", "-", "--save-model", tmp_path / "model"]
-    output, _ = succeed("track", source, "--box", box, *results, "--lockstep")
+    output, _ = catstream("track", source, "--box", box, *results, "--lockstep").communicate(timeout=60)
     assert output == (whole_run / "stdout").read_text()
     assert [json.loads(line)["frame"] for line in output.splitlines()] == list(range(32))
-    for file in ("model", "out/demo.txt", "out/demo_confidence.value", "out/demo.csv"):
+    for file in ("model", "out/demo.ndjson"):
         assert (tmp_path / file).read_bytes() == (whole_run / file).read_bytes()
     newest = int(table(tmp_path / "out" / "demo.csv")[-1]["model_version"])
     assert Learned.load(tmp_path / "model").model.version >= newest > 2
@@ -82,32 +84,21 @@ def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
     assert process.wait(60) == 1
 
 
-def test_the_files_of_an_object_never_have_the_names_of_another_ones(video, succeed, tmp_path):
-    source, box = video
-    boxes = ["--box", f"a={box}", "--box", f"a_time={box}"]
-    succeed("track", source, *boxes, "--output", tmp_path, "--end", 4)
-    assert len(np.loadtxt(tmp_path / "demo-a_time.txt", delimiter=",")) == 4
-    assert np.loadtxt(tmp_path / "demo-a_time.value").shape == (4,)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_stopped_run_keeps_its_results(long_video, catstream, until, tmp_path, number):
     source, box = long_video  # it is not over before the signal comes
-    more = ["--video", "--write", tmp_path / "t.parquet", "--write", tmp_path / "t.json"]
-    more += ["--save-model", tmp_path / "model", "--set", "run.unstored_frames=1", "--lockstep"]
+    more = ["--video", "--save-model", tmp_path / "model", "--set", "run.unstored_frames=1", "--lockstep"]
     heeded = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
     process = catstream("track", source, "--box", box, "--output", tmp_path, *more, preexec_fn=heeded)
-    children = started(process, tmp_path / "demo.txt")
-    until(lambda: len((tmp_path / "demo.txt").read_text().splitlines()) > 8)
+    children = started(process, tmp_path / "demo.ndjson")
+    until(lambda: len(frames_of(tmp_path)) > 8)
     process.send_signal(number)
     errors = process.communicate(timeout=60)[1]
     assert process.returncode == 130
     assert "the results so far are kept" in errors
-    rows = np.loadtxt(tmp_path / "demo.txt", delimiter=",", ndmin=2)
-    assert len(rows) >= 1
-    assert len((tmp_path / "demo.csv").read_text().splitlines()) == len(rows) + 1
-    assert parquet.read_table(tmp_path / "t.parquet").num_rows == len(rows)
-    assert len(json.loads((tmp_path / "t.json").read_text())) == len(rows)
+    rows = frames_of(tmp_path)
+    assert rows == list(range(len(rows)))
+    assert len(table(tmp_path / "demo.csv")) == len(rows)
     with open_source(tmp_path / "demo.mp4") as film:  # it may be short of the frame at which the signal came
         assert len(rows) - sum(1 for _ in film) in (0, 1)
     assert Learned.load(tmp_path / "model").model.version >= 1
@@ -132,7 +123,7 @@ def test_a_truncated_video_is_followed_up_to_the_break(video, fail, tmp_path):
     good = readable(broken)
     assert 0 < good < 32
     assert f"is damaged at frame {good}" in fail("track", broken, "--box", box, "--output", tmp_path / "out")
-    assert len((tmp_path / "out" / "broken.txt").read_text().splitlines()) == good
+    assert len(frames_of(tmp_path / "out", "broken")) == good
 
 
 def test_damaged_frames_are_skipped_if_requested_and_counted(video, succeed, tmp_path):
@@ -146,7 +137,7 @@ def test_damaged_frames_are_skipped_if_requested_and_counted(video, succeed, tmp
         good = sum(1 for _ in whole)
     _, errors = succeed("track", damaged, "--box", box, "--output", tmp_path / "out", "--skip-damaged")
     assert "frames could not be decoded, and skipped" in errors
-    assert readable(damaged) < len((tmp_path / "out" / "damaged.txt").read_text().splitlines()) == good < 32
+    assert readable(damaged) < len(frames_of(tmp_path / "out", "damaged")) == good < 32
 
 
 def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succeed, tmp_path):
@@ -158,10 +149,10 @@ def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succee
             cv2.imwrite(str(images / f"{frame.number}.png"), frame.image[: -8 if frame.number == 10 else None])
     error = fail("track", images, "--box", box, "--output", tmp_path / "out")
     assert all(word in error for word in ("one size", "10.png", "--resize"))
-    assert len((tmp_path / "out" / "walk.txt").read_text().splitlines()) == 10
+    assert len(frames_of(tmp_path / "out", "walk")) == 10
     files = ["--output", tmp_path / "all", "--video"]
     succeed("track", images, "--box", box, *files, "--resize")
-    assert len((tmp_path / "all" / "walk.txt").read_text().splitlines()) == 12
+    assert len(frames_of(tmp_path / "all", "walk")) == 12
     with open_source(tmp_path / "all" / "walk.mp4") as film:
         assert sum(1 for _ in film) == 12
 
@@ -185,9 +176,6 @@ REJECTED = {
         "1000 objects are more than 32",
     ),
     "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "give one of them"),
-    "models of two objects in one file": (["--save-model", "a=m", "--save-model", "b=m"], "named twice"),
-    "a model and a recording in one file": (["--save-model", "m", "--record", "m"], "named twice"),
-    "a model and tracks in one file": (["--save-model", "m.csv", "--write", "m.csv"], "named twice"),
     "a model of several objects": (["--box", "a=1,2,30,40", "--box", "b=1,2,30,40", "--save-model", "m"], "NAME=FILE"),
     "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
     "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
@@ -214,11 +202,11 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     source, box = video
     folder = tmp_path / "file" if output == "a file" else Path(output)
     (tmp_path / "file").write_text("mine\n")
-    assert "cannot write results" in fail("track", source, "--box", box, "--output", folder)
+    assert "a folder that exists and that you may write to" in fail("track", source, "--box", box, "--output", folder)
     assert (tmp_path / "file").read_text() == "mine\n"
 
 
-@pytest.mark.parametrize("file", ["demo.txt", "demo.mp4.part"])
+@pytest.mark.parametrize("file", ["demo.ndjson", "demo.mp4.part"])
 def test_a_full_disk_ends_the_run_with_one_line(video, fail, tmp_path, file):
     source, box = video
     (tmp_path / file).symlink_to("/dev/full")
@@ -232,12 +220,12 @@ def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_no
     nohup = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
     results = ["--output", tmp_path / "one", "--video"]
     first = catstream("track", source, "--box", box, *results, *slowly, *place, preexec_fn=nohup)
-    started(first, tmp_path / "one" / "demo.txt")
+    started(first, tmp_path / "one" / "demo.ndjson")
     first.send_signal(signal.SIGHUP)
     assert "already running" in fail("track", source, "--box", box, "--output", tmp_path / "two", *place)
     assert not (tmp_path / "two").exists()
     assert first.wait(120) == 0
-    assert len((tmp_path / "one" / "demo.txt").read_text().splitlines()) == 32
+    assert frames_of(tmp_path / "one") == list(range(32))
     with open_source(tmp_path / "one" / "demo.mp4") as film:
         assert sum(1 for _ in film) == 32
 
@@ -296,14 +284,14 @@ def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video,
 
 
 def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, said, monkeypatch, tmp_path):
-    tracking, close = [], LineFile.close
+    tracking, close = [], LineSink.close
 
     def closed(sink):
         tracking.extend(each for each in psutil.Process().children(recursive=True) if each.name() == "detector")
         close(sink)
 
     monkeypatch.setattr(RunProgress, "show", lambda *_: signal.raise_signal(signal.SIGINT))
-    monkeypatch.setattr(LineFile, "close", closed)
+    monkeypatch.setattr(LineSink, "close", closed)
     source, box = video
     code, _, errors = said("track", source, "--box", box, "--write", tmp_path / "t.ndjson")
     assert (code, tracking) == (130, []), errors
@@ -324,3 +312,13 @@ def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_
     assert "c" in last
     _, errors = succeed("track", source, "--box", f"a={box}", "--save-model", tmp_path / "only", "--end", 12)
     assert "there is no object" not in errors, "without a name, the only one is meant"
+
+
+def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video, catstream, succeed, endpoint):
+    source, box = video
+    run = catstream("track", source, "--box", box, "--paused", "--set", f"run.endpoint={endpoint}")
+    assert "paused: to continue, catstream resume --endpoint" in run.stderr.readline()
+    with subscribe(endpoint, "tracks", timeout=60) as tracks:
+        succeed("resume", "--endpoint", endpoint)
+        assert [track.frame for track in tracks] == list(range(32))
+    assert run.wait(60) == 0

@@ -16,7 +16,7 @@ import pytest
 from catstream.box import Box
 from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
-from catstream.video.demo import render
+from catstream.video.rendered import render
 
 PYTHON = Path("/usr/bin/python3")  # the one that Debian's packages are for
 SERVER = Path(__file__).with_name("rtsp_server.py")
@@ -75,7 +75,7 @@ class Run:
         errors = self.process.communicate(timeout=60)[1]
         assert self.process.returncode == 130
         rows = list(csv.DictReader((self.output / "one.csv").read_text().splitlines()))
-        assert len((self.output / "one.txt").read_text().splitlines()) == len(rows)
+        assert len((self.output / "one.ndjson").read_text().splitlines()) == len(rows)
         return rows, errors
 
 

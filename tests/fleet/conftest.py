@@ -12,7 +12,7 @@ from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.video.live_demo import first_box
 
 FRAMES = 32
-LIVE = "demo:1?rate=10"
+LIVE = "demo:1"
 
 
 @pytest.fixture(scope="session")

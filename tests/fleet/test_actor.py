@@ -18,7 +18,7 @@ from catstream.fleet.store import Claim, Store
 from catstream.video.live_demo import first_box
 
 FRAMES = 60
-LIVE = "demo:1?rate=10"
+LIVE = "demo:1"
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from sklearn.decomposition import sparse_encode
 from catstream.box import Box
 from catstream.paper import scm
 from catstream.paper.scm import SparseCollaborativeModel
-from catstream.video import demo
+from catstream.video import rendered
 
 START = Box(60, 50, 48, 40)
 
@@ -41,7 +41,7 @@ def test_codes_of_equal_atoms_rebuild_the_row(rng):
 
 
 def test_the_demos_object_is_followed():
-    frames, truth = zip(*demo.render(40, (320, 240)), strict=True)
+    frames, truth = zip(*rendered.render(40, (320, 240)), strict=True)
     found = followed(frames, truth[0])
     assert min(found_box.overlap(box) for (_, found_box), box in zip(found, truth[1:], strict=True)) > 0.5
 

@@ -113,8 +113,8 @@ def test_a_pipeline_is_copied_before_its_start_only(pipeline, made):
 @pytest.mark.timeout(60)
 def test_a_run_of_a_live_source_is_resumed_with_its_first_frame(tmp_path):
     """The second frame would come after 100 s."""
-    source = "demo:1?rate=0.01"
-    with Pipeline(source, first_box(source), state=tmp_path / "kept") as pipeline:
+    source = "demo:1"
+    with Pipeline(source, first_box(source), {"run.image_rate": 0.01}, state=tmp_path / "kept") as pipeline:
         before = next(iter(pipeline))
     with Pipeline(resume=tmp_path / "kept") as pipeline:
         assert next(iter(pipeline)).frame == before.frame + 1

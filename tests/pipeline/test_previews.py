@@ -12,7 +12,7 @@ from catstream.box import Box
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.services.previews import Previews
-from catstream.video.demo import render
+from catstream.video.rendered import render
 
 
 @pytest.fixture

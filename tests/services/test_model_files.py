@@ -17,7 +17,7 @@ from catstream.services.detector import DetectorLoop
 from catstream.services.loop import Process
 from catstream.services.model_files import ModelFiles
 from catstream.settings import Settings
-from catstream.video.demo import render
+from catstream.video.rendered import render
 
 
 @pytest.fixture(scope="module")

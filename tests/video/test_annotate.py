@@ -1,19 +1,22 @@
-"""Annotated video: every frame, any size, whole or not there."""
+"""Annotated video: every frame, any size, whole or not there; colours that can be told apart, and stay."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
+from itertools import combinations
 
-import av
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as some
 
+from catstream.applications.html.page import COLOURS
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
-from catstream.video.annotate import draw, drawn_size, thumbnail
-from catstream.video.palette import Colours, rgb
+from catstream.video.annotate import PALETTE, Colours, draw, drawn_size, thumbnail
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 
@@ -62,7 +65,7 @@ def test_each_object_is_drawn_in_its_own_colour_which_stays(rng):
 
 
 def has_colour(image, colour):
-    red, green, blue = rgb(colour)
+    red, green, blue = bytes.fromhex(colour[1:])
     return (image == (blue, green, red)).all(axis=2).sum() > 9
 
 
@@ -100,35 +103,11 @@ def test_frames_keep_the_time_stamps_of_the_source(tmp_path, rate, times, precis
         assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=precision)
 
 
-@pytest.fixture
-def with_sound(tmp_path):
-    """A video of 4 s with a tone that begins after 2 s."""
-    path = tmp_path / "sound.mp4"
-    with av.open(str(path), "w") as container:
-        picture, tone = container.add_stream("mpeg4", rate=25), container.add_stream("aac", rate=16000, layout="mono")
-        picture.width = picture.height = 64
-        picture.pix_fmt = "yuv420p"
-        for _ in range(100):
-            container.mux(picture.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), format="bgr24")))
-        for start in range(0, 64000, 1000):
-            wave = np.sin(np.arange(start, start + 1000) * 0.3) * (start >= 32000)
-            samples = av.AudioFrame.from_ndarray(wave[None].astype(np.float32), format="fltp", layout="mono")
-            samples.sample_rate, samples.pts = 16000, start
-            container.mux(tone.encode(samples))
-        container.mux([*picture.encode(None), *tone.encode(None)])
-    return path
-
-
-@pytest.mark.parametrize("first", [0, 25])
-def test_the_sound_of_the_source_keeps_its_time(tmp_path, with_sound, first):
-    source = open_source(with_sound, part=slice(first, None))
-    with source, VideoWriter(tmp_path / "out.mp4", source.rate, source.size, sound=source.sound) as video:
-        for frame in source:
-            video.write(frame.image, frame.time)
-    with av.open(str(tmp_path / "out.mp4")) as container:
-        heard = [(frame.time, np.abs(frame.to_ndarray()).max() > 0.5) for frame in container.decode(audio=0)]
-    assert min(time for time, loud in heard if loud) == pytest.approx(2 - first / 25, abs=0.15)
-    assert heard[-1][0] == pytest.approx(4 - first / 25, abs=0.15)
+def test_pixels_keep_their_aspect(tmp_path):
+    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64), pixel_aspect=Fraction(2)) as video:
+        video.write(np.zeros((64, 64, 3), np.uint8))
+    with open_source(tmp_path / "out.mp4") as source:
+        assert source.pixel_aspect == 2
 
 
 def test_a_video_without_frames_leaves_no_file(tmp_path):
@@ -181,3 +160,61 @@ def test_a_thumbnail_shows_both_boxes():
     assert small.shape == (100, 200, 3)
     assert small[40, 20].mean() > 180
     assert abs(small[80, 150].astype(int) - 128).max() < 10
+
+
+#: Linear red, green, blue as people of each kind of vision see them (Machado and others, 2009, severity 1).
+VISIONS = {
+    "normal": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+#: Linear red, green, blue to the responses of the cones, and their cube roots to lightness and two axes of colour.
+CONES = [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]
+OKLAB = [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
+
+
+def linear(colour):
+    share = np.array(list(bytes.fromhex(colour[1:]))) / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def oklab(colour, vision):
+    return np.array(OKLAB) @ np.cbrt(np.array(CONES) @ np.clip(np.array(vision) @ linear(colour), 0, 1))
+
+
+@pytest.mark.parametrize(
+    ("colours", "kinds", "apart"),
+    [(PALETTE, VISIONS.keys(), 0.09), (COLOURS, VISIONS.keys() - {"tritanopia"}, 0.1)],
+    ids=["objects", "curves"],
+)
+def test_any_two_colours_are_distinguishable_also_for_colour_blind_people(colours, kinds, apart):
+    # The eight colours of Okabe and Ito are 0.02 to 0.12 apart in the same measure.
+    for kind in kinds:
+        seen = [oklab(colour, VISIONS[kind]) for colour in colours]
+        assert min(np.linalg.norm(one - other) for one, other in combinations(seen, 2)) > apart, kind
+
+
+@pytest.mark.parametrize("colour", PALETTE)
+def test_dark_text_on_a_colour_is_readable(colour):
+    luminance, dark = np.dot([0.2126, 0.7152, 0.0722], linear(colour)), 0.0056  # of #111
+    assert (luminance + 0.05) / (dark + 0.05) >= 4.5
+
+
+@given(some.lists(some.tuples(some.booleans(), some.sampled_from("abcdefghijkl"))))
+def test_a_colour_stays_while_its_object_lives_and_is_shared_only_if_all_are_used(events):
+    colours, living = Colours(), {}
+    for comes, name in events:
+        if comes:
+            before = living.setdefault(name, colours.of(name))
+            assert colours.of(name) == before
+        else:
+            living.pop(name, None)
+            colours.keep(living)
+        assert {name: colours.of(name) for name in living} == living
+
+
+@given(some.sets(some.text(), max_size=len(PALETTE)))
+def test_as_many_objects_as_colours_have_different_ones(names):
+    colours = Colours()
+    assert len({colours.of(name) for name in names}) == len(names)

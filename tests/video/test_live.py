@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import av
 import numpy as np
@@ -95,6 +96,44 @@ def test_a_camera_that_sends_no_frames_is_reopened(camera, monkeypatch, caplog, 
         next(source)
     assert "one is lost (no frame arrives)" in caplog.text
     assert "one is back after" in caplog.text
+
+
+def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_path, monkeypatch, caplog, until):
+    monkeypatch.setattr(live, "_SILENT_SECONDS", 0.5)
+    with av.open(str(tmp_path / "a.ts"), "w") as container:
+        picture, tone = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=48000)
+        picture.width, picture.height, picture.pix_fmt = 128, 96, "yuv420p"
+        packets = [
+            packet
+            for number in range(25)
+            for packet in picture.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24"))
+        ]
+        samples = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 48000 * 20), np.int16), "s16", "stereo")
+        samples.sample_rate = 48000
+        container.mux([*packets, *picture.encode(None), *tone.encode(samples), *tone.encode(None)])
+    data = (tmp_path / "a.ts").read_bytes()
+
+    class Camera(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.end_headers()
+            with suppress(OSError):
+                for start in range(0, len(data), len(data) // 200):
+                    self.wfile.write(data[start : start + len(data) // 200])
+                    time.sleep(0.3 if start > len(data) // 4 else 0)
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Camera) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        with open_source(f"http://127.0.0.1:{server.server_port}/a.ts") as source:
+            began = time.monotonic()
+            until(lambda: source.reopened)
+            assert time.monotonic() - began < 20, "the sound lasts longer"
+        server.shutdown()
+    assert "(no frame arrives)" in caplog.text
 
 
 def test_the_reason_of_a_loss_is_logged_once(camera, monkeypatch, caplog, until):

@@ -6,6 +6,7 @@ import os
 import struct
 import tempfile
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from catstream.errors import VideoError
 from catstream.video.frames import Source
 from catstream.video.source import open_source
 
-CODECS = {".mp4": "libx264", ".mkv": "libx264", ".ts": "libx264", ".avi": "mjpeg", ".mpg": "mpeg2video"}
+H264 = dict.fromkeys((".mp4", ".mkv", ".ts", ".mov", ".h264", ".flv", ".MTS"), "libx264")
+CODECS = {**H264, ".avi": "mjpeg", ".mpg": "mpeg2video", ".wmv": "wmv2"}
 
 
 @cache
@@ -38,26 +40,47 @@ def number_of(image: np.ndarray) -> int:
 
 
 @cache
-def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotation: int) -> bytes:
-    """A file of numbered frames, which many tests read."""
+def encoded(
+    suffix: str,
+    frames: int = 100,
+    options: tuple[tuple[str, str], ...] = (),
+    rotation: int = 0,
+    times: tuple[float, ...] = (),
+    sound: float = 0.0,
+    title: str = "",
+) -> bytes:
+    """A file of numbered frames, which many tests read.
+
+    options  of the container, and with the prefix v: of the codec
+    times    time stamps of the frames in seconds; empty for 25 frames per second
+    sound    seconds of a sound track
+    """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"a{suffix}")
+        path, codec = Path(folder, f"a{suffix}"), CODECS[suffix]
         # The same bytes in each run: Matroska has random identifiers, x264's macroblock tree is chaotic.
-        muxing = {
-            "fflags": "bitexact",
-            "cluster_time_limit": "400",
-            **dict(options),
-        }  # a long Matroska has many clusters
+        muxing = {"fflags": "bitexact", "cluster_time_limit": "400"}  # a long Matroska has many clusters
+        coding = {"preset": "superfast"} if codec == "libx264" else {}
+        for key, value in options:
+            (coding if key.startswith("v:") else muxing)[key.removeprefix("v:")] = value
         with av.open(str(path), "w", options=muxing) as container:
-            quick = {"preset": "superfast"} if CODECS[suffix] == "libx264" else {}
-            stream: Any = container.add_stream(CODECS[suffix], rate=25, options=quick)
+            container.metadata["title"] = title
+            stream: Any = container.add_stream(codec, rate=25, options=coding)
             stream.width, stream.height = 160, 120
-            stream.pix_fmt = "yuvj420p" if suffix == ".avi" else "yuv420p"
+            stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            tone: Any = container.add_stream("aac", rate=16000, layout="mono") if sound else None
             if rotation:
                 stream.set_display_rotation(rotation)
             for number in range(frames):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+                frame = av.VideoFrame.from_ndarray(numbered(number), format="bgr24")
+                if times:
+                    frame.pts, frame.time_base = round(1000 * times[number]), Fraction(1, 1000)
+                    stream.codec_context.time_base = frame.time_base
+                container.mux(stream.encode(frame))
             container.mux(stream.encode(None))
+            if sound:
+                samples = av.AudioFrame.from_ndarray(np.zeros((1, round(16000 * sound)), np.float32), "fltp", "mono")
+                samples.sample_rate = 16000
+                container.mux([*tone.encode(samples), *tone.encode(None)])
         return path.read_bytes()
 
 
@@ -65,12 +88,12 @@ def encoded(suffix: str, frames: int, options: frozenset[tuple[str, str]], rotat
 def video(tmp_path: Path) -> Callable[..., Path]:
     """Writes a video of numbered frames; the ending of its name says which kind."""
 
-    def write(name: str, frames: int = 100, options: dict[str, str] | None = None, rotation: int = 0) -> Path:
+    def write(name: str, frames: int = 100, options: dict[str, str] | None = None, **others: Any) -> Path:
         path = tmp_path / name
         codec = CODECS[path.suffix]
         if codec not in av.codecs_available:
             pytest.skip(f"this FFmpeg cannot write {codec}")
-        path.write_bytes(encoded(path.suffix, frames, frozenset((options or {}).items()), rotation))
+        path.write_bytes(encoded(path.suffix, frames, tuple((options or {}).items()), **others))
         return path
 
     return write
@@ -91,9 +114,9 @@ def images(tmp_path: Path) -> Callable[..., Path]:
 
     def write(folder: str, names: list[str] | int) -> Path:
         path = tmp_path / folder
-        path.mkdir(parents=True)
         for number, name in enumerate([f"{k}.png" for k in range(names)] if isinstance(names, int) else names):
-            cv2.imwrite(str(path / name), numbered(number))
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            (path / name).write_bytes(cv2.imencode(Path(name).suffix, numbered(number))[1].tobytes())
         return path
 
     return write
@@ -158,34 +181,158 @@ def test_frames_of_a_part_keep_their_time_stamps(video, name, part):
 
 
 def test_damage_after_a_part_is_no_error(video):
-    path = video("a.mpg")
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    path = damaged(video("a.mpg"), 0.5)
     good, _ = broken(path)
     assert numbers(open_source(path, part=slice(5, len(good)))) == good[5:]
 
 
 @KINDS
 @pytest.mark.parametrize("share", [0.31, 0.6, 0.83])
-def test_a_truncated_video_returns_its_good_frames_and_then_an_error_with_the_frame_number(video, name, share):
+def test_a_truncated_video_returns_its_good_frames_in_order(video, name, share):
     path = video(name, options={"movflags": "faststart"} if name.endswith("mp4") else None)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * share)])
+    found = numbers(open_source(path, skip_damaged=True))
+    assert found == sorted(set(found))
+    assert found[:3] == [0, 1, 2]
+    assert found[-1] < 99
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mpg"])
+def test_what_ffmpeg_cannot_decode_is_an_error_after_the_frames_before_it(video, name):
+    path = damaged(video(name), 0.5)
     good, message = broken(path)
     assert good == list(range(len(good)))
-    assert 2 < len(good) < 100
-    assert f"frame {len(good)} " in message or f"after frame {len(good) - 1}:" in message
-    with open_source(path, skip_damaged=True) as source:
-        read = len(list(source)) + source.counters.get("damaged", 0)
-    if path.suffix in (".mp4", ".mkv"):  # which state how long they were
-        assert read == pytest.approx(100, abs=1)
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.mpg"])
-def test_damage_in_the_middle_is_an_error_after_the_frames_before_it(video, name):
-    good, message = broken(damaged(video(name), 0.5))
-    assert good == list(range(len(good)))
     assert 20 < len(good) < 80
-    assert "is damaged at frame" in message
+    assert f"{str(path)!r} is damaged at frame {len(good)} (" in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.mpg"])
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_with_skip_damaged_reading_goes_on_at_the_next_key_frame_and_frames_keep_their_times(video, name, share):
+    path = damaged(video(name, options={"v:g": "10"}), share)
+    with open_source(path, skip_damaged=True) as source:
+        found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
+        lost = source.counters.get("damaged", 0)
+    shown = [number for _, _, number in found]
+    assert [number for number, _, _ in found] == list(range(len(found)))
+    assert shown == sorted(set(shown))
+    assert (shown[0], shown[-1]) == (0, 99)
+    assert lost <= 100 - len(shown) + 1 < 40  # a container may pass over a damaged place without a word
+    if path.suffix != ".avi":  # which counts frames in the place of times
+        assert [time for _, time, _ in found] == pytest.approx([number / 25 for number in shown], abs=0.002)
+    with open_source(path, 20, skip_damaged=True) as source:
+        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[20:]
+
+
+def laced_matroska(path: Path) -> Path:
+    """A Matroska file of 50 JPEGs, with blocks of sound that hold 8 frames each, as mkvmerge writes them."""
+
+    def element(name: str, content: bytes) -> bytes:
+        return bytes.fromhex(name) + struct.pack(">Q", len(content) | 1 << 56) + content
+
+    def number(name: str, value: int) -> bytes:
+        return element(name, value.to_bytes(4))
+
+    def track(index: int, kind: int, codec: bytes, content: bytes) -> bytes:
+        numbers = number("D7", index) + number("73C5", index) + number("83", kind)
+        return element("AE", numbers + element("86", codec) + content)
+
+    picture = track(1, 1, b"V_MJPEG", element("E0", number("B0", 160) + number("BA", 120)))
+    tone = element("B5", struct.pack(">d", 48000.0)) + number("9F", 2) + number("6264", 16)
+    tracks = picture + track(2, 2, b"A_PCM/INT/LIT", element("E1", tone))
+    clusters = b""
+    for count in range(50):
+        jpeg = cv2.imencode(".jpg", numbered(count))[1].tobytes()
+        blocks = element("A3", b"\x81\0\0\x80" + jpeg) + element("A3", b"\x82\0\0\x84\x07" + bytes(7680))
+        clusters += element("1F43B675", number("E7", 40 * count) + blocks)
+    head = element("1A45DFA3", element("4282", b"matroska"))
+    info = element("1549A966", number("2AD7B1", 1000000))
+    path.write_bytes(head + element("18538067", info + element("1654AE6B", tracks) + clusters))
+    return path
+
+
+#: Whole files that something is unusual about: the name, and what `video` is given for it.
+LATE = tuple(5 + number / 25 for number in range(60))
+WHOLE: dict[str, tuple[str, dict[str, Any]]] = {
+    "sound outlasts the picture": ("a.mp4", {"sound": 9.0}),
+    "the video begins late": ("a.mkv", {"times": LATE}),
+    "frames that repeat the last one": ("a.avi", {"times": tuple(n / 25 if n < 30 else n / 25 + 1 for n in range(60))}),
+    "B-frames in an AVI": ("b.avi", {"options": {"v:bf": "3"}}),
+    "a title that is not UTF-8": ("a.mkv", {"title": "XXXXXXXX"}),
+    "a name that is not UTF-8": (os.fsdecode(b"caf\xe9.mp4"), {}),
+    "a suffix of a camcorder": ("00001.MTS", {}),
+}
+
+
+@pytest.mark.parametrize(("name", "others"), WHOLE.values(), ids=WHOLE)
+def test_a_whole_file_is_read_to_its_last_frame_and_its_times_grow(video, name, others, monkeypatch):
+    if name == "b.avi":
+        monkeypatch.setitem(CODECS, ".avi", "libx264")
+    path = video(name, 60, **others)
+    path.write_bytes(path.read_bytes().replace(b"XXXXXXXX", "обработ".encode("cp1251") + b"!"))
+    for skip in (False, True):
+        with open_source(path, skip_damaged=skip) as source:
+            frames = list(source)
+            assert not source.counters
+            assert source.frames == 60
+        assert [number_of(frame.image) for frame in frames] == list(range(60))
+        wanted = np.subtract(others.get("times", LATE), others.get("times", LATE)[0])
+        assert [frame.time for frame in frames] == pytest.approx(wanted, abs=0.002)
+
+
+def test_a_matroska_file_with_laced_sound_is_whole(tmp_path):
+    assert numbers(open_source(laced_matroska(tmp_path / "a.mkv"))) == list(range(50))
+
+
+@pytest.mark.parametrize("name", ["joined.ts", "list.m3u8"])
+def test_joined_segments_are_read_to_the_end_and_time_goes_on(video, tmp_path, name):
+    part = video("part.ts", 30, options={"v:bf": "2"})
+    (tmp_path / "joined.ts").write_bytes(3 * part.read_bytes())
+    (tmp_path / "list.m3u8").write_text(
+        "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:2\n"
+        + "#EXT-X-DISCONTINUITY\n".join(3 * ["#EXTINF:1.2,\npart.ts\n"])
+        + "#EXT-X-ENDLIST\n"
+    )
+    with open_source(tmp_path / name) as source:
+        found = [(number_of(frame.image), frame.time) for frame in source]
+    assert [number for number, _ in found] == 3 * list(range(30))
+    assert [time for _, time in found] == pytest.approx([number / 25 for number in range(90)], abs=0.002)
+
+
+def test_the_whole_segment_after_a_torn_one_is_read(video):
+    path = video("a.ts", 30, options={"v:bf": "2"})
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 376 * 188] + whole)
+    with open_source(path, skip_damaged=True) as source:
+        found = [number_of(frame.image) for frame in source]
+        assert 0 < source.counters["damaged"] < 4
+    assert found[-30:] == list(range(30))
+    assert len(found) > 40
+
+
+def test_a_stream_without_a_container_has_the_rate_that_it_states(video):
+    path = video("a.h264", 20, options={"v:x264-params": "fps=50/1:force-cfr=1"})
+    with open_source(path) as source:
+        assert source.rate == pytest.approx(50)
+        assert [frame.time for frame in source] == pytest.approx([number / 50 for number in range(20)])
+
+
+def test_a_video_that_changes_its_size_ends_there_or_is_scaled(video, tmp_path):
+    large = tmp_path / "large.ts"
+    with av.open(str(large), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for number in range(30, 40):
+            image = cv2.resize(numbered(number), (320, 240))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode(None))
+    path = video("a.ts", 30)
+    path.write_bytes(path.read_bytes() + large.read_bytes())
+    good, message = broken(path)
+    assert (good, "(frame 30) is 320x240, the first 160x120" in message) == (list(range(30)), True)
+    assert numbers(open_source(path, resize=True)) == list(range(40))
 
 
 def test_a_video_without_its_index_is_an_error(video):
@@ -219,47 +366,65 @@ def test_a_closed_source_has_no_frames(video):
 
 # --- images ------------------------------------------------------------------------------------------
 
+SEVEN = [f"{number:05d}.png" for number in range(7)]
+LATIN = os.fsdecode(b"caf\xe9")
+#: Names of images, what is opened, and the numbers of the images that are read.
+OPENED = {
+    "in natural order": ([f"{number}.png" for number in range(12)], "walk", list(range(12))),
+    **{pattern: (SEVEN, f"walk/{pattern}", list(range(7))) for pattern in ("%05d.png", "%d.png", "*.png", "000??.png")},
+    "a class of letters": (SEVEN, "walk/0000[2-4].png", [2, 3, 4]),
+    "names that match": (["left1.png", "left2.png", "right1.png", "right2.png"], "walk/right%d.png", [2, 3]),
+    **{
+        inner: ([f"{inner}/1.jpg", f"{inner}/2.jpg", "else/3.jpg"], "walk", [0, 1]) for inner in ("img", "color", "rgb")
+    },
+    "without hidden files": ([".0000.png", "0001.png"], "walk", [1]),
+    "digits that are not decimal": (["²2.png", "²10.png"], "walk", [0, 1]),
+    "names that are not UTF-8": ([f"{LATIN}/1{LATIN}.png", f"{LATIN}/2{LATIN}.png"], f"walk/{LATIN}", [0, 1]),
+}
 
-def test_images_of_a_folder_are_read_in_natural_order(images):
-    folder = images("walk", 12)
-    source = open_source(folder)
-    assert (source.name, source.frames, source.size) == ("walk", 12, (160, 120))
-    assert numbers(source) == list(range(12))
 
-
-@pytest.mark.parametrize("pattern", ["%05d.png", "%d.png", "*.png", "000??.png", "0000[0-9].png"])
-def test_patterns_of_both_kinds(images, pattern):
-    folder = images("walk", [f"{number:05d}.png" for number in range(7)])
+@pytest.mark.parametrize(("names", "opened", "wanted"), OPENED.values(), ids=OPENED)
+def test_the_images_of_a_folder_or_a_pattern_are_read_in_order(images, names, opened, wanted):
+    folder = images("walk", names)
     (folder / "note.txt").write_text("not an image")
-    source = open_source(folder / pattern)
-    assert source.name == "walk"
-    assert numbers(source) == list(range(7))
+    with open_source(folder.parent / opened, image_rate=10.0) as source:
+        assert (source.frames, source.size, source.rate) == (len(wanted), (160, 120), 10)
+        assert source.name == (LATIN if LATIN in opened else "walk")
+        frames = list(source)
+        assert list(source) == []
+    assert [number_of(frame.image) for frame in frames] == wanted
+    assert [frame.time for frame in frames] == pytest.approx([number / 10 for number in range(len(wanted))])
 
 
-def test_a_pattern_selects_only_the_names_that_match_it(images):
-    folder = images("walk", ["left1.png", "left2.png", "right1.png", "right2.png"])
-    assert numbers(open_source(folder / "right%d.png")) == [2, 3]
+def test_a_folder_opens_by_its_only_video(video, tmp_path):
+    path = video("a.MTS", frames=2)
+    for name in ("._a.avi", "._cover.jpg", "groundtruth_rect.txt"):
+        (tmp_path / name).write_bytes(b"no video")
+    assert numbers(open_source(tmp_path)) == numbers(open_source(path.as_uri())) == [0, 1]
+    video("b.avi", frames=1)
+    with pytest.raises(VideoError, match="2 videos"):
+        open_source(tmp_path)
 
 
-@pytest.mark.parametrize("inner", ["img", "imgs", "color", "rgb"])
-def test_a_sequence_folder_opens_by_its_images(images, inner):
-    images(f"walk/{inner}", ["0001.jpg", "0002.jpg"])
-    source = open_source(images("walk/else", []).parent)
-    assert source.name == "walk"
-    assert numbers(source) == [0, 1]
+HUGE = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
+UNREADABLE = {
+    "of another size": (cv2.imencode(".png", numbered(3, width=150))[1].tobytes(), ["150x120", "160x120", "--resize"]),
+    "a text": (b"nothing", ["cannot read the image", "(frame 3): replace or remove it"]),
+    "empty": (b"", ["cannot read the image"]),
+    "a JPEG that is cut off": (cv2.imencode(".jpg", numbered(3))[1].tobytes()[:-500], ["cannot read the image"]),
+    "of more pixels than OpenCV reads": (HUGE, ["cannot read the image"]),
+    "of floats": (cv2.imencode(".tiff", np.zeros((20, 30, 3), np.float32))[1].tobytes(), ["cannot read the image"]),
+}
 
 
-def test_a_sequence_folder_opens_by_its_only_video(video, tmp_path):
-    folder = tmp_path / "walk"
-    folder.mkdir()
-    video("a.avi", frames=3).rename(folder / "a.avi")
-    (folder / "groundtruth_rect.txt").write_text("1,2,3,4\n" * 3)
-    assert numbers(open_source(folder)) == [0, 1, 2]
-
-
-def test_hidden_files_are_not_frames(images):
-    folder = images("walk", [".0000.png", "0001.png"])
-    assert numbers(open_source(folder)) == [1]
+@pytest.mark.parametrize(("content", "words"), UNREADABLE.values(), ids=UNREADABLE)
+def test_the_first_image_that_cannot_be_used_is_named(images, capfd, content, words):
+    folder = images("walk", 5)
+    (folder / "3.png").write_bytes(content)
+    good, message = broken(folder)
+    assert good == [0, 1, 2]
+    assert all(word in message for word in ["3.png", *words])
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("part", [slice(None), *PARTS], ids=str)
@@ -271,65 +436,16 @@ def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
     assert found == list(enumerate(wanted))[2:]
 
 
-@KINDS
-@pytest.mark.parametrize("share", [0.3, 0.7])
-def test_damage_is_skipped_if_requested_and_frames_keep_their_time_stamps(video, name, share):
-    path = damaged(video(name), share)
-    with open_source(path, skip_damaged=True) as source:
-        found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
-        lost = source.counters.get("damaged", 0)  # a container may pass over a damaged place without a word
-    shown = [number for _, _, number in found]
-    assert [number for number, _, _ in found] == list(range(len(found)))
-    assert shown == sorted(set(shown))
-    assert shown[0] == 0
-    assert shown[-1] == 99
-    assert lost <= 100 - len(shown) < 40
-    if path.suffix != ".avi":  # which keeps no times
-        assert [time for _, time, _ in found] == pytest.approx([number / 25 for number in shown], abs=0.002)
-    with open_source(path, 20, skip_damaged=True) as source:
-        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[20:]
-
-
 @pytest.mark.parametrize("part", [slice(-1, None), slice(None, -1), slice(0, 9, 0), slice(9, 0, -1)], ids=str)
 def test_a_part_with_a_negative_step_is_an_error(images, part):
     with pytest.raises(VideoError, match="frames count from 0"):
         open_source(images("walk", ["0.png"]), part=part)
 
 
-def test_a_part_without_frames_is_an_error_with_the_number_of_frames(images):
-    with pytest.raises(VideoError, match="has 9 frames, numbered from 0, and none from frame 9 on: give an earlier"):
-        open_source(images("walk", 9), part=slice(9, 20))
-
-
 @pytest.mark.parametrize("part", [slice(5, 5), slice(7, 5), slice(0)], ids=str)
 def test_a_part_that_ends_before_it_starts_is_an_error_about_the_end(images, part):
     with pytest.raises(VideoError, match=f"before {part.stop}: give an end after the start"):
         open_source(images("walk", 9), part=part)
-
-
-def test_a_folder_of_images_has_the_rate_that_is_given(images):
-    folder = images("walk", 3)
-    with open_source(folder, image_rate=10.0) as source:
-        assert source.rate == 10
-        assert [frame.time for frame in source] == [0.0, 0.1, 0.2]
-
-
-def test_hidden_files_do_not_hide_the_only_video(video, tmp_path):
-    video("a.avi", frames=2)
-    for name in ("._a.avi", "._cover.jpg"):  # as macOS writes them
-        (tmp_path / name).write_bytes(b"no video")
-    assert numbers(open_source(tmp_path)) == [0, 1]
-
-
-def test_a_digit_that_is_no_decimal_one_is_a_letter(images):
-    assert numbers(open_source(images("walk", ["²2.png", "²10.png"]))) == [0, 1]
-
-
-def test_an_image_of_more_pixels_than_opencv_reads_is_an_error(tmp_path):
-    blank = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
-    (tmp_path / "0.bmp").write_bytes(blank)
-    with pytest.raises(VideoError, match=r"cannot read the image .*0\.bmp"):
-        open_source(tmp_path)
 
 
 def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):
@@ -350,18 +466,6 @@ def test_a_cover_picture_before_the_video_is_not_the_video(tmp_path):
         assert numbers(source) == [7]
 
 
-def test_a_file_address_names_a_file_of_this_machine(images):
-    folder = images("a walk", ["0.png", "1.png"])
-    assert numbers(open_source(folder.as_uri())) == [0, 1]
-
-
-def test_opencv_prints_no_warning_for_an_unreadable_image(tmp_path, capfd):
-    cv2.imwrite(str(tmp_path / "0.tiff"), np.zeros((20, 30, 3), np.float32))
-    with pytest.raises(VideoError, match=r"cannot read the image .*0\.tiff"):
-        open_source(tmp_path)
-    assert capfd.readouterr().err == ""
-
-
 def test_grey_images_are_expanded(tmp_path):
     cv2.imwrite(str(tmp_path / "0.png"), np.full((20, 30), 77, np.uint8))
     with open_source(tmp_path) as source:
@@ -369,22 +473,6 @@ def test_grey_images_are_expanded(tmp_path):
     assert image.shape == (20, 30, 3)
     assert image.dtype == np.uint8
     assert (image == 77).all()
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (cv2.imencode(".png", numbered(3, width=150))[1].tobytes(), ["150x120", "160x120"]),
-        (b"nothing", ["cannot read the image"]),
-    ],
-    ids=["of another size", "unreadable"],
-)
-def test_the_first_image_that_cannot_be_used_is_named(images, content, words):
-    folder = images("walk", 5)
-    (folder / "3.png").write_bytes(content)
-    good, message = broken(folder)
-    assert good == [0, 1, 2]
-    assert all(word in message for word in ["3.png", *words])
 
 
 def test_images_before_the_first_frame_are_not_read(images):
@@ -425,10 +513,3 @@ def test_what_is_no_source_is_an_error_that_names_the_alternatives(tmp_path, mon
     os.mkfifo(tmp_path / "pipe.mpg")
     with pytest.raises(VideoError, match=message):
         open_source(place)
-
-
-def test_a_folder_with_two_videos_is_an_error(video, tmp_path):
-    video("a.avi", frames=1)
-    video("b.avi", frames=1)
-    with pytest.raises(VideoError, match="2 videos"):
-        open_source(tmp_path)

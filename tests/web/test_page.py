@@ -10,7 +10,7 @@ import pytest
 
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
-from catstream.video.demo import RATE, render
+from catstream.video.rendered import RATE, Demo
 from catstream.video.writer import VideoWriter
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server
@@ -26,7 +26,7 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
 ):
     path, boxes = tmp_path / "demo.mp4", []
     with VideoWriter(path, RATE, SIZE) as video:
-        for image, box in render(145, SIZE, begin=LEAVES - 120):
+        for image, box in map(Demo(SIZE).image, range(LEAVES - 120, LEAVES + 25)):
             video.write(image)
             boxes.append(box)
     # The pipeline continues only if its tracks are received.

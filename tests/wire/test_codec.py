@@ -55,7 +55,7 @@ from catstream.messages.schema import (
     fields,
 )
 from catstream.settings import RunSettings, Settings
-from catstream.video import demo
+from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
 
@@ -238,7 +238,7 @@ def test_arrays_travel_row_by_row_whatever_their_layout():
 
 
 def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
-    detectors, ((image, box),) = Detectors(Settings()), demo.render(1, (320, 240))
+    detectors, ((image, box),) = Detectors(Settings()), rendered.render(1, (320, 240))
     pyramid = Pyramid(image)
     _, features = detectors.step(pyramid, given={"": detectors.begin("", pyramid, box)})
     (limit,) = get_type_hints(RunSettings, include_extras=True)["objects_most"].__metadata__

@@ -39,6 +39,7 @@ from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.messages.storage import write_atomically, writing
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
+from catstream.sinks.exports import LAYOUTS, write_layout
 
 _ROOT = Path(errors.__file__).parents[1]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
@@ -106,28 +107,23 @@ def prepare_folder(output: Path, settings: Settings) -> None:
             write_atomically(file, (json.dumps(values, indent=1) + "\n").encode())
 
 
-def _files(output: Path, tracker: str, name: str) -> tuple[Path, Path, Path]:
+def _files(output: Path, tracker: str, name: str) -> list[Path]:
     """Return the paths of boxes, confidence and times of a run in the VOT toolkit's layout."""
-    folder, stem = output / tracker / "longterm" / name, f"{name}_001"
-    return folder / f"{stem}.txt", folder / f"{stem}_confidence.value", folder / f"{stem}_time.value"
+    return [output / tracker / "longterm" / pattern.format(name) for pattern in LAYOUTS["vot"]]
 
 
 def save(output: Path, run: EvaluationRun) -> None:
     """Write a run. The folder in VOT's layout is renamed into place last: its existence marks the run as complete."""
-    boxes, confidence, seconds = _files(output, run.tracker, run.name)
-    folder, home = boxes.parent, output / run.tracker
-    part = folder.with_name(folder.name + ".part")
+    folder, home = _files(output, run.tracker, run.name)[0].parent, output / run.tracker
+    part = home / f"{run.name}.part"
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(folder, ignore_errors=True)
     with writing(home):
-        for made in (part, home / "times"):
-            made.mkdir(parents=True, exist_ok=True)
-        np.savetxt(home / f"{run.name}.txt", run.boxes, fmt="%.4f", delimiter=",")
-        np.savetxt(home / "times" / f"{run.name}_time.txt", run.seconds, fmt="%.8f")
-        np.savetxt(part / boxes.name, run.boxes, fmt="%.4f", delimiter=",")
-        np.savetxt(part / confidence.name, run.confidence, fmt="%.6f")
-        np.savetxt(part / seconds.name, run.seconds, fmt="%.8f")
-        part.rename(folder)
+        write_layout("otb", home, run.name, run.boxes, None, run.seconds)
+        write_layout("vot", part, run.name, run.boxes, run.confidence, run.seconds)
+        folder.parent.mkdir(exist_ok=True)
+        (part / run.name).rename(folder)
+        part.rmdir()
 
 
 def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> EvaluationRun | None:

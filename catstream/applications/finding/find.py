@@ -20,8 +20,7 @@ from catstream.box import Box
 from catstream.errors import SettingsError, VideoError
 from catstream.run.learned import Learned
 from catstream.settings import RunSettings
-from catstream.video.ahead import read_ahead
-from catstream.video.frames import Frame, without_password
+from catstream.video.frames import Frame, read_ahead, without_password
 from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
 
 _One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
@@ -97,7 +96,7 @@ class File:
         A video that is damaged raises VideoError after the frames before the damage.
         """
         if self.kind == "video":
-            with open_source(self.path, skip_damaged=settings.skip_damaged) as source:
+            with open_source(self.path, settings=settings) as source:
                 opened(source.frames)
                 interval, last = max(1, round(every * source.rate)), None
                 with closing(read_ahead(source)) as frames:

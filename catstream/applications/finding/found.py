@@ -21,8 +21,8 @@ from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages.names import counted
 from catstream.messages.storage import write_atomically, writing
-from catstream.video.image import jpeg
-from catstream.video.palette import Colours
+from catstream.video.annotate import Colours
+from catstream.video.frames import jpeg
 
 _KIND = "catstream find 3"  # and the version of the lines
 _GAP_SECONDS, _GAP_STEPS = 1.0, 2.5  # longest time between two sightings of an interval: the longer one of these

@@ -18,11 +18,11 @@ import numpy as np
 import psutil
 
 from catstream.applications.evaluation.scores import overlaps
+from catstream.applications.loadtest.broadcast import Schedule
 from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health, Model, Track
 from catstream.numerics.arrays import Float64
-from catstream.video.broadcast import Schedule
 
 #: The percentiles of latencies that are reported, by name.
 PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from catstream.applications.loadtest import crowd
+from catstream.applications.loadtest.broadcast import Broadcast, Schedule
 from catstream.applications.loadtest.plan import Plan
 from catstream.applications.workers import SPAWN, sigint_blocked
 from catstream.box import Box
@@ -24,9 +26,8 @@ from catstream.numerics.arrays import Float64
 from catstream.pipeline import Pipeline
 from catstream.services.loop import die_with
 from catstream.settings import Settings
-from catstream.video import crowd, demo
-from catstream.video.broadcast import Broadcast, Schedule
-from catstream.video.image import jpeg
+from catstream.video import rendered
+from catstream.video.frames import jpeg
 from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import GapCounter, Subscriber
@@ -59,7 +60,7 @@ def render(plan: Plan, images: int, done: Callable[[int], None] = lambda _: None
     files, truth = [], []
     shown: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
     if plan.objects == 1:
-        shown = ((image, {UNNAMED: box}) for image, box in demo.render(images, plan.size))
+        shown = ((image, {UNNAMED: box}) for image, box in rendered.render(images, plan.size))
     else:
         shown = crowd.render(plan.objects, images, plan.size)
     for image, boxes in shown:
@@ -95,7 +96,7 @@ class Camera:
 
     def show_still(self) -> None:
         """Send the first image repeatedly, at the frame rate of the video."""
-        self.play(Schedule(monotonic(), demo.RATE, frames=1))
+        self.play(Schedule(monotonic(), rendered.RATE, frames=1))
 
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Send the video by a schedule; return the schedule of each stream."""

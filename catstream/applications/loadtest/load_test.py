@@ -11,13 +11,13 @@ from time import monotonic
 
 import numpy as np
 
+from catstream.applications.loadtest.broadcast import Schedule
 from catstream.applications.loadtest.latency import REST, Measures, Observations, Usage, measure, observed, summary
 from catstream.applications.loadtest.load import Camera, Stream, Subscribers, render
 from catstream.applications.loadtest.plan import Limit, Plan, violations
 from catstream.errors import ServiceError
 from catstream.numerics.arrays import Float64
-from catstream.video import demo
-from catstream.video.broadcast import Schedule
+from catstream.video import rendered
 
 _LEAST, _MOST = 0.5, 1000.0  # frames per second
 _PRECISION = 0.05  # maximum relative error of the highest rate
@@ -248,7 +248,7 @@ def run_load_test(
     find : search for the highest rate that meets the limits, beginning with that of the plan
     report, done : functions that are called with the progress, and after each run
     """
-    load_test, images = LoadTest(limits, find), demo.FRAMES if find else min(plan.frames, demo.FRAMES)
+    load_test, images = LoadTest(limits, find), rendered.FRAMES if find else min(plan.frames, rendered.FRAMES)
 
     def holds(rate: float) -> bool:
         result = run(replace(plan, rate=rate), camera, report)

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from catstream.applications.loadtest import crowd
 from catstream.applications.loadtest.latency import PERCENTILES, percentiles
 from catstream.errors import SettingsError
 from catstream.messages.names import check_count, counted
 from catstream.settings import Settings
-from catstream.video import crowd
-from catstream.video.sprite import SIZE
+from catstream.video.rendered import SIZE
 
 if TYPE_CHECKING:
     from catstream.applications.loadtest.load_test import Result

@@ -124,11 +124,12 @@ def test_runs_with_another_ground_truth_are_repeated(tmp_path, sequence, counted
 
 def test_an_incomplete_run_is_repeated(tmp_path, sequence, run, counted):
     save(tmp_path, run)
-    folder = tmp_path / "catstream" / "longterm" / "walk"
-    folder.rename(folder.with_name("walk.part"))
+    folder, part = tmp_path / "catstream" / "longterm" / "walk", tmp_path / "catstream" / "walk.part"
+    part.mkdir()
+    folder.rename(part / "walk")
     evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
     assert len(counted) == 1
-    assert not folder.with_name("walk.part").exists()
+    assert not part.exists()
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from catstream.applications.loadtest.broadcast import Schedule
 from catstream.applications.loadtest.latency import Measures
 from catstream.applications.loadtest.load_test import Result
 from catstream.applications.loadtest.plan import Plan
 from catstream.box import Box
 from catstream.messages.kinds import Track
-from catstream.video.broadcast import Schedule
 
 BOX = Box(10.0, 10.0, 20.0, 20.0)
 

@@ -1,0 +1,179 @@
+"""THE TABLE of destinations and formats of tracks.
+
+A sink takes each frame while the run goes on: `catstream track --write DEST`, `catstream sink DEST`. An export is made
+from a log, an NDJSON or CSV file, afterwards: `catstream export LOG DEST`. A new one is a row here, a class or a
+function in a file of its own, and a line in docs/how-to/sinks.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from math import nan
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, cast
+
+from catstream.errors import VideoError, require_extra
+from catstream.messages.kinds import Track
+from catstream.messages.storage import why_not_writable, writing
+from catstream.video.frames import RATE
+from catstream.video.source import ALL_FRAMES
+
+#: Stands for standard output.
+STDOUT = "-"
+
+
+class TrackedFrame(NamedTuple):
+    """The tracks of a frame, at least one; a subscriber receives them one by one, and passes on one at a time.
+
+    seconds  processing time of the frame, NaN if it is not known
+    """
+
+    tracks: Sequence[Track]
+    seconds: float = nan
+
+    @property
+    def number(self) -> int:
+        """Number of the frame."""
+        return self.tracks[0].frame
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The run whose tracks a sink writes.
+
+    source      of its frames if they can be read a second time: None beside a running pipeline
+    part        the frames that are tracked
+    image_rate  frames per second of a folder of images
+    endpoint    of the running pipeline, for a sink that receives other messages, too
+    keys        folder of the keys for this endpoint
+    last        number of the last frame in the log of a run that is resumed; -1 for a new run
+    """
+
+    source: str | None = None
+    part: slice = field(default_factory=lambda: ALL_FRAMES)
+    image_rate: float = RATE
+    endpoint: str = ""
+    keys: str = ""
+    last: int = -1
+
+
+class Sink(Protocol):
+    """Takes the frames in their order; made as `Class(place, origin)`.
+
+    A sink may have the attribute `last`, the number of the last frame that it holds, -1 for none: when a run is
+    resumed, it gets all later frames of the log first.
+    """
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Add a frame; raise VideoError if that is not possible."""
+
+    def close(self) -> None:
+        """Complete what was written, which remains; raise VideoError if that is not possible."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of the table.
+
+    home     the class of a sink, or the function `export(frames, path, name)`
+    meaning  a line of the help
+    suffix   of the file of an export; empty for a folder
+    extra    the extra that it needs
+    repeats  whether a sink can be continued, or made again from the log, when a run is resumed
+    """
+
+    home: str
+    meaning: str
+    suffix: str = ""
+    extra: str = ""
+    repeats: bool = True
+
+    def load(self) -> Any:
+        """Import the class or function; raises MissingExtraError if its extra is not installed."""
+        if self.extra:
+            require_extra(self.extra)
+        module, _, name = self.home.rpartition(".")
+        return getattr(import_module(f"catstream.sinks.{module}"), name)
+
+
+#: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
+SINKS = {
+    ".ndjson": Row("track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
+    STDOUT: Row("track_log.StdoutSink", "the same, on standard output", repeats=False),
+    ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    ".mcap": Row(
+        "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
+    ),
+}
+
+#: Name of a format -> the export.
+EXPORTS = {
+    "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
+    "sqlite": Row("exports.write_sqlite", "the table tracks of a database", ".sqlite"),
+    "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
+    "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB"),
+    "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k"),
+    "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment"),
+}
+
+
+def sink_of(place: str) -> Row:
+    """Return the row of a sink; raises VideoError if there is none for this suffix or scheme."""
+    scheme, mark, _ = place.partition("://")
+    row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
+    if row is None:
+        raise VideoError(
+            f"{place} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where - is "
+            "standard output; for other formats use catstream export"
+        )
+    return row
+
+
+def export_of(path: Path, name: str | None) -> Row:
+    """Return the row of an export, by its name, or else by the suffix; raises VideoError if that selects not one."""
+    rows = [row for row in EXPORTS.values() if row.suffix and row.suffix == path.suffix]
+    if name is None and len(rows) != 1:
+        raise VideoError(f"the format of {path} is not known: give --format, one of {', '.join(EXPORTS)}")
+    return rows[0] if name is None else EXPORTS[name]
+
+
+def is_file(place: str) -> bool:
+    """Return whether a destination is a file: not standard output, and no address."""
+    return place != STDOUT and "://" not in place
+
+
+def check_file(path: Path, *, may_exist: bool, source: str = "", made: Path | None = None) -> None:
+    """Raise VideoError if a file exists and may not, is the source of the frames, or cannot be written.
+
+    The folder `made` is made before the file, if it does not exist.
+    """
+    if source and path.exists() and Path(source).exists() and path.samefile(source):
+        raise VideoError(f"{path} is the source, which would be lost: give another name or folder")
+    if path.exists() and not may_exist:
+        raise VideoError(f"{path} exists already: replace it with --overwrite, or give another name")
+    if reason := why_not_writable(path, made):
+        raise VideoError(reason)
+
+
+def open_sink(place: str, origin: Origin) -> Sink:
+    """Open the sink of a destination; raises VideoError or MissingExtraError if that is not possible."""
+    return cast(Sink, sink_of(place).load()(place, origin))
+
+
+def export(frames: Iterable[TrackedFrame], path: Path, row: Row, name: str) -> None:
+    """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
+
+    They are named after `name`, that of the log. Raises VideoError if they cannot be written.
+    """
+    make: Callable[[Iterable[TrackedFrame], Path, str], None] = row.load()
+    part = path.with_name(f"{path.name}.part")
+    with writing(path, VideoError):
+        try:
+            make(frames, part if row.suffix else path, name)
+            if row.suffix:
+                part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)

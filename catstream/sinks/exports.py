@@ -1,0 +1,128 @@
+"""Formats that are made from a log: text files of the benchmarks' toolkits, and the tables of a database."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from catstream.errors import VideoError
+from catstream.numerics.arrays import Float64
+from catstream.sinks.destinations import TrackedFrame
+
+#: Layout -> the files of boxes, scores and times of an object, in the folder of the results; NAME is that of the log,
+#: or NAME-OBJECT. The toolkits of got10k (which has OTB, too) and VOT read them.
+LAYOUTS = {
+    "otb": ("{0}.txt", "{0}_confidence.value", "times/{0}_time.txt"),
+    "got10k": ("{0}/{0}_001.txt", "{0}/{0}_confidence.value", "{0}/{0}_time.txt"),
+    "vot": ("{0}/{0}_001.txt", "{0}/{0}_001_confidence.value", "{0}/{0}_001_time.value"),
+}
+
+#: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
+#: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.
+_COLUMNS = {
+    **{"frame": "INTEGER NOT NULL", "seq": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
+    **{"x": "REAL", "y": "REAL", "w": "REAL", "h": "REAL", "score": "REAL NOT NULL"},
+    **{"model_version": "INTEGER NOT NULL", "pts": "REAL", "object": "TEXT NOT NULL"},
+}
+_BATCH = 65536  # rows in memory at once
+
+
+def write_layout(
+    layout: str, folder: Path, name: str, boxes: Float64, confidence: Float64 | None, seconds: Float64 | None
+) -> None:
+    """Write the files of one object in one of the `LAYOUTS`; raises OSError if that is not possible.
+
+    Parameters
+    ----------
+    boxes : float64 (frames, 4), x, y, w, h in pixels; NaN if there is none
+    confidence : float64 (frames,); None to write no such file
+    seconds : float64 (frames,), processing time; None to write no such file
+    """
+    values = (boxes, confidence, seconds)
+    for pattern, column, form in zip(LAYOUTS[layout], values, ("%.4f", "%.6f", "%.8f"), strict=True):
+        if column is not None:
+            file = folder / pattern.format(name)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(file, column, fmt=form, delimiter=",")
+
+
+def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+    """Write boxes as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
+
+    Frames, ids and pixels count from 1 there. The first object that appears has the id 1, and a name keeps its id. A
+    frame without any object has no line, so the file does not say how many frames there were.
+    """
+    ids: dict[str, int] = {}
+    with path.open("w", encoding="utf-8") as file:
+        for track in (track for frame in frames for track in frame.tracks):
+            number = ids.setdefault(track.object, len(ids) + 1)
+            if track.box is not None:
+                x, y, w, h = track.box
+                box = f"{x + 1:.2f},{y + 1:.2f},{w:.2f},{h:.2f}"
+                file.write(f"{track.frame + 1},{number},{box},{track.score:.4f},-1,-1,-1\n")
+
+
+def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+    """Write the table `tracks` of a database."""
+    columns = ", ".join(f"{name} {kind}" for name, kind in _COLUMNS.items())
+    path.unlink(missing_ok=True)  # left by a process that was killed
+    try:
+        with closing(sqlite3.connect(path)) as database, database:
+            database.execute(f"CREATE TABLE tracks ({columns}, PRIMARY KEY (frame, object)) STRICT")
+            marks = ", ".join("?" for _ in _COLUMNS)
+            database.executemany(f"INSERT INTO tracks VALUES ({marks})", _rows(frames))
+    except sqlite3.Error as error:
+        raise VideoError(f"cannot write {path}: {error}") from None
+
+
+def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+    """Write the columns of the same table, which pyarrow, pandas, DuckDB and Spark read."""
+    import pyarrow as arrow
+    import pyarrow.parquet
+
+    kinds = {"INTEGER": arrow.int64(), "REAL": arrow.float64(), "TEXT": arrow.string()}
+    schema = arrow.schema([(name, kinds[kind.split()[0]]) for name, kind in _COLUMNS.items()])
+    rows = _rows(frames)
+    with arrow.parquet.ParquetWriter(path, schema) as writer:
+        while batch := [*islice(rows, _BATCH)]:
+            columns = zip(zip(*batch, strict=True), schema.types, strict=True)
+            writer.write_batch(arrow.record_batch([arrow.array(*column) for column in columns], schema=schema))
+
+
+def _rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of the table, in the order of the log."""
+    for track in (track for frame in frames for track in frame.tracks):
+        box = track.box or [None] * 4
+        yield (
+            *(track.frame, track.seq, track.time, track.state, *box, track.score),
+            *(track.model_version, track.pts, track.object),
+        )
+
+
+def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, name: str) -> None:
+    """Write the files of each object; those of times only if the log has them, as a CSV file has."""
+    rows: dict[str, dict[int, tuple[float, ...]]] = {}
+    times: dict[int, float] = {}
+    for frame in frames:
+        times[frame.number] = frame.seconds
+        for track in frame.tracks:
+            rows.setdefault(track.object, {})[frame.number] = (*(track.box or [np.nan] * 4), track.score)
+    for thing, found in rows.items():
+        table = np.full((max(times) + 1, 6), np.nan)
+        table[list(found), :5] = list(found.values())
+        table[list(times), 5] = list(times.values())
+        seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
+        whole = f"{name}-{thing}" if thing else name
+        write_layout(layout, folder, whole, table[:, :4], table[:, 4], seconds)
+
+
+write_otb = partial(_write_objects, "otb")
+write_got10k = partial(_write_objects, "got10k")
+write_vot = partial(_write_objects, "vot")

@@ -1,0 +1,183 @@
+"""The log of tracks: NDJSON and CSV files that grow line by line. A run that is resumed continues them.
+
+A power cut or a full disk can cut a file within a frame of several objects. In each frame, the objects that were not in
+the frame before come first, so a last frame that has all objects of the frame before it is whole. Any other last frame
+counts as not written: it is cut, and tracked again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from itertools import chain, pairwise
+from math import isnan, nan
+from pathlib import Path
+from typing import IO, get_args
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages.kinds import State, Track
+from catstream.messages.names import UNNAMED, check_name
+from catstream.messages.storage import writing
+from catstream.sinks.destinations import Origin, TrackedFrame
+
+_STATES: dict[str, State] = {state: state for state in get_args(State)}
+
+#: Stands for the objects of the frame before the first one: an object without a name is written last.
+_FIRST = frozenset({UNNAMED})
+
+
+class LineSink(ABC):
+    """A file with a line for each track. What was written remains, however this process ends.
+
+    An existing file is replaced; if the run is resumed, it is cut after the frame `origin.last` and continued.
+
+    Attributes
+    ----------
+    last : number of the last frame in the file, -1 for none
+    """
+
+    #: The first line of a file, with its line end.
+    header = ""
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self.path, self.last, self._before = Path(place), -1, _FIRST
+        end = 0
+        for frame, after in whole_frames(self.path) if origin.last >= 0 else ():
+            if frame.number > origin.last:
+                break
+            self.last, self._before, end = frame.number, _objects(frame), after
+        with writing(self.path, VideoError), ExitStack() as stack:
+            if end:
+                os.truncate(self.path, end)
+            self._file = self._open("a" if end else "w")
+            if self.header and not end:  # a file for whose header the disk has no room is closed and removed
+                stack.callback(self.path.unlink)
+                stack.enter_context(self._file)
+                self._file.write(self.header)
+                stack.pop_all()
+
+    @abstractmethod
+    def line(self, track: Track, seconds: float) -> str:
+        """Return the line of a track, without its line end."""
+
+    @staticmethod
+    @abstractmethod
+    def parse(line: str) -> tuple[Track, float]:
+        """Return what `line` got; raise ValueError, KeyError or TypeError if it is no such line."""
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Add the lines of a frame, in one write."""
+        tracks = sorted(frame.tracks, key=lambda track: track.object in self._before)
+        self._before = _objects(frame)
+        with self._translated_errors():
+            self._file.write("".join(f"{self.line(track, frame.seconds)}\n" for track in tracks))
+
+    def close(self) -> None:
+        """Close the file; a line for which the disk had no room is tried again."""
+        with self._translated_errors():
+            self._file.close()
+
+    def _open(self, mode: str) -> IO[str]:
+        return self.path.open(mode, encoding="utf-8", buffering=1)
+
+    @contextmanager
+    def _translated_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
+            raise
+        except OSError as error:
+            raise VideoError(f"cannot write to {self.path} any more: {error.strerror}") from None
+
+
+class NdjsonSink(LineSink):
+    """Tracks as JSON objects, one on each line, as `Track.to_dict` gives them; a box is [x, y, w, h] or null."""
+
+    def line(self, track: Track, _: float) -> str:
+        return json.dumps(track.to_dict())
+
+    @staticmethod
+    def parse(line: str) -> tuple[Track, float]:
+        fields = json.loads(line)
+        return Track(**{**fields, "box": fields["box"] and Box(*fields["box"])}), nan
+
+
+class StdoutSink(NdjsonSink):
+    """The same on standard output, where each frame is seen at once."""
+
+    def __init__(self, _: str, __: Origin) -> None:
+        super().__init__("standard output", Origin())
+        self.last = sys.maxsize  # what a run has printed before it was resumed is not repeated
+
+    def _open(self, _: str) -> IO[str]:
+        return os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", buffering=1)
+
+
+class CsvSink(LineSink):
+    """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known."""
+
+    header = "frame,seconds,state,x,y,w,h,score,model_version,object,processing\n"
+
+    def line(self, track: Track, seconds: float) -> str:
+        box = ",,," if track.box is None else ",".join(f"{side:.4f}" for side in track.box)
+        took = "" if isnan(seconds) else f"{seconds:.6f}"
+        score = f"{track.score:.6f},{track.model_version}"
+        return f"{track.frame},{track.time:.6f},{track.state},{box},{score},{track.object},{took}"
+
+    @staticmethod
+    def parse(line: str) -> tuple[Track, float]:
+        """The track has no `pts`, which is not in the file, and the `seq` of a run without a skipped frame."""
+        frame, seconds, state, x, y, w, h, score, version, name, took = line.removesuffix("\n").split(",")
+        box = Box(*map(float, (x, y, w, h))) if x else None
+        number, name = int(frame), check_name(name)
+        track = Track(number + 1, number, float(seconds), _STATES[state], box, float(score), int(version), object=name)
+        return track, float(took or nan)
+
+
+_LOGS: dict[str, type[LineSink]] = {".ndjson": NdjsonSink, ".csv": CsvSink}
+
+
+def is_log(path: Path) -> bool:
+    """Return whether a file of this name has all tracks of a run, and can be read and continued."""
+    return path.suffix in _LOGS
+
+
+def read_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
+    """Yield each frame of a log, and the byte at which it ends, up to the first line that is incomplete."""
+    kind = _LOGS[path.suffix]
+    tracks: list[Track] = []
+    seconds = nan
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        end = len(file.readline()) if kind.header else 0
+        for line in file:
+            try:
+                track, took = kind.parse(line.decode())
+            except (KeyError, TypeError, ValueError):  # a power cut can leave zeros at the end
+                break
+            if not line.endswith(b"\n"):
+                break
+            if tracks and track.frame != tracks[0].frame:
+                yield TrackedFrame(tracks, seconds), end
+                tracks = []
+            tracks.append(track)
+            seconds, end = took, end + len(line)
+        if tracks:
+            yield TrackedFrame(tracks, seconds), end
+
+
+def whole_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
+    """Yield the same, except for a last frame that may be incomplete."""
+    before = _FIRST
+    for each, later in pairwise(chain(read_frames(path), [None])):
+        if each is not None and (later is not None or before <= _objects(each[0])):
+            yield each
+            before = _objects(each[0])
+
+
+def _objects(frame: TrackedFrame) -> frozenset[str]:
+    return frozenset(track.object for track in frame.tracks)

@@ -1,0 +1,95 @@
+"""The video with its tracks drawn in, from the frames of a source, or from the pictures of a running pipeline."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from catstream.client.subscription import subscribe
+from catstream.errors import SilenceError, VideoError
+from catstream.messages.kinds import Preview, Track
+from catstream.sinks.destinations import Origin, Sink, TrackedFrame
+from catstream.video.annotate import Colours, draw, drawn_size, preview_image
+from catstream.video.frames import RATE
+from catstream.video.source import open_source
+from catstream.video.writer import VideoWriter
+
+_KEPT_FRAMES = 256  # whose tracks wait for their picture
+
+
+def open_video(place: str, origin: Origin) -> Sink:
+    """Open an MP4 of the frames of a source if they can be read a second time, else of the pipeline's pictures."""
+    return PictureVideo(place, origin) if origin.source is None else SourceVideo(place, origin)
+
+
+class SourceVideo:
+    """An MP4 of the frames that have a track, with their tracks drawn in; it gets its name when it is closed."""
+
+    last = -1  # when a run is resumed, the video is drawn again from the first frame
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
+        self._frames = open_source(
+            origin.source or "", part=origin.part, image_rate=origin.image_rate, skip_damaged=True, resize=True
+        )
+        self._colours = Colours()
+        try:
+            aspect = self._frames.pixel_aspect
+            self._video = VideoWriter(place, self._frames.rate, drawn_size(self._frames.size), pixel_aspect=aspect)
+        except VideoError:
+            self._frames.close()
+            raise
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Draw the tracks of a frame over it."""
+        image = next((each.image for each in self._frames if each.number == frame.number), None)
+        if image is None:
+            raise VideoError(f"the source has no frame {frame.number}: give the one that the pipeline tracks")
+        self._colours.keep(track.object for track in frame.tracks)
+        self._video.write(draw(image, frame.tracks, self._colours), frame.tracks[0].time)
+
+    def close(self) -> None:
+        """Finish the video."""
+        self._frames.close()
+        self._video.close()
+
+
+class PictureVideo:
+    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._place = place
+        self._previews = subscribe(origin.endpoint, "previews", timeout=0, keys=origin.keys)
+        self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
+        self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
+        self._video: VideoWriter | None = None
+        self._colours = Colours()
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Keep the tracks, and draw a picture whose frame is over."""
+        self._tracks.setdefault(frame.number, []).extend(frame.tracks)
+        if len(self._tracks) > _KEPT_FRAMES:
+            del self._tracks[next(iter(self._tracks))]
+        if self._picture is None:
+            with suppress(SilenceError):
+                self._picture = next(self._previews, None)
+        if self._picture is not None and self._picture.frame < frame.number:
+            self._draw(self._picture)
+            self._picture = None
+
+    def close(self) -> None:
+        """Finish the video."""
+        self._previews.close()
+        if self._video is None:
+            raise VideoError(
+                f"{self._place} was not written: the pipeline sent no picture of a frame that was received"
+            )
+        self._video.close()
+
+    def _draw(self, picture: Preview) -> None:
+        tracks = self._tracks.get(picture.frame, [])
+        image = preview_image(picture, tracks, self._colours) if tracks else None
+        if image is not None:
+            self._colours.keep(track.object for track in tracks)
+            if self._video is None:
+                self._video = VideoWriter(self._place, RATE, (image.shape[1], image.shape[0]))
+            self._video.write(image, tracks[0].time)

@@ -1,0 +1,85 @@
+"""A broadcast: each frame at its moment, known by its time stamp, none left out for a slow reader."""
+
+from __future__ import annotations
+
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from catstream.applications.loadtest.broadcast import Broadcast, Schedule
+from catstream.video.frames import jpeg
+from catstream.video.source import open_source
+
+SIZE = (64, 48)
+GREYS = [jpeg(np.full((48, 64, 3), grey, np.uint8)) for grey in (0, 80, 160, 240)]
+
+
+@pytest.fixture
+def broadcast():
+    with Broadcast(GREYS, SIZE, streams=2) as camera:
+        yield camera
+
+
+def shown(image: np.ndarray) -> int:
+    return round(image.mean() / 80)
+
+
+def test_the_time_stamp_of_a_frame_is_its_due_time_and_its_image_the_scheduled_one(broadcast):
+    schedules = broadcast.play(Schedule(time.monotonic() + 1, 20.0, frames=30))
+    for url, schedule in zip(broadcast.urls, schedules, strict=True):
+        with open_source(url) as source:
+            for frame in source:
+                number = schedule.number(frame.pts)
+                assert frame.pts == pytest.approx(schedule.due(number), abs=2e-6)
+                assert shown(frame.image) == schedule.picture(number, len(GREYS))
+                if number >= 10:
+                    break
+        assert time.monotonic() >= frame.pts
+
+
+def test_the_streams_are_shifted_by_a_part_of_a_frame(broadcast):
+    one, other = broadcast.play(Schedule(100.0, 20.0, frames=30))
+    assert (one.start, other.start) == (100.0, 100.025)
+
+
+def test_a_still_image_is_sent_before_the_start_and_after_the_end(broadcast):
+    (schedule, _) = broadcast.play(Schedule(time.monotonic() + 0.5, 40.0, frames=3))
+    seen = {}
+    with open_source(broadcast.urls[0]) as source:
+        for frame in source:
+            seen[schedule.number(frame.pts)] = shown(frame.image)
+            if schedule.number(frame.pts) > 20:
+                break
+    assert {picture for number, picture in seen.items() if number < 0} == {0}
+    assert {picture for number, picture in seen.items() if number > 2} == {2}
+
+
+def test_a_slow_receiver_gets_every_frame(broadcast):
+    (schedule, _) = broadcast.play(Schedule(time.monotonic(), 100.0, frames=1000))
+    with urllib.request.urlopen(broadcast.urls[0]) as answer:
+        first = time.monotonic()
+        while time.monotonic() < first + 0.3:
+            pass  # it reads nothing: what is sent meanwhile waits
+        data = b""
+        while schedule.following(time.monotonic()) < 60:
+            data += answer.read1()
+    assert data.count(b"\xff\xd8\xff") >= 40
+
+
+def test_a_receiver_that_disconnects_ends_its_connection_only(broadcast, until, capfd):
+    broadcast.play(Schedule(time.monotonic(), 100.0, frames=1000))
+    before = threading.active_count()
+    for _ in range(2):
+        with open_source(broadcast.urls[0]) as source:
+            assert next(iter(source)).image.shape == (48, 64, 3)
+    until(lambda: threading.active_count() <= before)
+    assert capfd.readouterr().err == ""
+
+
+def test_an_unknown_stream_is_an_http_404(broadcast):
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(broadcast.urls[0][:-1] + "7")
