@@ -160,7 +160,9 @@ def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until,
 def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):
     spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)})
     with started(spec, store) as first:
-        until(lambda: (found := Store(store).stream("gate").newest()) is not None and found.facts["frame"] > 5)
+        until(
+            lambda: (found := Store(store).stream("gate").newest()) is not None and found.facts["frame"] > 60
+        )  # checkpoints: one a second
         with started(spec, store, "n2", every=60.0) as second:  # as if the first node had died
             until(lambda: first.report()[1])
             status = until(lambda: (found := second.report()[0]).state == "running" and found)
