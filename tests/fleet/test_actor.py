@@ -70,8 +70,8 @@ def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
     assert Store(store).stream("cam-7").newest().facts["frame"] == FRAMES - 1
 
 
-def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(spec, store, until):
-    with started(spec, store) as old:
+def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(long_spec, store, until):
+    with started(long_spec, store) as old:
         until(lambda: Store(store).stream("cam-7").newest() is not None)
         claim = Store(store).stream("cam-7").claim("another node")
         until(lambda: old.report()[1])
@@ -160,9 +160,7 @@ def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until,
 def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):
     spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)})
     with started(spec, store) as first:
-        until(
-            lambda: (found := Store(store).stream("gate").newest()) is not None and found.facts["frame"] > 60
-        )  # checkpoints: one a second
+        until(lambda: (found := Store(store).stream("gate").newest()) is not None and found.facts["frame"] > 60)
         with started(spec, store, "n2", every=60.0) as second:  # as if the first node had died
             until(lambda: first.report()[1])
             status = until(lambda: (found := second.report()[0]).state == "running" and found)
