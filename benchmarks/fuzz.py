@@ -16,27 +16,29 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 from unittest.mock import patch
 
 import atheris
 import numpy as np
 from table import Table, benchmark, command
 
-COMPILED = [f"catstream.features.{name}" for name in ("cells", "colours", "compiled", "hog")]  # by numba: no bytecode
+COMPILED = ["catstream.features.kernels"]  # by numba: no bytecode
 
 with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
-    from catstream.box import Box, Window
+    from catstream.box import Box
     from catstream.compression.forest import Forest
     from catstream.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
     from catstream.messages import storage
     from catstream.messages.heads import GROUPS
     from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
-    from catstream.messages.schema import Array, ByObject, Bytes, Field, Name, Named, OnlyWith, fields
     from catstream.run.learned import Learned
     from catstream.settings import Settings
     from catstream.wire.codec import KINDS, decode, encode, topic_of
     from catstream.wire.keys import Keys, create
+
+    sys.path.append(str(Path(__file__).parents[1]))
+    from tests.wire.examples import example
 
 SECONDS = 5  # time limit of an input
 MEGABYTES = 64  # limit of the growth of resident memory
@@ -60,48 +62,6 @@ class Decoder:
         self.take, self.error, self.seeds = take, error, seeds
 
 
-def message(kind: type, full: bool, d: int = 5) -> Any:
-    """Return a valid message of a kind, made from its schema.
-
-    Parameters
-    ----------
-    full : with everything that may be missing and two objects, or without and with the object without a name
-    d : columns of its rows
-    """
-    values: dict[str, Any] = {}
-    for field in fields(kind):
-        rule = field.limit(OnlyWith)
-        given = full if rule is None else values.get(rule.field) == rule.value
-        values[field.name] = value(field, full, d) if given or not field.optional else None
-    return kind(**values)
-
-
-def value(field: Field, full: bool, d: int) -> Any:
-    """Return a valid value of a field."""
-    if field.limit(ByObject):
-        return {name: value(field.values, full, d) for name in (("anna", "ben") if full else ("",))}
-    if field.limit(Name):
-        return "anna" if full else ""
-    if field.values is not None:
-        named = field.limit(Named) or Named({"sent": 0, "stored": 0})
-        names = [name for name in named.columns if full or name in named.required]
-        return {name: value(field.values, full, d + named.columns[name]) for name in names}
-    if field.is_message:
-        return message(field.type, full, d)
-    if array := field.limit(Array):
-        shape = [side if isinstance(side, int) else d if side == "d" else 3 * full for side in array.shape]
-        return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=array.dtype).reshape(shape)
-    if limits := field.limit(Bytes):
-        return limits.begin
-    if get_origin(field.type) is Literal:
-        return get_args(field.type)[0 if full else -1]
-    if get_origin(field.type) is tuple:
-        return (3, 1, 0)
-    if field.type in (Box, Window):
-        return field.type(4.5, 3.0, 20.0, 10.0)
-    return {bool: full, int: 4, float: 0.75, str: "7f"}[field.type]
-
-
 def decoders(folder: Path) -> dict[str, Decoder]:
     """Return all decoders of untrusted bytes: each kind of message, and each kind of file.
 
@@ -109,7 +69,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     ----------
     folder : for the files
     """
-    seeds = {name: [message(kind, full=full) for full in (True, False)] for name, kind in KINDS.items()}
+    seeds = {name: [example(kind, full) for full in (True, False)] for name, kind in KINDS.items()}
     found = {
         name: Decoder(lambda data, kind=kind: encode(decode(data, kind)), ProtocolError, *map(encode, seeds[name]))
         for name, kind in KINDS.items()
@@ -122,7 +82,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
         "any message": Decoder(
             lambda data: encode(decode(data, *KINDS.values())),
             ProtocolError,
-            *(encode(message) for several in seeds.values() for message in several),
+            *(encode(each) for several in seeds.values() for each in several),
         ),
         "topic": Decoder(topic_of, ProtocolError, *(encode(both[0]) for both in seeds.values())),
         "storage": filed(folder / "a", storage.read, ProtocolError, (folder / "checkpoint").read_bytes()),
@@ -155,7 +115,7 @@ def grown() -> Forest:
     for seq in range(1, 12):
         rows = np.random.default_rng(seq).normal(size=(4, WIDTH)).astype("f4")
         training = dict.fromkeys(GROUPS, TrainingRows.labelled(rows, [1, 0, 1, 0]))
-        part = ObjectFeatures(BOX, training, message(DetectorState, full=True))
+        part = ObjectFeatures(BOX, training, example(DetectorState))
         forest.take(Features(seq, seq, 0.0, {"anna": part, "ben": part}))
     return forest
 

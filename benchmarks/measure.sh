@@ -16,7 +16,6 @@ measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
 
 measure startup "$python" benchmarks/startup.py --runs 3
 measure throughput "$python" benchmarks/throughput.py --runs 2
-measure kernels "$python" benchmarks/kernels.py
 measure objects "$python" benchmarks/objects.py
 measure wire "$python" benchmarks/wire.py
 measure subscribers "$python" benchmarks/subscribers.py --frames 1500 --runs 1

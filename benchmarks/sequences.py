@@ -13,7 +13,7 @@ from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.box import Box
 from catstream.errors import BoxError, VideoError
 from catstream.tracker import Tracker
-from catstream.video import rendered
+from catstream.video.rendered import FRAMES, SIZE, write
 from catstream.video.source import open_source
 
 FIRST = "first"  #: name of the object of a sequence, if it is one of several
@@ -32,10 +32,10 @@ def scratch() -> Path:
 
 
 @cache
-def rendered(frames: int, size: tuple[int, int] = rendered.SIZE) -> Sequence:
+def rendered(frames: int, size: tuple[int, int] = SIZE) -> Sequence:
     """Render the demo video, in any length and size, as a sequence."""
     folder = scratch() / f"demo-{size[0]}x{size[1]}-{frames}"
-    rendered.write(folder, frames, size)
+    write(folder, frames, size)
     return find_sequences(folder)[0]
 
 
@@ -63,7 +63,7 @@ def named(options: argparse.Namespace, name: str) -> Sequence:
     """Return the sequence of this name, or the demo video if there is no data folder."""
     if options.quick or options.data.is_dir():
         return sequences(options, name)[0]
-    return rendered(rendered.FRAMES, (320, 240))
+    return rendered(FRAMES, (320, 240))
 
 
 def video(sequence: Sequence) -> str:

@@ -9,19 +9,26 @@ from __future__ import annotations
 
 import math
 import reprlib
+import sys
 from collections.abc import Iterable
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
+
+from msgspec import Meta
 
 from catstream.errors import BoxError
+
+#: Numbers of a rectangle in a message; one that is made here is not checked.
+_Coordinate = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+_Side = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 
 
 class _Rectangle(NamedTuple):
     """A rectangle in pixels: top left corner, width and height."""
 
-    x: float
-    y: float
-    w: float
-    h: float
+    x: _Coordinate
+    y: _Coordinate
+    w: _Side
+    h: _Side
 
     @property
     def centre(self) -> tuple[float, float]:

@@ -9,76 +9,24 @@ from __future__ import annotations
 
 import math
 import os
-import threading
-from collections.abc import Callable, Mapping
-from functools import wraps
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
-from catstream.detection.likeness import Likeness
-from catstream.detection.objects import Detectors, prepare
-from catstream.errors import BoxError, FrameError, MissingFileError, ObjectError, ProtocolError, ServiceError
-from catstream.features.layout import row_length
+from catstream.detection.objects import Detectors
+from catstream.errors import BoxError, FrameError, ObjectError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import storage
-from catstream.messages.checks import check_message
-from catstream.messages.kinds import Features, Model, Track, Tracks
+from catstream.messages.kinds import Features, Track, Tracks
 from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
-from catstream.messages.packing import pack, unpack
-from catstream.messages.storage import Arrays, Metadata, with_prefix
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
-
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
-
-_KIND = "tracker 3"  # and the version of what the file holds
-
-
-class _Lock:
-    """A lock that one thread may take several times; a copy of it, also in another process, is a new one."""
-
-    def __init__(self) -> None:
-        self._lock = threading.RLock()
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-
-    def __exit__(self, *_: object) -> None:
-        self._lock.release()
-
-    def __reduce__(self) -> tuple[type[_Lock], tuple[()]]:
-        return _Lock, ()
-
-
-def _one_at_a_time(
-    method: Callable[Concatenate[MultiTracker, _Arguments], _Result],
-) -> Callable[Concatenate[MultiTracker, _Arguments], _Result]:
-    """A method whose calls by several threads wait for one another."""
-
-    @wraps(method)
-    def called(self: MultiTracker, /, *arguments: _Arguments.args, **more: _Arguments.kwargs) -> _Result:
-        with self._lock:
-            return method(self, *arguments, **more)
-
-    return called
-
-
-def _seconds(time: float) -> float:
-    """The time of a frame as a number of Python, which a saved tracker can contain."""
-    if not math.isfinite(time):
-        raise FrameError(f"the time of a frame is a finite number of seconds, got {time}: give another, or none")
-    return float(time)
 
 
 class MultiTracker:
@@ -86,7 +34,7 @@ class MultiTracker:
 
     The same frames and settings give the same boxes, bit for bit; they are those of a `catstream.Pipeline` in lockstep.
     While a call computes, linear algebra in this process runs on one thread; what was set before holds again once it
-    returns. Calls of several threads wait for one another.
+    returns. One thread at a time may call it; trackers in several threads do not affect one another.
 
     A frame is an array as `catstream.Tracker` takes it.
 
@@ -107,7 +55,6 @@ class MultiTracker:
     """
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
-        self._lock = _Lock()
         self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
         self._tracks: dict[str, Track] | None = None
 
@@ -131,7 +78,6 @@ class MultiTracker:
             raise BoxError("nothing is tracked yet: call init with a frame and a box first")
         return dict(self._tracks)
 
-    @_one_at_a_time
     def init(self, frame: np.ndarray, boxes: Boxes, time: float = 0.0) -> None:
         """Start with the boxes of objects, and forget everything before.
 
@@ -158,7 +104,6 @@ class MultiTracker:
             raise ObjectError("there is no object to follow: give a box for at least one name")
         check_count(len(boxes), self.settings.run.objects_most)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
-        prepare(self.settings)  # a library is held to one thread if it is there when a call begins
         with one_thread():
             pyramid = Pyramid(image)
             given = detectors.begin_all(boxes, pyramid, time)
@@ -166,7 +111,6 @@ class MultiTracker:
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
             self._learn(*detectors.step(pyramid, time, given))
 
-    @_one_at_a_time
     def update(
         self,
         frame: np.ndarray,
@@ -234,7 +178,6 @@ class MultiTracker:
         check_count(len(names), self.settings.run.objects_most)
         return {name: learned.compressor(self.settings, name) for name, learned in models.items()}
 
-    @_one_at_a_time
     def forget(self, name: str) -> None:
         """Stop tracking an object; everything learned of it is dropped with the next frame.
 
@@ -248,7 +191,6 @@ class MultiTracker:
         _ = self.tracks
         self.detectors.forget(name)
 
-    @_one_at_a_time
     def learned(self, name: str = UNNAMED) -> Learned:
         """Everything that was learned of an object: save it as a model, and use it in another video.
 
@@ -266,97 +208,16 @@ class MultiTracker:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
         return Learned.of(self.forest.compressors[name], self.settings)
 
-    @_one_at_a_time
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything that was learned to one file, atomically: `load` continues from there.
-
-        Raises
-        ------
-        BoxError
-            Before `init`.
-        ServiceError
-            If it cannot be written.
-        """
-        last = self.tracks
-        tracks = Tracks(self.forest.seq, self.forest.frame, last)
-        arrays, metadata = self.forest.state()
-        objects: list[Metadata] = []
-        for i, (name, detector) in enumerate(self.detectors.detectors.items()):
-            model, model_metadata = pack(detector.model, f"model.{i}")
-            start, start_metadata = detector.scm_state()
-            arrays |= model | {f"bootstrap.{i}.{key}": array for key, array in start.items()}
-            if detector.likeness is not None:
-                arrays |= {f"likeness.{i}.{key}": array for key, array in detector.likeness.state().items()}
-            objects.append({"name": name, "model": model_metadata, "bootstrap": start_metadata})
-        whole: Metadata = {
-            "kind": _KIND,
-            "program": version("catstream"),
-            "settings": self.settings.texts(),
-            "size": list(self._size),
-            "tracks": pack(tracks, "tracks")[1],
-            "forest": metadata,
-            "objects": objects,
-        }
-        with storage.writing(path):
-            storage.write(path, arrays, whole)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """A tracker that continues where `save` was called, bit for bit.
-
-        Raises
-        ------
-        ServiceError
-            If there is no such file, or it cannot be read.
-        ProtocolError
-            If it is damaged, another file, or of a catstream with other features.
-        """
-        if not Path(path).exists():
-            raise MissingFileError(f"there is no saved tracker {str(path)!r}: its method `save` writes one")
-        if not Path(path).is_file():
-            raise ServiceError(f"{str(path)!r} is not a file: give one that the method `save` of a tracker wrote")
-        try:
-            arrays, metadata = storage.read(path)
-        except OSError as error:
-            raise ServiceError(f"cannot read {str(path)!r} ({error.strerror}): give another file") from None
-        try:
-            if metadata.get("kind") != _KIND:
-                raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
-            return cls._of(arrays, metadata)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ProtocolError(f"{path} is not a saved tracker ({error}): `{cls.__name__}.save` writes one") from None
-
-    @classmethod
-    def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
-        self = cls(Settings.from_values(metadata["settings"]))
-        self.forest = Forest.from_state(arrays, metadata["forest"], self.settings)
-        self.trainer, self.detectors = Trainer(self.settings), Detectors(self.settings)
-        for i, each in enumerate(metadata["objects"]):
-            model = unpack(Model, arrays, each["model"], f"model.{i}")
-            check_message(model)
-            if len(model.weights) != row_length():
-                raise ValueError(
-                    f"its model has {len(model.weights)} weights, the features of this catstream are {row_length()}: "
-                    f"catstream {metadata['program']} wrote it"
-                )
-            detector = self.detectors.add(str(each["name"]))
-            state = self.forest.compressors[detector.name].detector
-            if state is None:
-                raise ValueError(f"it does not say where the object {detector.name!r} was")
-            detector.resume(state, model)
-            detector.resume_scm(with_prefix(arrays, f"bootstrap.{i}."), each["bootstrap"])
-            if likeness := with_prefix(arrays, f"likeness.{i}."):
-                detector.likeness = Likeness.from_state(likeness)
-        height, width = metadata["size"]
-        self._size = int(height), int(width)
-        tracks = unpack(Tracks, arrays, metadata["tracks"], "tracks")
-        check_message(tracks)
-        self._tracks = tracks.tracks
-        return self
-
     def _learn(
         self, tracks: Tracks, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})
     ) -> None:
         self._tracks = tracks.tracks
         for sample in self.forest.take(features, learned):
             self.detectors.adopt(self.trainer.train(sample))
+
+
+def _seconds(time: float) -> float:
+    """The time of a frame as a number of Python."""
+    if not math.isfinite(time):
+        raise FrameError(f"the time of a frame is a finite number of seconds, got {time}: give another, or none")
+    return float(time)

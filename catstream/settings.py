@@ -40,9 +40,7 @@ class _Group:
 
     group: ClassVar[str]
 
-    def __new__(cls, *unnamed: object, **values: object) -> Self:
-        if unnamed:
-            raise SettingsError(f"settings are given by name, got {unnamed[0]!r}: for example {cls.__name__}(name=1)")
+    def __new__(cls, **values: object) -> Self:
         for name in values:
             _check_name(f"{cls.group}.{name}")
         return super().__new__(cls)
@@ -60,58 +58,36 @@ class RunSettings(_Group):
 
     endpoint: Annotated[
         str,
-        _about(
-            "Where the processes meet: a folder for ipc:// sockets (empty: a new private one), "
-            "or tcp://HOST:PORT, the first of the ports that the channels use."
-        ),
+        _about("Where the processes meet: a folder for ipc:// sockets (empty: a new private one), or tcp://HOST:PORT."),
     ] = ""
     keys: Annotated[
         str,
-        _about(
-            "Folder of keys from `catstream keys new` (empty: none). With keys, all connections are encrypted, every "
-            "client must be allowed, and other hosts may reach the endpoint."
-        ),
+        _about("Folder of keys from `catstream keys new` (empty: none): then each client must be allowed."),
     ] = ""
     lockstep: Annotated[
-        bool,
-        _about("Make a run repeatable bit for bit: the detector waits for each model before it continues."),
+        bool, _about("Make a run repeatable bit for bit: the detector waits for each model before it continues.")
     ] = False
     lag_frames: Annotated[
         int,
-        _about(
-            "Frames of a file by which the detector may be ahead of learning: it waits for the model that results from "
-            "the frame so many frames ago (0: as lockstep).",
-            ge=0,
-            le=65536,
-        ),
+        _about("Frames of a file by which the detector may be ahead of learning (0: as lockstep).", ge=0, le=65536),
     ] = 25
     seed: Annotated[int, _about("Seed of all random numbers.", ge=0)] = 0
     image_rate: Annotated[
-        float,
-        _about("Frames per second of a folder or a pattern of images, and of a live demo.", ge=1e-9, le=1000),
+        float, _about("Frames per second of a folder or a pattern of images, and of a live demo.", ge=1e-9, le=1000)
     ] = 25.0
     skip_damaged: Annotated[
-        bool,
-        _about(
-            "Continue after a damaged place in a video file: frames that cannot be decoded are skipped and counted. "
-            "Without it, the run ends there."
-        ),
+        bool, _about("Continue after a damaged place in a video file. Without it, the run ends there.")
     ] = False
     resize: Annotated[
         bool,
         _about("Scale images of another size to that of the first one. Without it, the run ends at such an image."),
     ] = False
     unstored_frames: Annotated[
-        int,
-        _about("Features messages, up to 256 MiB, that may be sent and not yet stored.", ge=1, le=65536),
+        int, _about("Features messages, up to 256 MiB, that may be sent and not yet stored.", ge=1, le=65536)
     ] = 256
-    objects_most: Annotated[
-        int,
-        _about("Objects that a stream may have at most: each takes memory and time of its own.", ge=1, le=64),
-    ] = 32
+    objects_most: Annotated[int, _about("Objects that a stream may have at most.", ge=1, le=64)] = 32
     checkpoint_seconds: Annotated[
-        float,
-        _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600),
+        float, _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600)
     ] = 1.0
 
 
@@ -127,19 +103,11 @@ class CoresetSettings(_Group):
     ] = 0.0
     reduction: Annotated[
         Literal["svd", "frequent-directions"],
-        _about(
-            "How rows are reduced: the tree of the paper, which keeps the n strongest directions of each node and "
-            "grows with the logarithm of the video's length (svd), or one frequent-directions sketch of n rows, whose "
-            "size is constant (frequent-directions)."
-        ),
+        _about("How rows are reduced: by the tree of the paper (svd), or by one sketch of n rows, of constant size."),
     ] = "svd"
     sample_interval: Annotated[
         int,
-        _about(
-            "Frames between two samples from which the trainer learns; fewer as long as the trees are small and grow "
-            "by an eighth sooner.",
-            ge=1,
-        ),
+        _about("Frames between two samples from which a model is trained; fewer while the trees are small.", ge=1),
     ] = 8
 
 
@@ -152,8 +120,7 @@ class SearchSettings(_Group):
     mode: Annotated[
         Literal["local", "full"],
         _about(
-            "Search around the predicted place, and the whole frame if the score is low (local), or every whole "
-            "frame (full)."
+            "Search around the predicted place, and the whole frame if the score is low (local); or each whole frame."
         ),
     ] = "local"
     context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
@@ -162,13 +129,12 @@ class SearchSettings(_Group):
         int,
         _about(
             "Frames between two searches of the whole frame while the local score is between belief.weak_score and "
-            "belief.confident_score, or the object is not trusted. Below, each whole frame is searched.",
+            "belief.confident_score, or the object is not trusted.",
             ge=1,
         ),
     ] = 10
     motion_frames: Annotated[
-        int,
-        _about("Frames in a block of centres from which EM learns the parameters of the Kalman filter.", ge=8),
+        int, _about("Frames in a block of centres from which EM learns the parameters of the Kalman filter.", ge=8)
     ] = 64
 
 
@@ -179,17 +145,12 @@ class BeliefSettings(_Group):
     group = "belief"
 
     weak_score: Annotated[
-        float,
-        _about(
-            "Score below which the object is lost: reported as absent. A frame with such a local score is searched as "
-            "a whole."
-        ),
+        float, _about("Score below which the object is lost: it is absent, and the whole frame is searched.")
     ] = 0.3
     confident_score: Annotated[
         float,
         _about(
-            "Score from which the detector is confident if the object is trusted: it learns from the frame and adapts "
-            "the size (that of a redetected object is adapted from belief.weak_score). A lost object returns at this "
+            "Score from which a trusted object is learned from, and its size adapted. A lost object returns at this "
             "score."
         ),
     ] = 0.45
@@ -201,10 +162,7 @@ class BeliefSettings(_Group):
     ] = 0.4
     sighting_likeness: Annotated[
         float,
-        _about(
-            "Likeness to the object of a saved model that it needs to be detected for the first time: share of a "
-            "window's appearance in the subspace of the object, relative to that of the object itself."
-        ),
+        _about("Likeness to the object of a saved model that a window needs to be its first detection."),
     ] = 0.5
 
 
@@ -217,16 +175,15 @@ class TeachingSettings(_Group):
     bootstrap: Annotated[
         Literal["copies", "scm"],
         _about(
-            "Source of the first model: n affine copies of the first box (copies), or the boxes of the sparse "
-            "collaborative model, which follows the object until there are n of them, as in the paper (scm)."
+            "Source of the first model: n affine copies of the first box (copies), or n boxes of the sparse "
+            "collaborative model, as in the paper (scm)."
         ),
     ] = "copies"
     classifier: Annotated[
         Literal["joint", "least-squares", "one-class"],
         _about(
-            "How a model is learned: least squares of the object's mean against the background's mean and covariance, "
-            "plus the regression of the loss tree (joint); the former alone (least-squares); or the paper's one-class "
-            "linear SVM of the object's rows (one-class)."
+            "How a model is learned: least squares of the object's mean against the background, plus the regression of "
+            "the loss tree (joint); the former alone (least-squares); or the paper's one-class SVM (one-class)."
         ),
     ] = "joint"
     colours: Annotated[bool, _about("Use the histogram of the window's colours as a feature.")] = True
@@ -235,13 +192,7 @@ class TeachingSettings(_Group):
     ] = 3
     mirrored: Annotated[int, _about("How many of these copies are mirrored left to right.", ge=0)] = 1
     other_backgrounds: Annotated[
-        float,
-        _about(
-            "Share of the first frame's affine copies that are put on another background, so that the background "
-            "behind the object is not learned with it.",
-            ge=0,
-            le=1,
-        ),
+        float, _about("Share of the first frame's affine copies that are put on another background.", ge=0, le=1)
     ] = 0.9
     near_misses: Annotated[
         int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0, le=256)
@@ -259,22 +210,14 @@ class ExtentSettings(_Group):
 
     size_count: Annotated[int, _about("Sizes that a search may try, an odd number.", ge=1, le=15)] = 7
     aspect_count: Annotated[
-        int,
-        _about("Aspect ratios that a search may try, an odd number (1: the ratio never changes).", ge=1, le=15),
+        int, _about("Aspect ratios that a search may try, an odd number (1: it never changes).", ge=1, le=15)
     ] = 5
     prior: Annotated[
-        float,
-        _about(
-            "Weight of (log f)^2, for a size or aspect ratio that differs from the first box's by the factor f.", ge=0
-        ),
+        float, _about("Weight of (log f)^2, for a size or aspect ratio of f times that of the first box.", ge=0)
     ] = 0.5
     weight: Annotated[
         float,
-        _about(
-            "Weight of the extent head beside the appearance score if size and aspect ratio are chosen (0: the size "
-            "and aspect heads are not used either).",
-            ge=0,
-        ),
+        _about("Weight of the extent head beside the appearance score (0: size and aspect heads are off, too).", ge=0),
     ] = 1.0
 
 
@@ -318,11 +261,7 @@ class Settings:
             extent: ExtentSettings | Mapping[str, object] = ...,
         ) -> None: ...
 
-    def __new__(cls, *unnamed: object, **groups: object) -> Self:
-        if unnamed:
-            raise SettingsError(
-                f"settings are given by name, got {unnamed[0]!r}: for example Settings(coreset={{'size': 128}})"
-            )
+    def __new__(cls, **groups: object) -> Self:
         for name in groups:
             if name not in _groups():
                 _check_name(name)
@@ -348,14 +287,7 @@ class Settings:
         overrides: Mapping[str, object] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> Settings:
-        """Collect settings from all their sources: those that `given` finds, the others by default.
-
-        Raises
-        ------
-        SettingsError
-            For a name that does not exist (names the nearest), or a value that
-            does not fit.
-        """
+        """Collect settings from all their sources: those that `given` finds, the others by default."""
         return cls.from_values(cls.given(preset=preset, file=file, overrides=overrides, environment=environment))
 
     @staticmethod
@@ -417,10 +349,7 @@ class Settings:
     def for_length(self, frames: int | None) -> Settings:
         """These settings for a video of so many frames: `coreset.share` becomes a `coreset.size`.
 
-        Raises
-        ------
-        SettingsError
-            If there is a share and the length is not known.
+        SettingsError if there is a share and the length is not known.
 
         Examples
         --------

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
-from typing import Self
 
 import numpy as np
 
 from catstream.box import Box
-from catstream.errors import ObjectError
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED
 from catstream.multi import MultiTracker
@@ -18,10 +15,7 @@ from catstream.settings import Settings
 
 
 class Tracker:
-    """Follows one object, frame by frame; used like a `cv2.Tracker`.
-
-    The same frames and settings give the same boxes, bit for bit. While a call computes, linear algebra in this
-    process runs on one thread; what was set before holds again once it returns.
+    """Follows one object, frame by frame; used like a `cv2.Tracker`. It is a `MultiTracker` of one object.
 
     A frame is an array of shape (h, w, 3) in the order of OpenCV (blue, green, red), (h, w, 4) with transparency
     last (BGRA), or (h, w) or (h, w, 1) in grey; of uint8, uint16, or float from 0 to 1. All frames of an object have
@@ -44,24 +38,14 @@ class Tracker:
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self._objects = MultiTracker(settings)
+        self.settings = self._objects.settings
 
     def __repr__(self) -> str:
         return repr(self._objects).replace("MultiTracker", "Tracker", 1)
 
     @property
-    def settings(self) -> Settings:
-        """All settings."""
-        return self._objects.settings
-
-    @property
     def track(self) -> Track:
-        """The full result for the last frame: state, score, model version.
-
-        Raises
-        ------
-        BoxError
-            Before `init`.
-        """
+        """The full result for the last frame: state, score, model version. BoxError before `init`."""
         return self._objects.tracks[UNNAMED]
 
     def init(self, frame: np.ndarray, box: str | Iterable[float], time: float = 0.0) -> None:
@@ -86,7 +70,7 @@ class Tracker:
         self._objects.init(frame, {UNNAMED: box}, time)
 
     def update(self, frame: np.ndarray, time: float = 0.0) -> tuple[bool, Box | None]:
-        """Find the object in the next frame, and learn from it.
+        """Find the object in the next frame, and learn from it; errors as those of `MultiTracker.update`.
 
         Returns
         -------
@@ -94,57 +78,10 @@ class Tracker:
             Whether the object is there.
         box : Box or None
             Where, x, y, w, h in pixels; None while it is absent.
-
-        Raises
-        ------
-        BoxError
-            Before `init`.
-        FrameError
-            For an array that is not a frame, or is of another size than those before, or a time that is not finite.
         """
         track = self._objects.update(frame, time=time)[UNNAMED]
         return track.box is not None, track.box
 
     def learned(self) -> Learned:
-        """Everything that was learned of the object: save it as a model, and use it in another video.
-
-        Raises
-        ------
-        BoxError
-            Before `init`.
-        ServiceError
-            If too few frames were learned from.
-        """
+        """Everything that was learned of the object, as `MultiTracker.learned`."""
         return self._objects.learned()
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all that was learned to one file, whole or not at all: `Tracker.load` continues from there.
-
-        Raises
-        ------
-        BoxError
-            Before `init`.
-        ServiceError
-            If it cannot be written.
-        """
-        self._objects.save(path)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """A tracker that continues where `save` was called, bit for bit.
-
-        Raises
-        ------
-        ServiceError
-            If there is no such file, or it cannot be read.
-        ProtocolError
-            If it is damaged, another file, or of a catstream with other features.
-        ObjectError
-            If several objects are saved in it.
-        """
-        objects = MultiTracker.load(path)
-        if list(objects.tracks) != [UNNAMED]:
-            raise ObjectError(f"{path} has objects with names: load it with MultiTracker.load")
-        self = cls()
-        self._objects = objects
-        return self

@@ -5,10 +5,8 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 
-from catstream.compression import reduce
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
-from catstream.messages import storage
 from catstream.messages.kinds import End, Features
 from catstream.run.learned import begun
 from catstream.run.state import TREES, locked
@@ -29,9 +27,7 @@ from catstream.wire.newest import Publisher
 
 
 def prepare() -> None:
-    """Import everything that a reduction and a checkpoint need."""
-    reduce.prepare()
-    storage.prepare()
+    """Everything is imported above."""
 
 
 def main(process: Process) -> None:

@@ -34,7 +34,8 @@ from catstream.services.actions import Action
 from catstream.services.core_state import Known, Phase, Progress, Request, State
 from catstream.services.desired import DesiredObject, DesiredState
 from catstream.services.timing import FEATURES_END_SECONDS, RESULTS_END_SECONDS
-from catstream.wire.timing import EARLY_SECONDS
+
+EARLY_SECONDS = 5.0
 
 #: For the end to be stored, once the process was asked to end.
 _END_SECONDS = {"features": FEATURES_END_SECONDS, "results": RESULTS_END_SECONDS}

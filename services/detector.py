@@ -19,14 +19,11 @@ from typing import Any
 
 import cv2
 
-from catstream.detection import objects
 from catstream.detection.detector import Detector, Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.features.pyramid import Pyramid
-from catstream.messages import storage
 from catstream.messages.kinds import Command, End, Features, Model, Position, Tracks
-from catstream.numerics import ridge
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED
 from catstream.services import actions, core
@@ -34,7 +31,7 @@ from catstream.services.actions import Action
 from catstream.services.core import Event, History
 from catstream.services.core_state import Known, Phase, Progress, Request, Rules, State
 from catstream.services.desired import DESIRED, DesiredObject, DesiredState
-from catstream.services.loop import RECORDER, Process
+from catstream.services.loop import Process
 from catstream.services.model_files import ModelFiles
 from catstream.services.outputs import Outputs
 from catstream.services.timing import CLOSE_SECONDS, MODEL_SECONDS, OPEN_SECONDS, SKIP_SECONDS, TURN_SECONDS
@@ -63,9 +60,7 @@ _log = logging.getLogger(__name__)
 
 def prepare() -> None:
     """Import everything that tracking needs, and limit OpenCV to the thread that calls it."""
-    ridge.prepare()
     source.prepare()
-    storage.prepare()
     cv2.setNumThreads(1)
 
 
@@ -96,7 +91,6 @@ class DetectorLoop:
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
         settings, job = process.settings, process.job
-        objects.prepare(settings)
         self._process, self._began = process, time.monotonic()
         self._models_of_job = ModelFiles(job.state / SEARCHED if job.state is not None else None)
         desired = _desired(process, self._models_of_job)
@@ -234,8 +228,7 @@ class DetectorLoop:
     # What the core is told
 
     def _tell_subscribed(self) -> None:
-        missing, seconds = self._outputs.awaited, time.monotonic() - self._began
-        self.tell(core.Subscribed(RECORDER not in missing, not missing - {RECORDER}, seconds))
+        self.tell(core.Subscribed(True, True, time.monotonic() - self._began))
 
     def _request(self, command: Command) -> Request:
         """A command without the saved model, which is kept here."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.errors import CatstreamError, StreamRewoundError
-from catstream.messages.kinds import Health, Run
+from catstream.messages.kinds import Health
 from catstream.run.job import Job
 from catstream.services.process_title import set_process_title
 from catstream.services.timing import HEALTH_SECONDS, STUCK_SECONDS
@@ -22,7 +22,7 @@ from catstream.services.watchdog import Watchdog
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
-from catstream.wire.rejects import rejects
+from catstream.wire.socket import rejects
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
@@ -75,11 +75,6 @@ class Process:
     def seconds_since_stop(self) -> float:
         """Seconds since a signal asked the process to end; negative if none has."""
         return time.monotonic() - self._stop_moment
-
-    @property
-    def run(self) -> Run:
-        """The settings of the pipeline, which a recording needs to repeat the learning."""
-        return Run.from_settings(self.settings.portable())
 
     def beat(
         self,

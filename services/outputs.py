@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from typing import Self
 
 from catstream.messages.kinds import End, Features, Tracks
-from catstream.services.loop import RECORDER, Process
+from catstream.services.loop import Process
 from catstream.services.previews import Previews
 from catstream.services.timing import TURN_SECONDS
 from catstream.wire.acknowledged import Sender
@@ -35,19 +35,12 @@ class Outputs:
             owned = process.job.owned
             self.results = stack.enter_context(Sender(RESULTS, endpoint, window)) if owned else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
-            self._training = stack.enter_context(Publisher(TRAINING, endpoint, first_message=process.run))
+            self._training = stack.enter_context(Publisher(TRAINING, endpoint))
             self.previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
         self.senders: dict[str, DataSender] = {"features": self.features}
         if self.results is not None:
             self.senders["results"] = self.results
-        if process.job.record is not None:
-            self._tracks.awaited.add(RECORDER)
-
-    @property
-    def awaited(self) -> set[str]:
-        """Names of the subscribers that should be connected before the first frame, and are not yet."""
-        return self._tracks.awaited | self._training.awaited
 
     def poll(self, awaited: str | None = None) -> None:
         """Process acknowledgements; wait a short time for one on the channel `awaited`."""
@@ -55,7 +48,7 @@ class Outputs:
             sender.poll(TURN_SECONDS if name == awaited else 0)
 
     def serve_late_joiners(self) -> None:
-        """Send the first message or the newest preview to new subscribers."""
+        """Send the end or the newest preview to new subscribers."""
         self._tracks.serve_late_joiners()
         self._training.serve_late_joiners()
         self.previews.turn()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from catstream.wire.timing import PATIENCE_SECONDS, REPORT_SECONDS
-
 # Turns of loops.
 TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
 MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
@@ -45,10 +43,8 @@ KILLED_SECONDS = 5.0  #: limit for the end of a process that was killed
 
 #: A limit, a longer one, and what goes wrong otherwise.
 ORDER: tuple[tuple[float, float, str], ...] = (
-    (TURN_SECONDS, PATIENCE_SECONDS, "a receiver asks a detector that waits for something else a second time"),
     (MESSAGE_SECONDS, STUCK_SECONDS, "a process without messages counts as stuck"),
     (TURN_SECONDS, MESSAGE_SECONDS, "a process that died is restarted after the others have noticed it"),
-    (HEALTH_SECONDS, REPORT_SECONDS, "a client that waits for a health report receives none"),
     (STEP_SECONDS, STOPPED_SECONDS, "a process counts as stopped because its parent was suspended once"),
     (STEP_SECONDS, STUCK_SECONDS, "a process counts as stuck because its parent was suspended once"),
     (STUCK_SECONDS, LONGEST_STUCK_SECONDS, "the turns on a slow machine get no more time"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from catstream.messages.kinds import End
-from catstream.numerics import ridge
 from catstream.services.loop import Process
 from catstream.services.timing import CLOSE_SECONDS, MESSAGE_SECONDS, TRAIN_SECONDS
 from catstream.training.trainer import Trainer
@@ -14,8 +13,7 @@ _NONE = {"version": 0.0, "trained": 0.0}
 
 
 def prepare() -> None:
-    """Import everything that training needs."""
-    ridge.prepare()
+    """Everything that training needs is imported already."""
 
 
 def main(process: Process) -> None:

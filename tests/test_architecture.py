@@ -50,8 +50,7 @@ IMPORTERS = {
         "services/detector.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
-    "numba": ["catstream/features/compiler.py"],
-    "llvmlite": [f"catstream/features/{name}.py" for name in ("compiled", "compiler", "machine")],
+    "numba": ["catstream/features/kernels.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/store.py"],
@@ -60,20 +59,18 @@ IMPORTERS = {
     "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
     "zmq": [
-        "catstream/wire/context.py",
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",
         "catstream/wire/newest.py",
         "catstream/wire/commands.py",
-        "catstream/wire/monitor.py",
-        "catstream/wire/zap.py",
         "catstream/wire/keys.py",
+        "catstream/client/subscription.py",
     ],
     "mcap": ["catstream/sinks/mcap_sink.py"],
-    "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
         "catstream/client/registry.py",
+        *("catstream/box.py", "catstream/messages"),
         *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
         *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
         *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
@@ -89,11 +86,8 @@ IMPORTERS = {
 
 #: Libraries that take long to import: inside the function that needs them.
 SLOW = {
-    "sklearn",
     "mcap",
     "av",
-    "scipy",
-    "filterpy",
     "pyarrow",
     "ray",
     "obstore",
@@ -197,7 +191,7 @@ def test_slow_libraries_are_imported_by_the_functions_that_use_them():
 
 @pytest.mark.parametrize("name", ["compressor", "trainer"])
 def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
-    unused = SLOW | {"asyncio", "cv2", "llvmlite", "numba"}
+    unused = SLOW | {"asyncio", "cv2", "numba", "sklearn"}
     check = f"import sys, catstream.services.{name}; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")

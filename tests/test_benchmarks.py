@@ -7,11 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-ALONE, PAGE = BENCHMARKS / "kernels.py", BENCHMARKS / "page.py"
+ALONE, PAGE = BENCHMARKS / "startup.py", BENCHMARKS / "page.py"
 SLOW = BENCHMARKS / "fleet" / "faults.py"  # minutes; tests/fleet/test_fleet.py kills a node, too
 #: Its cluster is detached: it runs on when the object is deleted that has started it.
 SLOW_MARKS = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:subprocess:ResourceWarning")]
@@ -40,18 +39,6 @@ def test_a_benchmark_runs_as_a_process_of_its_own(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=150, check=False)
     assert done.returncode == 0, done.stderr
     assert_finite(figures)
-
-
-def test_two_runs_part_in_the_first_of_five_frames_apart_and_else_where_they_overlap_least(monkeypatch):
-    monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
-    parting = runpy.run_path(str(BENCHMARKS / "forks.py"))["parting"]
-    boxes = np.tile([10.0, 10, 20, 20], (20, 1))
-    others = boxes.copy()
-    others[3:7, 0] += 40  # four frames are too few
-    others[5, 0] = np.nan
-    assert parting(boxes, others) == 3
-    others[10:15, 0] += 40
-    assert parting(boxes, others) == 10
 
 
 def assert_finite(figures):

@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from catstream.box import Box
-from catstream.errors import BoxError, FrameError, ObjectError, ProtocolError, ServiceError, SettingsError
-from catstream.messages import storage
+from catstream.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
 from catstream.multi import MultiTracker
-from catstream.numerics import parallel
+from catstream.numerics import threads
 from catstream.settings import Settings
-from catstream.tracker import Tracker
 
 STEPS = {"anna": (4, 1), "ben": (-3, 2), "cleo": (0, -4)}  # pixels a frame
 STARTS = {"anna": (40, 30), "ben": (250, 60), "cleo": (150, 180)}
@@ -81,10 +79,10 @@ def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames, together)
 
 def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, together, monkeypatch):
     for cores in (1, 4):
-        monkeypatch.setattr(parallel, "_cores", lambda cores=cores: cores)
-        parallel._pool.cache_clear()
+        monkeypatch.setattr(threads, "_cores", lambda cores=cores: cores)
+        threads._pool.cache_clear()
         assert followed(frames, STEPS) == together
-    parallel._pool.cache_clear()
+    threads._pool.cache_clear()
 
 
 #: In which frame an object begins, and in which it is forgotten, if it is.
@@ -185,8 +183,6 @@ def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not
         assert without_version(tracks["anna"]) == without_version(other.update(frame)["anna"])
         if number == 3:  # not found yet
             assert tracks["cleo"].state == "absent"
-            tracker.save(tmp_path / "kept")
-            tracker = MultiTracker.load(tmp_path / "kept")
     assert tracks["cleo"].box.overlap(box_of("cleo", number)) > 0.6
     assert tracks["cleo"].model_version > cleo.model.version
     assert set(cleo.origins) < set(tracker.learned("cleo").origins)
@@ -206,32 +202,3 @@ def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
     with pytest.raises(ObjectError, match="a box and a saved model"):
         tracker.update(frames[1], begin={"cleo": box_of("cleo", 1)}, search={"cleo": cleo})
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
-
-
-@pytest.mark.parametrize("after", [1, 6, 11], ids="after {} frames".format)
-def test_saved_objects_continue_bit_for_bit(frames, after, tmp_path):
-    tracker = started(frames, ["anna", "ben"])
-    for number in range(1, after):
-        tracker.update(frames[number], begin={"cleo": box_of("cleo", number)} if number == 3 else {})
-    tracker.save(tmp_path / "kept")
-    loaded = MultiTracker.load(tmp_path / "kept")
-    assert loaded.tracks == tracker.tracks
-    assert [loaded.update(frame) for frame in frames[after:]] == [tracker.update(frame) for frame in frames[after:]]
-    loaded.forget("anna")
-    assert "anna" not in loaded.update(frames[-1])
-
-
-def test_saved_objects_with_names_are_not_loaded_as_one(frames, tmp_path):
-    started(frames).save(tmp_path / "kept")
-    with pytest.raises(ObjectError, match=r"MultiTracker\.load"):
-        Tracker.load(tmp_path / "kept")
-
-
-def test_a_damaged_list_of_objects_is_rejected_with_one_line(frames, tmp_path):
-    started(frames).save(tmp_path / "kept")
-    arrays, metadata = storage.read(tmp_path / "kept")
-    for objects in ([{"name": "ben"}], [{**metadata["objects"][0], "name": "ben"}], 3):
-        storage.write(tmp_path / "kept", arrays, metadata | {"objects": objects})
-        with pytest.raises(ProtocolError, match="is not a saved tracker") as error:
-            MultiTracker.load(tmp_path / "kept")
-        assert "\n" not in str(error.value)

@@ -95,12 +95,6 @@ def test_the_error_for_a_name_similar_to_no_other_contains_the_command_that_list
         Settings(qqq=1)
 
 
-@pytest.mark.parametrize("make", [Settings, CoresetSettings], ids=["all", "group"])
-def test_a_value_without_a_name_is_rejected(make):
-    with pytest.raises(SettingsError, match="given by name, got 64"):
-        make(64)
-
-
 def test_an_invalid_group_is_rejected():
     with pytest.raises(SettingsError, match=r"the group of settings coreset cannot be 64: give a CoresetSettings"):
         Settings(coreset=64)

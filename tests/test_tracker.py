@@ -13,8 +13,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.compression.forest import Forest
-from catstream.errors import BoxError, FrameError, ProtocolError, ServiceError, SettingsError
-from catstream.messages import storage
+from catstream.errors import BoxError, FrameError, SettingsError
 from catstream.settings import PRESETS, Settings
 from catstream.tracker import Tracker
 
@@ -149,104 +148,36 @@ def test_a_frame_whose_update_was_interrupted_counts_as_not_seen(video, monkeypa
     assert tracker.track.seq == 2
 
 
-def test_calls_of_several_threads_wait_for_one_another(video):
-    frames, tracker = video[0], started(video)
-    with ThreadPoolExecutor(3) as pool:
-        assert len(list(pool.map(tracker.update, frames[1:]))) == 19
-    assert tracker.track.seq == 20
-    assert copy.deepcopy(tracker).update(frames[-1]) == pickle.loads(pickle.dumps(tracker)).update(frames[-1])
-
-
-def results(tracker, frames):
-    return [(*tracker.update(frame), tracker.track) for frame in frames]
-
-
-_SKETCH = {"coreset.reduction": "frequent-directions"}
-
-
-@pytest.mark.parametrize("settings", [{}, _SCM, _SKETCH], ids=["copies", "scm", "sketch"])
-@pytest.mark.parametrize("after", [1, 4, 11], ids="after {} frames".format)
-def test_a_saved_tracker_continues_bit_for_bit(video, tmp_path, settings, after):
-    frames, tracker = video[0], started(video, settings)
-    results(tracker, frames[1:after])
-    tracker.save(tmp_path / "kept")
-    loaded = Tracker.load(tmp_path / "kept")
-    assert (loaded.track, loaded.settings) == (tracker.track, tracker.settings)
-    assert results(loaded, frames[after:]) == results(tracker, frames[after:])
-
-
-def test_times_of_numpy_are_saved_and_one_that_is_not_finite_is_rejected(video, tmp_path):
+def test_a_copy_of_a_tracker_continues_as_the_tracker(video):
     tracker = started(video)
-    for frame, time in zip(video[0][1:], (np.float32(0.5), np.int64(1)), strict=False):
-        tracker.update(frame, time)
-    for invalid in (math.nan, math.inf):
-        with pytest.raises(FrameError, match="finite number of seconds"):
-            tracker.update(video[0][3], invalid)
-    tracker.save(tmp_path / "kept")
-    assert Tracker.load(tmp_path / "kept").track.time == 1
+    tracker.update(video[0][1])
+    others = copy.deepcopy(tracker), pickle.loads(pickle.dumps(tracker))
+    assert {other.update(video[0][2]) for other in others} == {tracker.update(video[0][2])}
 
 
-def test_a_tracker_saved_while_the_object_is_absent_finds_it_as_the_other_does(video, tmp_path):
-    frames, tracker = video[0], started(video, {"search.motion_frames": 8})
-    results(tracker, [*frames[1:12], *[np.zeros_like(frames[0])] * 3])
-    assert tracker.track.state == "absent"
-    tracker.save(tmp_path / "kept")
-    back = results(tracker, frames[12:])
-    assert any(found for found, *_ in back)
-    assert results(Tracker.load(tmp_path / "kept"), frames[12:]) == back
+@pytest.mark.parametrize("time", [math.nan, math.inf])
+def test_a_time_that_is_not_finite_is_rejected(video, time):
+    with pytest.raises(FrameError, match="finite number of seconds"):
+        started(video).update(video[0][1], time)
 
 
-_LOADS = """
+_FOLLOWS = """
 import sys, numpy as np
 from catstream import Tracker
-tracker = Tracker.load(sys.argv[1])
-for frame in np.load(sys.argv[2]):
+first, *frames = np.load(sys.argv[1])
+tracker = Tracker()
+tracker.init(first, sys.argv[2])
+for frame in frames:
     tracker.update(frame)
     print(tracker.track)
 """
 
 
-def test_another_process_continues_bit_for_bit_with_any_number_of_threads(video, tmp_path):
+def test_another_process_gives_the_same_tracks_with_any_number_of_threads(video, tmp_path):
     frames, tracker = video[0], started(video)
-    results(tracker, frames[1:8])
-    tracker.save(tmp_path / "kept")
-    np.save(tmp_path / "rest.npy", frames[8:])
+    np.save(tmp_path / "frames.npy", frames)
     environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    command = [sys.executable, "-P", "-c", _LOADS, tmp_path / "kept", tmp_path / "rest.npy"]
+    command = [sys.executable, "-P", "-c", _FOLLOWS, tmp_path / "frames.npy", ",".join(map(str, video[1][0]))]
     told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    assert told.splitlines() == [str(track) for *_, track in results(tracker, frames[8:])]
-
-
-def test_a_missing_file_and_one_of_something_else_are_told_apart(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"there is no saved tracker 'nothing'.*`save` writes one") as missing:
-        Tracker.load("nothing")
-    assert isinstance(missing.value, ServiceError)
-    with pytest.raises(ServiceError, match="is not a file"):
-        Tracker.load(tmp_path)
-    (tmp_path / "text").write_text("root:x:0:0:root:/root:/bin/sh\n")
-    with pytest.raises(ProtocolError, match=r"is not an undamaged file of catstream .* a file that catstream wrote"):
-        Tracker.load(tmp_path / "text")
-    storage.write(tmp_path / "model", {"weights": np.zeros(3)}, {"kind": "learned 1"})
-    with pytest.raises(ProtocolError, match="of kind 'learned 1', not 'tracker 3'"):
-        Tracker.load(tmp_path / "model")
-
-
-def test_an_unwritable_place_is_named_as_it_was_given(video, tmp_path):
-    with pytest.raises(ServiceError, match=r"cannot write .*: give another place") as error:
-        started(video).save(tmp_path / "none" / "x")
-    assert ".part" not in str(error.value)
-
-
-def test_nothing_is_saved_before_init(tmp_path):
-    with pytest.raises(BoxError, match="call init"):
-        Tracker().save(tmp_path / "kept")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_tracker_of_other_features_is_rejected(video, tmp_path):
-    started(video).save(tmp_path / "kept")
-    arrays, metadata = storage.read(tmp_path / "kept")
-    shorter = {name: row[:-1].copy() for name, row in arrays.items() if name.startswith("model.0.") and row.ndim == 1}
-    storage.write(tmp_path / "kept", arrays | shorter, metadata)
-    with pytest.raises(ProtocolError, match="its model has 2463 weights, the features of this catstream are 2464"):
-        Tracker.load(tmp_path / "kept")
+    tracks = [(tracker.update(frame), tracker.track)[1] for frame in frames[1:]]
+    assert told.splitlines() == [str(track) for track in tracks]

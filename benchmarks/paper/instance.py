@@ -23,21 +23,17 @@ from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
-from unittest.mock import patch
 
 import cv2
 import numpy as np
 import shared  # noqa: F401
 from groups import CHECK
-from sequences import scratch, sequences
+from sequences import sequences
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.finding.find import File, Search
-from catstream.applications.finding.scan import Scan, Seen
+from catstream.applications.finding.scan import Scan
 from catstream.box import Box
-from catstream.features.cells import Cells
-from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import non_maximum_suppression
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
@@ -45,7 +41,6 @@ from catstream.services.start import SPAWN
 from catstream.tracker import Tracker
 from catstream.video import rendered
 from catstream.video.source import open_source
-from catstream.video.writer import VideoWriter
 
 Found = list[tuple[float, Box]]
 Finder = Callable[[np.ndarray], Found]
@@ -83,7 +78,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         if names:
             yield _summary(title, {name: answers[name] for name in names}, milliseconds)
     yield _paper(found, *((8, 4) if options.quick else (_PLAIN, _OTHERS)))
-    yield _scans(options, found)
     yield _each(answers)
 
 
@@ -340,72 +334,6 @@ def _painted(
     image = (share * placed + (1 - share) * background) * rng.uniform(*lights)
     noisy = image + rng.normal(scale=3.0, size=image.shape)
     return noisy.clip(0, 255).astype(np.uint8), Box(x - side / 2, y - side / 2, side, side)
-
-
-def _scans(options: argparse.Namespace, found: list[Sequence]) -> Table:
-    """Models together against each model's plain scan, and the search of a video against its duration."""
-    picked = [sequence for sequence in found if sequence.name not in CHECK]
-    picked = picked[:: max(1, len(picked) // 10)][:10]
-    learned = [learn([next(iter(each.frames()))], Box(*each.boxes[0].tolist())) for each in picked]
-    frames = [image for image, _ in rendered.render(2 if options.quick else 150)]
-    rows = []
-    for count in (1, 3) if options.quick else (1, 3, 10):
-        models = [learned[number % len(learned)] for number in range(count)]
-        sample = [Pyramid(image) for image in frames[::30]]
-        with one_thread(opencv=True):
-            together, seconds = _timed(Scan(models), sample)
-            with patch.object(Cells, "respond_above", _every_window):
-                alone = [_timed(Scan([model]), sample) for model in models]
-        plain = sum(spent for _, spent in alone)
-        pairs = zip(zip(*together, strict=True), (found for found, _ in alone), strict=True)
-        same = sum(_agree(one, other[0]) for ours, theirs in pairs for one, other in zip(ours, theirs, strict=True))
-        each = [1000 * spent / len(sample) for spent in (plain, seconds)]
-        agree = f"{same} of {count * len(sample)}"
-        rows.append((count, *each, plain / seconds, agree, _speed(models, frames)))
-    columns = (
-        "models",
-        "plain scan, ms a frame",
-        "together",
-        "ratio",
-        "the same best window",
-        "x real time, all cores",
-    )
-    note = "640x480 pixels; the search of a video of 25 frames/s takes one frame in 0.2 seconds"
-    return Table("Scans", columns, rows, note)
-
-
-def _timed(scan: Scan, frames: list[Pyramid]) -> tuple[list[list[list[Seen]]], float]:
-    """The windows that a scan finds in each frame, and its seconds."""
-    started = perf_counter()
-    found = [scan.windows(frame) for frame in frames]
-    return found, perf_counter() - started
-
-
-def _every_window(cells: Cells, weights: np.ndarray, bias: float, least: float) -> np.ndarray:
-    """Replaces `Cells.respond_above`: the score of every window is computed to the end."""
-    scores = cells.respond(weights, bias)
-    return np.where(scores >= least, scores, -np.inf)
-
-
-def _agree(found: list[Seen], plain: list[Seen]) -> bool:
-    """Whether two scans have the same best window, or both none."""
-    if not found or not plain:
-        return found == plain
-    return bool(np.allclose(found[0].window, plain[0].window)) and abs(found[0].score - plain[0].score) < 1e-4
-
-
-def _speed(models: list[Learned], frames: list[np.ndarray]) -> float:
-    """Duration of a video divided by the time of its search."""
-    path = scratch() / "speed.mp4"
-    if not path.exists():
-        with VideoWriter(path, 25, frames[0].shape[1::-1]) as video:
-            for frame in frames:
-                video.write(frame)
-    search = Search({str(number): model for number, model in enumerate(models)})
-    started = perf_counter()
-    for _ in search.file(File(path, "video")):
-        pass
-    return len(frames) / 25 / (perf_counter() - started)
 
 
 def _apart(found: Found) -> Found:

@@ -14,7 +14,7 @@ from accuracy import MEANS, accuracy_command, described, means, spread, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark
 
-from catstream.compression import sampling
+from catstream.compression.node import sample
 from catstream.compression.tree import CoresetTree
 from catstream.messages.kinds import Summary
 from catstream.settings import PRESETS, Settings
@@ -29,7 +29,7 @@ class RootTree(CoresetTree):
     def sample(self) -> Summary:
         root = self.nodes[0]
         mean = (root.sum / root.count).astype(root.rows.dtype)
-        return Summary(sampling.sample([root], self.size), mean, root.count, (root.level,))
+        return Summary(sample([root], self.size), mean, root.count, (root.level,))
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:

@@ -15,12 +15,12 @@ from rich.console import Console
 
 from catstream.cli.common import complain, screen, table
 from catstream.client.registry import address_of, locate
-from catstream.client.subscription import AnyMessage, Subscription, subscribe, wait_until_running
+from catstream.client.subscription import Subscription, subscribe, wait_until_running
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health
 from catstream.messages.names import counted
 from catstream.services.options import NumberRange, combined, with_json, with_keys
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, PUBLIC
 from catstream.wire.endpoint import Endpoint
 
 _PROCESSES = CHANNELS["health"].senders
@@ -68,7 +68,7 @@ def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
 
 
 @click.command()
-@click.argument("channel", type=click.Choice(["tracks", "models", "health", "samples", "features", "previews"]))
+@click.argument("channel", type=click.Choice(list(PUBLIC)))
 @with_endpoint
 @with_wait
 @click.option("--object", "name", metavar="NAME", help="Only the tracks, models or samples of this object.")
@@ -101,7 +101,7 @@ def watch(
       catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
     """
     seen = 0
-    with Subscription[AnyMessage](endpoint, channel, object=name, keys=keys) as messages:
+    with Subscription[Any](endpoint, channel, object=name, keys=keys) as messages:
         with suppress(KeyboardInterrupt):
             wait_for_pipeline(messages.endpoint, messages.keys, wait)
             for message in messages:

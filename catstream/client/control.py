@@ -27,7 +27,10 @@ from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import Place, find, is_deserted, source_at
 from catstream.wire.newest import Subscriber
-from catstream.wire.timing import ANSWER_SECONDS, DESERTED_SECONDS, REGISTRY_SECONDS
+
+ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
+DESERTED_SECONDS = 1.0  #: for an answer from a folder in which no pipeline seems to run; its detector may be restarted
+REGISTRY_SECONDS = 1.0  #: for the registry before each command; without an answer, the stream has not moved
 
 
 class Control:
@@ -51,6 +54,8 @@ class Control:
         the endpoint, a folder, that is said after a second.
     ServiceError
         From each command, if these keys do not have the role "control".
+    ObjectError
+        From each command, if the name of the object is not valid.
     """
 
     def __init__(
@@ -80,11 +85,6 @@ class Control:
         keep : bool
             Whether the box corrects the position of the same object. By default, another object takes the name, and
             everything that was learned of the previous one is dropped.
-
-        Raises
-        ------
-        ObjectError
-            If the name is not valid.
         """
         return self.execute("set-box", object, box=Box.parse(box), keep=keep)
 
@@ -104,8 +104,6 @@ class Control:
 
         Raises
         ------
-        ObjectError
-            If the name is not valid.
         ServiceError, ProtocolError
             If the file cannot be read, or is not a saved model.
         """
@@ -116,11 +114,6 @@ class Control:
         """Stop tracking an object, and drop everything that was learned of it; without a name, the only object.
 
         The other objects continue. If none is left, the run waits for a box, as if it was paused.
-
-        Raises
-        ------
-        ObjectError
-            If the name is not valid.
         """
         return self.execute("forget", object)
 
@@ -146,8 +139,6 @@ class Control:
 
         Raises
         ------
-        ObjectError
-            If the name is not valid.
         ServiceError
             If the file cannot be written.
         """
@@ -169,13 +160,7 @@ class Control:
         keep: bool = False,
         model: bytes | None = None,
     ) -> Answer:
-        """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol.
-
-        Raises
-        ------
-        ObjectError
-            If the name of the object is not valid.
-        """
+        """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol."""
         command = Command(uuid4().hex, verb, box, keep, check_name(object), model)
         self._follow()
         first = min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0

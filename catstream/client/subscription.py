@@ -15,50 +15,27 @@ continues if the stream moves to another node.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import threading
 from contextlib import ExitStack
 from time import monotonic
-from typing import Any, Generic, Literal, NamedTuple, Self, TypedDict, TypeVar, Unpack, cast, overload
+from typing import Any, Generic, Self, TypeVar, cast
 
-from catstream.client.registry import FollowedStream, described, follow
+import zmq
+import zmq.asyncio
+
+from catstream.client.registry import described, follow
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, Model, Preview, Run, Sample, Track
+from catstream.messages.kinds import End, Features, Health, Track
 from catstream.messages.names import check_name
-from catstream.wire.channels import CHANNELS, TRACKS
+from catstream.wire.channels import PUBLIC, TRACKS
 from catstream.wire.endpoint import Endpoint, Place, find
 from catstream.wire.newest import GapCounter, Subscriber
-from catstream.wire.readable import Turns, Wait, finish, finish_async
-from catstream.wire.timing import CHECK_SECONDS, DRAIN_SECONDS, REPORT_SECONDS
 
-#: Public name -> channel. Subscribers get features from the channel of copies; `catstream.control` gets saved models.
-_SUBSCRIBABLE = {
-    **{name: name for name in ("samples", "models", "tracks", "health", "previews")},
-    "features": "training",
-}
+REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a running pipeline sends one every second
+CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
+DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
 
-#: ZeroMQ connects again only while the subscriber reads: the end is lost if it did not read since a restart.
-_GONE = "its sockets were removed, and this subscriber did not receive its end"
-
-#: A message of any channel that can be subscribed to.
-AnyMessage = Track | Model | Health | Sample | Features | Preview
-Message = TypeVar("Message", bound=AnyMessage)
-
-
-#: Public name of a channel whose messages are about one object each -> their kind.
-_KINDS: dict[str, type] = {"tracks": Track, "models": Model, "samples": Sample}
-
-
-class _Connection(NamedTuple):
-    """The sockets of a subscription to one pipeline.
-
-    endpoint  of the pipeline
-    messages  receives the messages of the channel
-    ends      receives the end: if this subscriber is slow, the end could be among the messages that are dropped
-    """
-
-    endpoint: Endpoint
-    messages: Subscriber[Any]
-    ends: Subscriber[Any]
+Message = TypeVar("Message")
 
 
 class Subscription(Generic[Message]):
@@ -68,8 +45,7 @@ class Subscription(Generic[Message]):
     detector some are repeated. For models, samples, previews and health reports, the last message arrives at once; then
     each iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for
     each object, and the object that has waited longest comes first. A subscriber to a named endpoint may start before
-    the pipeline. If both run on the same machine as the same user, the pipeline waits for it, so that it receives every
-    message.
+    the pipeline.
 
     The subscription to a stream of a fleet continues if the stream moves or is started again, and while the registry of
     the fleet cannot be reached. It ends if the stream has ended, or was removed from the fleet. A frame that the stream
@@ -86,6 +62,8 @@ class Subscription(Generic[Message]):
         Folder of the client keys; empty if there are none.
     timeout : float or None
         Seconds without a message after which iteration raises `SilenceError`.
+    place : Endpoint or None
+        Endpoint of the connected pipeline; None if the stream of a fleet has not run yet.
 
     Raises
     ------
@@ -104,24 +82,29 @@ class Subscription(Generic[Message]):
         timeout: float | None = None,
         keys: str = "",
     ) -> None:
-        if channel not in _SUBSCRIBABLE:
+        if channel not in PUBLIC:
             raise ServiceError(
-                f"expected one of the channels {', '.join(_SUBSCRIBABLE)}, got {channel!r}: subscribe to one of them"
+                f"expected one of the channels {', '.join(PUBLIC)}, got {channel!r}: subscribe to one of them"
             )
-        if object is not None and channel not in _KINDS:
+        self._name, self._channel, self._gaps = channel, PUBLIC[channel], GapCounter()
+        if object is not None and not self._channel.by_object:
+            names = ", ".join(name for name, row in PUBLIC.items() if row.by_object)
             raise ServiceError(
-                f"a message of {channel} is about all objects: subscribe to {', '.join(_KINDS)} for one object, or to "
-                f"{channel} without an object"
+                f"a message of {channel} is about all objects: subscribe to {names} for one object, or to {channel} "
+                "without an object"
             )
         self._about = None if object is None else check_name(object)
         self.endpoint, self.keys, self.timeout = str(endpoint), keys, timeout
         self.end: End | None = None
-        self._name, self._channel, self._gaps = channel, CHANNELS[_SUBSCRIBABLE[channel]], GapCounter()
+        self.place: Endpoint | None = None
         self._close_time = float("inf")  # until which messages may still arrive after the end
         self._rejected = 0  # by the connections before this one
-        self._connection: _Connection | None = None
+        # The end has a socket of its own: if this subscriber is slow, it could be among the messages that are dropped.
+        self._messages: Subscriber[Any] | None = None
+        self._ends: Subscriber[Any] | None = None
         self._has_run = False  # whether the pipeline was there before
-        self._turns = Turns("subscription")
+        self._over = self._closed = False
+        self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
         self._stream = follow(endpoint, keys)
         if self._stream is not None:
             self._follow()
@@ -129,7 +112,7 @@ class Subscription(Generic[Message]):
             place = find(endpoint, keys)
             self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
             self._has_run = not place.lacks_sockets()
-            self._connect(place, early=self._channel.keeps == "every")
+            self._connect(place)
 
     @property
     def missed(self) -> int:
@@ -150,26 +133,22 @@ class Subscription(Generic[Message]):
         return f"{self.missed} missed{before}"
 
     @property
-    def place(self) -> Endpoint | None:
-        """Endpoint of the connected pipeline; None if the stream of a fleet has not run yet."""
-        return self._connection.endpoint if self._connection is not None else None
-
-    @property
     def run(self) -> str:
         """Id of the run that the last message is from: of one start of one pipeline; empty if it is not known."""
-        return self._connection.messages.run if self._connection is not None else ""
+        return self._messages.run if self._messages is not None else ""
 
     @property
     def rejected(self) -> int:
         """Messages that were dropped because they were not what the channel carries."""
-        return self._rejected + (self._connection.messages.rejected if self._connection is not None else 0)
+        return self._rejected + (self._messages.rejected if self._messages is not None else 0)
 
     def close(self) -> None:
-        """Disconnect. A loop of another thread or task ends with a ServiceError."""
-        self._turns.close()
-        self._disconnect()
-        if self._stream is not None:
-            self._stream.close()
+        """Disconnect. A loop of another thread or task ends with a ServiceError, soon."""
+        self._closed = True
+        with self._turn:
+            self._disconnect()
+            if self._stream is not None:
+                self._stream.close()
 
     def __enter__(self) -> Self:
         return self
@@ -181,67 +160,81 @@ class Subscription(Generic[Message]):
         return self
 
     def __next__(self) -> Message:
-        if (message := finish(self._turns.run(self._next()))) is None:
-            raise StopIteration
+        deadline = self._deadline()
+        while (message := self._take(deadline)) is None:
+            if self._over:
+                raise StopIteration
+            self._poller(zmq.Poller()).poll(self._milliseconds(deadline))
         return message
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> Message:
-        if (message := await finish_async(self._turns.run(self._next()))) is None:
-            raise StopAsyncIteration
+        deadline = self._deadline()
+        while (message := self._take(deadline)) is None:
+            if self._over:
+                raise StopAsyncIteration
+            await self._poller(zmq.asyncio.Poller()).poll(self._milliseconds(deadline))
         return message
 
-    def _next(self) -> Generator[Wait, None, Message | None]:
-        """Wait for the next message, and return it; None at the end."""
-        deadline = float("inf") if self.timeout is None else monotonic() + self.timeout
-        while (message := self._receive()) is None:
+    def _deadline(self) -> float:
+        return float("inf") if self.timeout is None else monotonic() + self.timeout
+
+    def _poller(self, poller: Any) -> Any:
+        """A poller of the sockets, by their descriptors, which another thread may close meanwhile."""
+        for socket in (self._messages, self._ends):
+            if socket is not None and not self._closed:
+                poller.register(socket.fileno(), zmq.POLLIN)
+        return poller
+
+    def _milliseconds(self, deadline: float) -> float:
+        """The time to wait for the sockets."""
+        until = min(deadline if self.end is None else float("inf"), self._close_time)
+        return 1000 * max(0.0, min(until - monotonic(), CHECK_SECONDS))
+
+    def _take(self, deadline: float) -> Message | None:
+        """The next message if one has arrived, without waiting; what else is to be done before the next wait."""
+        with self._turn:
+            if self._closed:
+                raise ServiceError("the subscription was closed, perhaps by another thread or task: make another one")
+            if (message := self._receive()) is not None:
+                self._has_run = True
+                return message
             self._follow()
-            if self.end is not None and monotonic() >= self._close_time:
-                # One object may have been forgotten before; the end of a fleet's stream may have no number.
-                if self._channel.keeps == "every" and self._about is None and self.end.seq:
-                    self._gaps.take(self.end.seq)
-                return None
             if self.end is None and self._stream is None:
                 self._look_for_sockets()
-            yield Wait(self._sockets(), self._wait_seconds(deadline))
-        self._has_run = True
-        return message
-
-    def _sockets(self) -> list[int]:
-        """The sockets that are polled for messages."""
-        sockets: list[Subscriber[Any] | FollowedStream] = [] if self._stream is None else [self._stream]
-        if self._connection is not None:
-            sockets += [self._connection.messages, self._connection.ends]
-        return [socket.fileno() for socket in sockets]
+            if self.end is None and monotonic() >= deadline:
+                why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
+                raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
+            self._over = self.end is not None and monotonic() >= self._close_time
+            # One object may have been forgotten before; the end of a fleet's stream may have no number.
+            if self._over and self.end and self.end.seq and self._channel.keeps == "every" and self._about is None:
+                self._gaps.take(self.end.seq)
+            return None
 
     def _receive(self) -> Message | None:
-        """Return the next message if one has arrived, without waiting."""
-        if (connection := self._connection) is None:
-            return None
-        while (message := connection.messages.receive(0)) is not None:
-            if self._stream is not None and not isinstance(message, End) and not self._stream.take(message):
+        while self._messages is not None and (message := self._messages.receive(0)) is not None:
+            if isinstance(message, End):
+                if self._channel.keeps == "every":  # the last message here
+                    self._pipeline_ended(message, 0.0)
+                continue
+            if self._stream is not None and not self._stream.take(message):
                 continue  # the stream was started again, and repeats a frame
             if isinstance(message, Track | Features):
                 began = message.began if self._about is not None and isinstance(message, Track) else None
                 self._gaps.take(message.seq, began)
-            if not isinstance(message, Run | End):
-                return cast(Message, message)
-            if isinstance(message, End) and self._channel.keeps == "every":  # the last message here
-                self._pipeline_ended(message, 0.0)
-                return None
-        for end in connection.ends.receive_all():
-            if self.end is None and isinstance(end, End):
-                self._pipeline_ended(end, monotonic() + DRAIN_SECONDS)
+            return cast(Message, message)
+        if self._ends is not None and self.end is None and (end := self._ends.receive(0)) is not None:
+            self._pipeline_ended(end, DRAIN_SECONDS)
         return None
 
-    def _pipeline_ended(self, end: End, close_time: float) -> None:
-        """End at this time; a stream of a fleet may continue with another pipeline."""
+    def _pipeline_ended(self, end: End, seconds: float) -> None:
+        """End after so many seconds; a stream of a fleet may continue with another pipeline."""
         if self._stream is not None:
             self._stream.pipeline_ended(end)
         else:
-            self.end, self._close_time = end, close_time
+            self.end, self._close_time = end, monotonic() + seconds
 
     def _follow(self) -> None:
         """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
@@ -250,63 +243,36 @@ class Subscription(Generic[Message]):
         moved = self._stream.update()
         if self._stream.end is not None:
             self.end, self._close_time = self._stream.end, monotonic() + DRAIN_SECONDS
-        elif (moved or self._connection is None) and (place := self._stream.place) is not None:
+        elif (moved or self._messages is None) and (place := self._stream.place) is not None:
             self._disconnect()
             self._connect(place)
 
     def _look_for_sockets(self) -> None:
-        """End if the pipeline has removed its sockets from its folder, which it does once it has ended."""
+        """End if the pipeline has removed its sockets from its folder, which it does once it has ended.
+
+        ZeroMQ connects again only while the subscriber reads: the end is lost if it did not read since a restart.
+        """
         lacks_sockets = self.place is not None and self.place.lacks_sockets()
         if lacks_sockets and self._has_run:
-            self._pipeline_ended(End(0, _GONE), monotonic() + DRAIN_SECONDS)
+            gone = "its sockets were removed, and this subscriber did not receive its end"
+            self._pipeline_ended(End(0, gone), DRAIN_SECONDS)
         self._has_run = self._has_run or not lacks_sockets
 
-    def _connect(self, place: Endpoint, *, early: bool = False) -> None:
-        """Connect to a pipeline; if `early`, one that starts later waits for this subscription."""
-        only = None if self._about is None else _KINDS[self._name]
+    def _connect(self, place: Endpoint) -> None:
+        only = None if self._about is None else self._channel.messages[0]
         with ExitStack() as stack:
-            messages = stack.enter_context(Subscriber(self._channel, place, only, about=self._about, early=early))
-            self._connection = _Connection(place, messages, Subscriber(TRACKS, place, only=End))
+            self._messages = stack.enter_context(Subscriber(self._channel, place, only, about=self._about))
+            self._ends, self.place = Subscriber(TRACKS, place, only=End), place
             stack.pop_all()
 
     def _disconnect(self) -> None:
-        if self._connection is not None:
-            self._connection.messages.close()
-            self._connection.ends.close()
-            self._rejected += self._connection.messages.rejected
-            self._connection = None
-
-    def _wait_seconds(self, deadline: float) -> float:
-        """Return the seconds to wait for the sockets. Raises SilenceError after the deadline."""
-        now = monotonic()
-        if now >= deadline and self.end is None:
-            why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
-            raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
-        until = min(deadline if self.end is None else float("inf"), self._close_time, now + CHECK_SECONDS)
-        return max(0.0, until - now)
+        if self._messages is not None and self._ends is not None:
+            self._messages.close()
+            self._ends.close()
+            self._rejected += self._messages.rejected
+        self._messages = self._ends = None
 
 
-class _Options(TypedDict, total=False):
-    timeout: float | None
-    keys: str
-
-
-class _OfObject(_Options, total=False):
-    object: str | None
-
-
-@overload
-def subscribe(endpoint: Place, channel: Literal["tracks"], **options: Unpack[_OfObject]) -> Subscription[Track]: ...
-@overload
-def subscribe(endpoint: Place, channel: Literal["models"], **options: Unpack[_OfObject]) -> Subscription[Model]: ...
-@overload
-def subscribe(endpoint: Place, channel: Literal["samples"], **options: Unpack[_OfObject]) -> Subscription[Sample]: ...
-@overload
-def subscribe(endpoint: Place, channel: Literal["health"], **options: Unpack[_Options]) -> Subscription[Health]: ...
-@overload
-def subscribe(endpoint: Place, channel: Literal["features"], **options: Unpack[_Options]) -> Subscription[Features]: ...
-@overload
-def subscribe(endpoint: Place, channel: Literal["previews"], **options: Unpack[_Options]) -> Subscription[Preview]: ...
 def subscribe(
     endpoint: Place,
     channel: str,
@@ -324,7 +290,8 @@ def subscribe(
         only running pipeline of this user. The address of a stream of a fleet is `fleet://HOST:PORT/STREAM`, with host
         and port of its registry; `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
     channel : str
-        "tracks", "models", "health", "samples", "features" or "previews".
+        "tracks", "models", "health", "samples", "features" or "previews": the messages are `Track`, `Model` and so on
+        of `catstream.messages.kinds`.
     object : str or None
         Name of the one object whose tracks, models or samples are received; "" for the object without a name, None for
         all objects.

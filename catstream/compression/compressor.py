@@ -16,8 +16,7 @@ from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpa
 from catstream.errors import SettingsError
 from catstream.messages.heads import APPEARANCE, TREES, Tree
 from catstream.messages.kinds import DetectorState, ObjectFeatures, ObjectPosition, Sample, TrainingRows
-from catstream.messages.packing import pack, unpack
-from catstream.messages.storage import Arrays, Metadata
+from catstream.messages.storage import Arrays, Metadata, pack, unpack
 from catstream.numerics.arrays import Bool, Float32
 from catstream.settings import Settings
 

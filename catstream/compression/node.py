@@ -1,13 +1,23 @@
-"""A node of the coreset tree: the summary of consecutive rows."""
+"""A node of the coreset tree, the summary of consecutive rows; and a sample of several nodes.
+
+The hierarchical sample has more rows of a node the higher its level is. The rows of a node are singular directions, not
+images: the sign of each is arbitrary, and all except the first have a mean near zero, so that a classifier cannot be
+trained on them. Any left rotation Q of a coreset is an equivalent coreset, ||Q C Y|| = ||C Y||. The reflection that
+distributes the first row, the mean direction, evenly over all rows makes every row the mean plus a variation.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 
 import numpy as np
 
 from catstream.compression.reduce import energy, products, reduce
+
+_NOTHING = np.empty((0, 0), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,3 +72,64 @@ class Node:
         total = self.sum + newer.sum
         rows = reduce(np.vstack([self.rows, newer.rows]), len(self.rows), total, self.products_with(newer))
         return Node(self.level + 1, rows, self.count + newer.count, total, self.energy + newer.energy)
+
+
+def share(level: int, top: int, size: int) -> int:
+    """Number of rows to take from a node: n w with w = 2**(level - top), rounded down.
+
+    >>> [share(level, top=3, size=64) for level in (3, 2, 0)]
+    [64, 32, 8]
+    """
+    return size >> (top - level)
+
+
+def sample(nodes: Sequence[Node], size: int, sampled: Sequence[Node] = (), known: np.ndarray = _NOTHING) -> np.ndarray:
+    """The first n w rows of each node, reflected and rescaled so that each has the weight of one original row.
+
+    Parameters
+    ----------
+    nodes : oldest first, levels strictly falling
+    size : n
+    sampled, known : nodes of an earlier sample, and its rows: those of the nodes that both begin with are not computed
+        again
+
+    Returns
+    -------
+    float32 (r, d), r <= 2n; (0, 0) for no nodes
+    """
+    if not nodes:
+        return _NOTHING
+    counts = [share(node.level, nodes[0].level, size) for node in nodes]
+    # If the oldest node is the same, as many rows are taken of each of the others that are.
+    same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], zip(nodes, sampled, strict=False)))
+    drawn = known[: sum(counts[:same])]
+    if same == len(nodes):
+        return drawn
+    new = [_drawn(node, count) for node, count in zip(nodes[same:], counts[same:], strict=True) if count]
+    return np.concatenate([drawn, *new] if same else new)
+
+
+def _drawn(node: Node, count: int) -> np.ndarray:
+    """The first rows of a node, reflected and rescaled."""
+    rows: np.ndarray = node.directions(count) * np.float32(np.sqrt(count / node.count))
+    spread(rows)
+    return rows
+
+
+def spread(rows: np.ndarray) -> None:
+    """Reflect rows, in place, so that the first is distributed evenly over all: Q C with Q e1 = 1 / sqrt(m).
+
+    A Householder reflection: Q'Q = I, so that the result is the same coreset. Costs O(m d).
+
+    >>> rows = np.array([[2, 0], [0, 1], [0, 0], [0, 0]], np.float32)
+    >>> spread(rows)
+    >>> rows[:, 0]
+    array([1., 1., 1., 1.], dtype=float32)
+    """
+    m = len(rows)
+    if m < 2:
+        return
+    normal = np.full(m, -1 / np.sqrt(m), np.float32)
+    normal[0] += 1
+    normal /= np.linalg.norm(normal)
+    rows -= np.outer(2 * normal, normal @ rows)

@@ -6,16 +6,12 @@ The first n rows of S V' are optimal: no other n rows keep more of ||A||^2, the 
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.blas import ssyrk
+from scipy.linalg.lapack import ssyevd
 
 from catstream.numerics.arrays import Float32
 
 _TINY = np.float32(1e-30)  # in place of an energy of 0, which nothing can be divided by
-
-
-def prepare() -> None:
-    """Import scipy before the first reduction, which would otherwise take a quarter of a second longer."""
-    import scipy.linalg.blas
-    import scipy.linalg.lapack  # noqa: F401
 
 
 def energy(rows: np.ndarray) -> float:
@@ -35,8 +31,6 @@ def products(rows: np.ndarray) -> np.ndarray:
     array([[ 4.,  0.],
            [ 6., 10.]], dtype=float32)
     """
-    from scipy.linalg.blas import ssyrk  # imported late: a program that only starts a pipeline needs no scipy
-
     gram: np.ndarray = ssyrk(1, rows.T, trans=1, lower=1)  # one triangle: the matrix is symmetric
     return gram
 
@@ -95,8 +89,6 @@ def _strongest(
     rows: np.ndarray, count: int, towards: np.ndarray | None, gram: np.ndarray | None
 ) -> tuple[Float32, Float32]:
     """Energies and rows s_i v_i of the `count` strongest directions, all of them if there are fewer rows."""
-    from scipy.linalg.lapack import ssyevd
-
     keep = min(count, len(rows))
     # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
     energies, vectors, failed = ssyevd(products(rows) if gram is None else gram, lower=1)

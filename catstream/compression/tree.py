@@ -11,8 +11,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from catstream.compression import sampling
-from catstream.compression.node import Node
+from catstream.compression.node import Node, sample
 from catstream.compression.reduce import shrink
 from catstream.errors import ProtocolError
 from catstream.messages import storage
@@ -159,7 +158,7 @@ class CoresetTree:
 
         The rows of nodes that the last sample had are kept: most nodes are the same for many frames.
         """
-        self._rows = sampling.sample(self.nodes, self.size, self._sampled, self._rows)
+        self._rows = sample(self.nodes, self.size, self._sampled, self._rows)
         self._sampled = list(self.nodes)
         return Summary(
             rows=self._rows,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.detection import belief, extent, motion, search, teacher
+from catstream.detection import belief, extent, search, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
@@ -21,7 +21,6 @@ from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
-from catstream.messages.storage import Arrays, Metadata
 from catstream.settings import Settings
 
 if TYPE_CHECKING:
@@ -146,9 +145,9 @@ class Detector:
         """
         state = self._known()
         window = Window.around(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
-        self.state = motion.observed(
+        self.state = belief.observed(
             replace(
-                motion.expected(state),
+                belief.expected(state),
                 level="confident",
                 trusted=True,
                 window=window,
@@ -197,17 +196,6 @@ class Detector:
         window = Window.around(box, context)
         return DetectorState(began, "confident", window, window, Window.around(first, context))
 
-    def scm_state(self) -> tuple[Arrays, Metadata | None]:
-        """Arrays and metadata of the paper's first tracker, for `resume_scm`; none if it is not in use."""
-        return ({}, None) if self._scm is None else self._scm.state()
-
-    def resume_scm(self, arrays: Arrays, metadata: Metadata | None) -> None:
-        """Continue the paper's first tracker of another detector; call it after `resume`."""
-        if metadata is not None:
-            from catstream.paper.scm import SparseCollaborativeModel
-
-            self._scm = SparseCollaborativeModel.resumed(arrays, metadata)
-
     def _known(self) -> DetectorState:
         if self.state is None:
             raise BoxError("there is no box to follow yet: call init with a frame and a box first")
@@ -241,7 +229,7 @@ def looked(
     -------
     the state with the place that was expected, and the detection
     """
-    state = motion.expected(state)
+    state = belief.expected(state)
     if state.first_window is None and likeness is not None:
         return search.seek(frame, state, seq, model, likeness, settings)
     return state, search.find(frame, state, seq, model, settings)
@@ -260,7 +248,7 @@ def settled(state: DetectorState, found: Detection, size: tuple[int, int], setti
         return state
     window = extent.followed(state.window, found.window, policy.resize).with_centre_in(*size)
     confident = window if policy.resize else state.confident_window
-    return motion.observed(replace(state, window=window, confident_window=confident))
+    return belief.observed(replace(state, window=window, confident_window=confident))
 
 
 def taught(

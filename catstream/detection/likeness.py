@@ -11,8 +11,6 @@ from typing import Self
 
 import numpy as np
 
-from catstream.messages.storage import Arrays
-
 _DIRECTIONS = 12  # dimension of the subspace
 
 
@@ -52,15 +50,6 @@ class Likeness:
         whole = energy - 2 * float(s @ b) + count * float(b @ b)
         basis = (span @ vectors[:, : -_DIRECTIONS - 1 : -1]).T.astype(np.float32)
         return cls(basis, background, float(values[-_DIRECTIONS:].sum()) / whole)
-
-    def state(self) -> Arrays:
-        """The arrays that `from_state` restores."""
-        return {"basis": self.basis, "background": self.background, "share": np.array([self.share])}
-
-    @classmethod
-    def from_state(cls, arrays: Arrays) -> Self:
-        """Restore what `state` returned; KeyError or ValueError if it is something else."""
-        return cls(arrays["basis"], arrays["background"], arrays["share"].item())
 
     def __call__(self, row: np.ndarray) -> float:
         """Likeness of a row, float32 (d,): about 1 for the object, about 0.2 for an unknown background."""

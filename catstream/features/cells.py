@@ -1,6 +1,12 @@
 """Cells: the features of an image in a grid of cells, and the score of every window in it.
 
-A window is 8 x 8 cells. Its feature row holds their HOG and mean colours, and the histogram of its colours.
+Each cell of 8 x 8 pixels has 31 HOG channels (18 signed and 9 unsigned orientations, 4 texture energies; Felzenszwalb
+et al. 2010), of the colour channel with the strongest gradient, then its mean colour in Lab. A window is 8 x 8 cells.
+
+HOG and mean colours say what is where. An object that bends or turns moves both between the cells, but keeps its
+colours: 288 shades of Lab, 8 of lightness by 6 x 6 of a and b. So a window's row also holds a histogram of the shades
+in its middle 6 x 6 cells, which are mostly object, of 4 x 4 shades each. The square root of each share is a feature, so
+that distances are Hellinger's.
 """
 
 from __future__ import annotations
@@ -10,15 +16,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.features import colours
-from catstream.features.colours import count
-from catstream.features.compiled import kernel
-from catstream.features.hog import grid
-from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, WINDOW, row_length
+from catstream.features import kernels
+from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, SHADES, WINDOW, row_length
 from catstream.features.pyramid import planes_of
-from catstream.numerics.arrays import Float32, Int64, UInt16, writable
+from catstream.numerics.arrays import writable
+from catstream.numerics.threads import Scratch
 
-_PLACES = COLOURS.start  # features of the cells of a window, before those of its colours
+_CHROMA_STEP = 10  # Lab units from one level of a or b to the next
+_LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
+_MOST_KEPT = 1024  # cells of an image whose scratch is kept: a patch, and no whole frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,13 +42,13 @@ class Cells:
     def of(cls, image: np.ndarray) -> Cells:
         """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells."""
         planes = planes_of(image)
-        return cls(grid(planes), colours.shades(planes))
+        return cls(grid(planes), shades(planes))
 
     @classmethod
     def within(cls, planes: np.ndarray) -> Cells:
         """Cells of a patch, uint8 (3, h, w), without the margin, whose features depend on pixels beyond it."""
         edge = MARGIN * CELL
-        return cls(grid(planes, MARGIN), colours.shades(planes[:, edge:-edge, edge:-edge]))
+        return cls(grid(planes, MARGIN), shades(planes[:, edge:-edge, edge:-edge]))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -58,7 +64,8 @@ class Cells:
     def rows(self, places: Sequence[tuple[int, int]]) -> np.ndarray:
         """Feature rows of the windows whose first cells are at (row, column), float32 (k, d)."""
         features = np.empty((len(places), row_length()), np.float32)
-        _cut(self.grid.reshape(len(self.grid), -1), self.shades, np.array(places, np.int64).reshape(-1, 2), features)
+        lines = self.grid.reshape(len(self.grid), -1)
+        kernels.cut_rows(lines, self.shades, np.array(places, np.int64).reshape(-1, 2), features)
         return features
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
@@ -69,7 +76,7 @@ class Cells:
         weights : float32 (d,)
         """
         scores = self._places(weights, bias)
-        colours.add_scores(self.shades, weights[COLOURS], scores)
+        add_colour_scores(self.shades, weights[COLOURS], scores)
         return scores
 
     def respond_above(self, weights: np.ndarray, bias: float, least: float) -> np.ndarray:
@@ -78,10 +85,10 @@ class Cells:
         The colours of a window are not counted if its score would be below `least` with any histogram of colours: this
         takes three quarters of the time of `respond` if few windows score that high.
         """
-        reach = least - colours.highest_score(weights[COLOURS])
+        reach = least - highest_colour_score(weights[COLOURS])
         scores = self._places(weights, bias)
         hopeless = scores < reach
-        colours.add_scores(self.shades, weights[COLOURS], scores, reach)
+        add_colour_scores(self.shades, weights[COLOURS], scores, reach)
         scores[hopeless | (scores < least)] = -np.inf
         return scores
 
@@ -90,31 +97,126 @@ class Cells:
         rows, columns = self.shape
         scores = np.empty((rows - WINDOW + 1, columns - WINDOW + 1), np.float32)
         scores.fill(bias)
-        _add_scores(self.grid.reshape(rows, -1), writable(weights[:_PLACES]).reshape(WINDOW, -1), scores)
+        of_cells = writable(weights[: COLOURS.start]).reshape(WINDOW, -1)
+        kernels.add_cell_scores(self.grid.reshape(rows, -1), of_cells, scores)
         return scores
 
 
-@kernel("void(float32[:,::1], uint16[:,::1], int64[:,::1], float32[:,::1])")
-def _cut(grid: Float32, shades: UInt16, places: Int64, features: Float32) -> None:
-    """Feature rows of the windows whose first cells are at `places`."""
-    for k in range(len(places)):
-        row, column = places[k, 0], places[k, 1]
-        for i in range(WINDOW):
-            cells = grid[row + i, column * CHANNELS : (column + WINDOW) * CHANNELS]
-            line = features[k, i * WINDOW * CHANNELS : (i + 1) * WINDOW * CHANNELS]
-            for j in range(WINDOW * CHANNELS):
-                line[j] = cells[j]
-        count(shades, row, column, features[k, _PLACES:])
+def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
+    """HOG and mean colour of every whole cell of an image.
+
+    A cell's features depend on pixels up to `MARGIN` cells away: the grid of a crop equals the slice of the frame's
+    grid, but for that margin.
+
+    Parameters
+    ----------
+    planes : uint8 (3, h, w), blue, green and red of the image
+    margin : cells along each edge that are left out
+
+    Returns
+    -------
+    float32 (h // 8 - 2 margin, w // 8 - 2 margin, 34)
+
+    >>> grid(np.zeros((3, 64, 96), np.uint8)).shape
+    (8, 12, 34)
+    """
+    rows, columns = planes.shape[1] // CELL, planes.shape[2] // CELL
+    cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
+    if cells.size:
+        arrays = _scratch.kept if rows * columns <= _MOST_KEPT else _scratch.made
+        kernels.describe_cells(planes, margin, _SHARES, cells, *arrays(rows, columns))
+    return cells
 
 
-@kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])")
-def _add_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
-    """Add the products of each row of cells, (34 columns,), with each row of the windows that it lies in."""
-    for row in range(len(grid)):
-        for column in range(scores.shape[1]):
-            cells = grid[row, column * CHANNELS : (column + WINDOW) * CHANNELS]
-            for i in range(max(row - len(scores) + 1, 0), min(row + 1, WINDOW)):
-                line, total = weights[i], np.float32(0)
-                for j in range(WINDOW * CHANNELS):
-                    total += cells[j] * line[j]
-                scores[row - i, column] += total
+@Scratch
+def _scratch(rows: int, columns: int) -> tuple[np.ndarray, ...]:
+    """The arrays for intermediate results of `describe_cells`."""
+    width, signed = columns * CELL, 18
+    return (
+        np.empty((3, 3, width + 2), np.float32),
+        np.empty((3, width + CELL), np.float32),
+        np.empty(width + CELL, np.uint8),
+        np.empty((columns + 1, signed, 4), np.float32),
+        np.empty((rows + 2, columns + 2, signed), np.float32),
+        np.empty((rows, columns), np.float32),
+    )
+
+
+def _shares() -> np.ndarray:
+    """Share of each pixel between the centres of four cells in each of these, float32 (8, 8, 4): row by row."""
+    far = (np.arange(CELL) + 0.5) / CELL
+    near = 1 - far
+    shares = [np.outer(down, across) for down in (near, far) for across in (near, far)]
+    return np.stack(shares, axis=-1).astype(np.float32)
+
+
+_SHARES = _shares()
+
+
+def shades(planes: np.ndarray) -> np.ndarray:
+    """The shade of every 2 x 2 pixels, whose mean is taken.
+
+    Parameters
+    ----------
+    planes : uint8 (3, h, w), blue, green and red; h and w are even
+
+    Returns
+    -------
+    uint16 (h // 2, w // 2), below `SHADES`
+
+    >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[None].repeat(3, axis=0)).ravel()))
+    2
+    """
+    found = np.empty((planes.shape[1] // 2, planes.shape[2] // 2), np.uint16)
+    kernels.look_up_shades(planes, _SHADES_OF, found)
+    return found
+
+
+def add_colour_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least: float = _LOWEST) -> None:
+    """Add the score of the histogram of each window, in constant time a window.
+
+    Parameters
+    ----------
+    found : uint16, as `shades` gives them
+    weights : float32 (SHADES,)
+    scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
+    least : windows with a lower score are left out, and their score stays as it is
+    """
+    strips = np.empty((scores.shape[1] + kernels.COUNTED - 1, SHADES), np.uint16)
+    kernels.add_colour_scores(found, writable(weights), least, strips, np.empty(SHADES, np.uint16), scores)
+
+
+def highest_colour_score(weights: np.ndarray) -> float:
+    """The highest score that the histogram of any window can have.
+
+    A histogram has no negative features and a constant length, so this is the length times that of the positive weights
+    (Cauchy-Schwarz).
+    """
+    return kernels.COLOUR_LENGTH * float(np.linalg.norm(np.maximum(weights, 0)))
+
+
+def lab(colours: np.ndarray) -> np.ndarray:
+    """Lab of colours, uint8 (k, 3): blue, green, red to lightness, a, b.
+
+    >>> lab(np.array([[0, 0, 0], [255, 255, 255], [0, 0, 255]], np.uint8))
+    array([[  0, 128, 128],
+           [255, 128, 128],
+           [136, 208, 195]], dtype=uint8)
+    """
+    converted = np.empty_like(colours)
+    kernels.convert_to_lab(colours, converted)
+    return converted
+
+
+def _shade_table() -> np.ndarray:
+    """Shade of every BGR colour of 5 bits each, blue first."""
+    levels = np.arange(4, 256, 8, dtype=np.uint8)
+    colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
+    found = lab(colours.reshape(-1, 3)).astype(int)
+    light = found[:, 0] * LIGHT // 256
+    chroma = ((found[:, 1:] - 128) // _CHROMA_STEP + CHROMA // 2).clip(0, CHROMA - 1)
+    bins: np.ndarray = ((light * CHROMA + chroma[:, 0]) * CHROMA + chroma[:, 1]).astype(np.uint16)
+    return bins
+
+
+_SHADES_OF = _shade_table()

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 
 from catstream.box import Window
-from catstream.features.compiled import kernel
+from catstream.features.kernels import sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
-from catstream.numerics.arrays import Float32, UInt8, UInt32
-from catstream.numerics.parallel import Scratch
+from catstream.numerics.threads import Scratch
 
 _MOST_CELLS = 62_500  # of the region around a tiny window, which bounds the cost of a large frame
 _OVERLAP = WINDOW + 2 * MARGIN  # cells that adjacent parts of a region share, at least: a window and its margin
@@ -159,7 +158,7 @@ class Pyramid:
             found = np.empty((1 if image.ndim == 2 else 3, size, size), np.uint8)
             lines = image.reshape(len(image), -1)
             scratch = _scratch.kept(size, lines.shape[1])
-            _sample(lines, x - middle * across, y - middle * down, across, down, found, *scratch)
+            sample(lines, x - middle * across, y - middle * down, across, down, found, *scratch)
             return found
         cos, sin = math.cos(turn), math.sin(turn)
         right, below = (across * cos, across * sin), (-down * sin, down * cos)
@@ -180,7 +179,7 @@ def planes_of(image: np.ndarray) -> np.ndarray:
 
 @Scratch
 def _scratch(size: int, columns: int) -> tuple[np.ndarray, ...]:
-    """The arrays for intermediate results of `_sample`."""
+    """The arrays for intermediate results of `sample`."""
     return np.empty((2, size), np.uint32), np.empty(size, np.float32), np.empty(columns, np.float32)
 
 
@@ -188,49 +187,3 @@ def _half(image: np.ndarray) -> np.ndarray:
     """The mean of each 2 x 2 pixels."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     return cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-
-
-@kernel(
-    "void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1], uint32[:,::1], float32[::1], float32[::1])"
-)
-def _sample(
-    image: UInt8,
-    left: float,
-    top: float,
-    across: float,
-    down: float,
-    found: UInt8,
-    pixels: UInt32,
-    share: Float32,
-    line: Float32,
-) -> None:
-    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row.
-
-    Scratch, of each pixel of a row found: pixels (2, columns), where in the line the two pixels are that it lies
-    between; share (columns,) of the second one; line (columns of the image,).
-    """
-    channels, rows, columns = found.shape
-    height, width = image.shape[0], image.shape[1] // channels
-    begin = min(max(int(np.floor(left)), 0), width - 1)
-    end = min(max(int(np.floor(left + (columns - 1) * across)) + 2, begin + 1), width)
-    first, second = pixels[0], pixels[1]
-    for i in range(columns):
-        x = left + i * across
-        pixel = int(np.floor(x))
-        first[i] = (min(max(pixel, begin), end - 1) - begin) * channels
-        second[i] = (min(max(pixel + 1, begin), end - 1) - begin) * channels
-        share[i] = x - np.floor(x)
-    for row in range(rows):
-        y = top + row * down
-        pixel = int(np.floor(y))
-        above = image[min(max(pixel, 0), height - 1), begin * channels : end * channels]
-        below = image[min(max(pixel + 1, 0), height - 1), begin * channels : end * channels]
-        part = np.float32(y - np.floor(y))
-        for i in range((end - begin) * channels):
-            value = np.float32(above[i])
-            line[i] = value + part * (np.float32(below[i]) - value) + np.float32(0.5)  # half, to round
-        for channel in range(channels):
-            values, line_found = line[channel:], found[channel, row]
-            for i in range(columns):
-                value = values[first[i]]
-                line_found[i] = np.uint8(value + share[i] * (values[second[i]] - value))

@@ -4,7 +4,7 @@ A message is frozen and complete by itself. In one process the stages pass the o
 `catstream.wire` converts them to msgpack and back, and checks every field on arrival.
 
 The annotations are the schema (see `catstream.messages.schema`), and the docstrings describe the fields. The checks,
-the files of `catstream.messages.packing`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
+the files of `catstream.messages.storage`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
 `d` is the length of a feature row (`catstream.features.layout.row_length`), `n` the coreset size, frames count from 0.
 The objects of a stream have names (`catstream.messages.names`); an object that is alone may have the name "".
@@ -14,14 +14,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from msgspec import Meta
 
 from catstream.box import Box, Window
+from catstream.errors import ProtocolError
 from catstream.messages.heads import GROUPS, HEADS, TREES
-from catstream.messages.schema import Array, ByObject, Bytes, Name, Named, OnlyWith, Whole
+from catstream.messages.schema import (
+    LARGEST_INTEGER,
+    LONGEST_LIST,
+    Array,
+    ByObject,
+    ByText,
+    Integer,
+    Named,
+    Number,
+    ObjectName,
+    Text,
+)
 
 State = Literal["bootstrapping", "present", "absent"]
 
@@ -42,9 +54,6 @@ LARGEST_GIVEN_MODELS = 200 << 20
 StreamState = Literal["starting", "running", "waiting", "paused", "moving", "stopping", "failed", "ended"]
 
 NodeState = Literal["alive", "draining", "dead"]
-
-#: The name of an object.
-ObjectName = Annotated[str, Name()]
 
 _COLUMNS = {name: tree.more_columns for name, tree in TREES.items()}
 _REQUIRED = frozenset(name for name, tree in TREES.items() if tree.required)
@@ -68,25 +77,24 @@ class Motion:
 class DetectorState:
     """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
 
-    first_frame       the object's first: with its name, it says which object this is; see `began` of a track
-    level             of the belief that the object was found, see `catstream.detection.belief`
+    first_frame       the object's first, see `began` of a track
+    level             belief that the object was found
     window            window of the object; the next search is centred on it
-    confident_window  the same in the last frame whose level was confident or redetected; while the object of a saved
-                      model is searched for, the best window of the last frame
-    first_window      the same in the first frame; None while the object of a saved model has not been found
-    trusted           false after the object was found again elsewhere in the frame, until its score is high
-    sightings         frames in a row in which the object of a saved model was seen in one place
+    confident_window  the same in the last confident frame; before a saved model's object is found, the best window
+    first_window      the same in the first frame; None before a saved model's object is found
+    trusted           false after the object was found again elsewhere, until its score is high
+    sightings         frames in a row in which a saved model's object was seen in one place
     motion            of the Kalman filter of the centre, None before a model had any
     centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
     """
 
-    first_frame: int
+    first_frame: Integer
     level: Level
     window: Window
     confident_window: Window
-    first_window: Window | None
+    first_window: Window | None = None
     trusted: bool = True
-    sightings: int = 0
+    sightings: Integer = 0
     motion: Motion | None = None
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
 
@@ -101,11 +109,11 @@ class TrainingRows:
     """Feature rows of windows of a frame, each with its label and weight.
 
     rows     features of the windows
-    labels   group "appearance": 1 for the object, 0 for background, between them for a near miss; group "extent": 1 for
-             a window of the right size and aspect, towards 0 for windows far from it
+    labels   group "appearance": 1 for the object, 0 for background; group "extent": 1 for a window of the right size
+             and aspect; between them for a near miss
     weights  number of ordinary rows that each stands for
-    offsets  group "extent": 0.5 for a window of the right size, and 1/16 more for each step by which it is too large;
-             then the same for the aspect; None if all are right
+    offsets  group "extent": 0.5 for the right size, 1/16 more for each step that it is too large; then the same for the
+             aspect; None if all are right
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
@@ -136,9 +144,9 @@ class ObjectFeatures:
     """The part of `Features` for one object.
 
     box       the object's box, None if it was not found
-    training  training rows of each group of `catstream.messages.heads`; a group without rows is left out
-    detector  state of the detector after this frame, from which a restarted detector continues; None before it has one
-    begins    whether a new object is tracked under this name from this frame on: its trees start empty
+    training  training rows of each group; a group without rows is left out
+    detector  state of the detector after this frame, None before it has one
+    begins    whether a new object begins under this name: its trees start empty
     model     the saved model that the trees continue, if the object begins with one; otherwise empty
     """
 
@@ -146,23 +154,23 @@ class ObjectFeatures:
     training: Annotated[dict[str, TrainingRows], Named(dict.fromkeys(GROUPS, 0))] = field(default_factory=dict)
     detector: DetectorState | None = None
     begins: bool = False
-    model: Annotated[bytes, Bytes("a saved model", longest=LARGEST_GIVEN_MODEL, begin=b"")] = b""
+    model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] = b""
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
     """The training rows of one frame, detector -> compressor.
 
-    seq      number of the message: 1, 2, 3 ... without a gap, one message a frame
+    seq      1, 2, 3 ... without a gap, one message a frame
     frame    number of the frame that the rows were cut from
     time     seconds since the start of the source, or of the run if the source is live
-    objects  the part of each object that is tracked, by name; the trees of all other objects are dropped
+    objects  the part of each object that is tracked, by name
     """
 
-    seq: int
-    frame: int
-    time: float
-    objects: Annotated[dict[str, ObjectFeatures], ByObject()]
+    seq: Integer
+    frame: Integer
+    time: Number
+    objects: ByObject[ObjectFeatures]
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +183,10 @@ class Stored:
     unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
-    seq: int
-    taken: int
-    versions: Annotated[dict[str, int], ByObject()] = field(default_factory=dict)
-    unsaved: int = 0
+    seq: Integer
+    taken: Integer
+    versions: ByObject[Integer] = field(default_factory=dict)
+    unsaved: Integer = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +199,7 @@ class ObjectPosition:
     """
 
     box: Box | None = None
-    version: int = 0
+    version: Integer = 0
     detector: DetectorState | None = None
 
 
@@ -205,10 +213,10 @@ class Position:
     unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
     """
 
-    seq: int = 0
-    frame: int = 0
-    objects: Annotated[dict[str, ObjectPosition], ByObject()] = field(default_factory=dict)
-    unsaved: int = 0
+    seq: Integer = 0
+    frame: Integer = 0
+    objects: ByObject[ObjectPosition] = field(default_factory=dict)
+    unsaved: Integer = 0
 
     @property
     def versions(self) -> dict[str, int]:
@@ -228,8 +236,8 @@ class Summary:
 
     rows: Annotated[np.ndarray, Array("float32", ("r", "d"))]
     mean: Annotated[np.ndarray, Array("float32", ("d",))]
-    count: int
-    levels: tuple[int, ...]
+    count: Integer
+    levels: Annotated[tuple[Integer, ...], Meta(max_length=LONGEST_LIST)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,18 +246,18 @@ class Sample:
 
     version  1, 2, 3 ... in the order in which the samples of all objects are made
     frame    number of the newest frame that it summarises
-    trees    the summary of each tree of `catstream.messages.heads.TREES`; a tree without a leaf is left out
-    centres  centre of the object in each frame of the last complete block of frames, pixels; NaN while absent
+    trees    the summary of each tree; a tree without a leaf is left out
+    centres  centre of the object in each frame of the last complete block, pixels; NaN while absent
     object   name of the object
     began    number of the object's first frame
     """
 
-    version: int
-    frame: int
+    version: Integer
+    frame: Integer
     trees: Annotated[dict[str, Summary], Named(_COLUMNS, _REQUIRED)]
     centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
     object: ObjectName = ""
-    began: int = 0
+    began: Integer = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,24 +270,24 @@ class Model:
     bias     chosen so that the score is 0 at the mean of the background and 1 at the mean of the object
     motion   parameters of the Kalman filter, None until there are enough centres for EM
     heads    vector of each head that does not add to the score, once it is trained. A window fits well if
-             (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for the names
-             "size" and "aspect"
+             (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for "size" and
+             "aspect"
     biases   bias of each of these heads that has one
     object   name of the object
-    began    number of the object's first frame: the detector uses no model of an object that had the name before
+    began    number of the object's first frame
     """
 
-    version: int
-    frame: int
+    version: Integer
+    frame: Integer
     weights: Annotated[np.ndarray, Array("float32", ("d",))]
-    bias: float
+    bias: Number
     motion: Motion | None = None
     heads: Annotated[dict[str, Annotated[np.ndarray, Array("float32", ("d",))]], Named(_NOT_IN_THE_SCORE)] = field(
         default_factory=dict
     )
     biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
     object: ObjectName = ""
-    began: int = 0
+    began: Integer = 0
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -289,8 +297,8 @@ class Track:
     Attributes
     ----------
     seq : int
-        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means that this subscriber
-        missed messages, or that the object was not tracked in between.
+        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means missed messages, or
+        that the object was not tracked in between.
     frame : int
         Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
     time : float
@@ -318,16 +326,16 @@ class Track:
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
     """
 
-    seq: int
-    frame: int
-    time: float
+    seq: Integer
+    frame: Integer
+    time: Number
     state: State
     box: Box | None
-    score: float
-    model_version: int
-    pts: float | None = None
+    score: Number
+    model_version: Integer
+    pts: Number | None = None
     object: ObjectName = ""
-    began: int = 0
+    began: Integer = 0
 
     def __repr__(self) -> str:
         name = f"object={self.object!r}, " if self.object else ""
@@ -365,14 +373,14 @@ class Track:
 class Tracks:
     """The tracks of one frame, detector -> the owner of the run.
 
-    seq     number of the message: 1, 2, 3 ... without a gap, one message a frame
+    seq     1, 2, 3 ... without a gap, one message a frame
     frame   number of the frame
     tracks  the track of each object, by name
     """
 
-    seq: int
-    frame: int
-    tracks: Annotated[dict[str, Track], ByObject()]
+    seq: Integer
+    frame: Integer
+    tracks: ByObject[Track]
 
 
 @dataclass(frozen=True, slots=True)
@@ -386,11 +394,15 @@ class Preview:
     jpeg    the picture as a JPEG file, with the frame's aspect ratio
     """
 
-    frame: int
-    width: Annotated[int, Whole(low=1)]
-    height: Annotated[int, Whole(low=1)]
-    boxes: Annotated[dict[str, Box], ByObject()]
-    jpeg: Annotated[bytes, Bytes("a JPEG", longest=1 << 19, begin=b"\xff\xd8\xff")]
+    frame: Integer
+    width: Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
+    height: Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
+    boxes: ByObject[Box]
+    jpeg: Annotated[bytes, Meta(max_length=1 << 19)]
+
+    def __post_init__(self) -> None:
+        if not self.jpeg.startswith(b"\xff\xd8\xff"):
+            raise ProtocolError("preview: expected a picture as a JPEG file")
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,8 +414,8 @@ class SavedModel:
     object   name of the object
     """
 
-    version: int
-    file: Annotated[bytes, Bytes("a saved model", longest=LARGEST_MODEL, begin=b"")]
+    version: Integer
+    file: Annotated[bytes, Meta(max_length=LARGEST_MODEL)]
     object: ObjectName = ""
 
 
@@ -419,29 +431,12 @@ class Health:
     objects   counters of each object, by name
     """
 
-    process: str
-    time: float
-    counters: dict[str, float] = field(default_factory=dict)
-    trouble: str = ""
-    source: str = ""
-    objects: Annotated[dict[str, dict[str, float]], ByObject()] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """The settings of a pipeline, with which its features can be used for training again, detector -> anyone.
-
-    program   version of catstream
-    settings  all settings except `run.endpoint` and `run.keys`, by name, each as the text that `--set` takes
-    """
-
-    program: str
-    settings: dict[str, str]
-
-    @classmethod
-    def from_settings(cls, settings: dict[str, str]) -> Run:
-        """A run of this version of catstream, with what `Settings.portable` returned."""
-        return cls(version("catstream"), settings)
+    process: Text
+    time: Number
+    counters: ByText[Number] = field(default_factory=dict)
+    trouble: Text = ""
+    source: Text = ""
+    objects: ByObject[ByText[Number]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -451,14 +446,14 @@ class End:
     seq     number of the last message before it, plus one
     reason  description of why the stream ended
     failed  whether it ended because of an error
-    totals  final counters, by name: features messages `sent` and `stored`, frames that were `damaged` or `skipped`, and
-            how often a live source was `reopened`
+    totals  final counters, by name: `sent` and `stored` features messages, `damaged` and `skipped` frames, and how
+            often a live source was `reopened`
     """
 
-    seq: int
-    reason: str
+    seq: Integer
+    reason: Text
     failed: bool = False
-    totals: dict[str, float] = field(default_factory=dict)
+    totals: ByText[Number] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -467,19 +462,24 @@ class Command:
 
     id      unique for each command: a command that is received twice is executed once and answered twice
     verb    the action
-    box     for "set-box": box of the object in the next frame that is tracked, in pixels; during a pause of a file, in
-            the frame that is held
+    box     for "set-box" only: box of the object in the next frame that is tracked; during a pause of a file, in the
+            frame that is held
     keep    for "set-box": whether it is the same object, so that everything learned about it is kept
     object  for "set-box", "search", "forget" and "save": name of the object
-    model   for "search": the saved model of the object, which is searched for from the next frame on
+    model   for "search" only: the saved model of the object, which is searched for from the next frame on
     """
 
-    id: str
+    id: Text
     verb: Verb
-    box: Annotated[Box | None, OnlyWith("verb", "set-box")] = None
+    box: Box | None = None
     keep: bool = False
     object: ObjectName = ""
-    model: Annotated[bytes | None, Bytes("a saved model", LARGEST_GIVEN_MODEL, b""), OnlyWith("verb", "search")] = None
+    model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] | None = None
+
+    def __post_init__(self) -> None:
+        for name, verb in (("box", "set-box"), ("model", "search")):
+            if (getattr(self, name) is not None) != (self.verb == verb):
+                raise ProtocolError(f"command: expected a {name} with {verb} and with nothing else, got {self.verb!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -495,12 +495,12 @@ class Answer:
     object   name of the object that the command was for
     """
 
-    id: str
+    id: Text
     done: bool
-    reason: str
-    frame: int = 0
+    reason: Text
+    frame: Integer = 0
     box: Box | None = None
-    version: int = 0
+    version: Integer = 0
     object: ObjectName = ""
 
 
@@ -584,8 +584,8 @@ class Question:
     stream  name of the one stream that it is about; empty for all streams and nodes
     """
 
-    id: str
-    stream: str = ""
+    id: Text
+    stream: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -596,5 +596,5 @@ class Listing:
     fleet   the state of the fleet as JSON, of the stream that the question is about alone
     """
 
-    id: str
-    fleet: Annotated[bytes, Bytes("the state of a fleet", longest=15 << 20, begin=b"{")]
+    id: Text
+    fleet: Annotated[bytes, Meta(max_length=15 << 20)]

@@ -18,12 +18,13 @@ Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
 
 _LONGEST = 64
 _SAME = 0.95  # overlap of boxes that were meant to be one
-_NAME = re.compile(rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?")
+#: Regular expression of the name of an object.
+PATTERN = rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?"
 
 
 def is_name(text: str) -> bool:
     """Whether a text may be the name of an object."""
-    return _NAME.fullmatch(text) is not None
+    return re.fullmatch(PATTERN, text) is not None
 
 
 def check_name(name: str) -> str:

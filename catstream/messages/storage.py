@@ -1,8 +1,12 @@
-"""Atomic file writes, file locks, and files of arrays and metadata in the safetensors format with a checksum."""
+"""Atomic file writes, file locks, and files of arrays and metadata in the safetensors format with a checksum.
+
+A message is kept as arrays and metadata, too: `pack` and `unpack`.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fcntl
 import glob
 import json
@@ -11,11 +15,14 @@ import secrets
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
+import safetensors
+import safetensors.numpy
 
 from catstream.errors import CatstreamError, ProtocolError, ServiceError
 
@@ -24,21 +31,19 @@ Arrays = dict[str, np.ndarray]
 #: JSON metadata by name. Code that reads a file checks the entries that it uses.
 Metadata = dict[str, Any]
 
+Message = TypeVar("Message")
+
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
-#: Names of the types of arrays in the format.
-_TYPES = {"float64": "F64", "float32": "F32", "int64": "I64", "int32": "I32", "uint8": "U8", "bool": "BOOL"}
-_MOST_BYTES_BESIDE = len("..part") + 16  # that the name of an unfinished file is longer than that of the file
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 _PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
-def write_atomically(path: str | os.PathLike[str], *data: bytes | memoryview, mode: int = 0o666) -> None:
+def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
     """Replace a file atomically. After the return, the new content survives a power cut.
 
     Parameters
     ----------
-    data : the content, in parts
     mode : permissions of the file, reduced by the umask
 
     Raises
@@ -63,12 +68,12 @@ def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
         If the file cannot be written, or the file system has no hard links.
     """
     path = Path(path)
-    with _written_beside(path, [data], 0o600) as part:
+    with _written_beside(path, data, 0o600) as part:
         os.link(part, path)  # unlike a rename, this fails if the file exists
 
 
 @contextlib.contextmanager
-def _written_beside(path: Path, parts: Sequence[bytes | memoryview], mode: int) -> Iterator[Path]:
+def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
     """A new file in the folder of `path` whose content is on disk; what the block does with it is then on disk, too.
 
     Its name is its own, so that several may write `path` at the same time. It is removed if the block leaves it there.
@@ -76,7 +81,7 @@ def _written_beside(path: Path, parts: Sequence[bytes | memoryview], mode: int) 
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     try:
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.writelines(parts)
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())  # the content must be on disk before the new name
         yield part
@@ -123,17 +128,6 @@ def is_writable(folder: Path) -> bool:
         return False
 
 
-def name_fits(path: Path) -> bool:
-    """Return whether the file system takes a name of this length in the folder of a file, which need not exist yet."""
-    return len(os.fsencode(path.name)) + _MOST_BYTES_BESIDE <= os.pathconf(nearest(path.parent), "PC_NAME_MAX")
-
-
-def nearest(folder: Path) -> Path:
-    """Return a folder, or if it does not exist the nearest one above it that does."""
-    folder = folder.absolute()
-    return next(path for path in (folder, *folder.parents) if path.exists())
-
-
 def why_not_writable(path: Path, made: Path | None = None) -> str:
     """Return why a file cannot be made or replaced, and what to do; empty if it can.
 
@@ -143,17 +137,10 @@ def why_not_writable(path: Path, made: Path | None = None) -> str:
     """
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
-        folder = nearest(folder)
+        folder = next(each for each in (folder, *folder.parents) if each.exists())
     if path.is_dir() or not is_writable(folder):
         return f"cannot write {path}: give a file in a folder that exists and that you may write to"
-    if not name_fits(path):
-        return f"cannot write {path}: its name is too long for the folder, give a shorter one"
     return ""
-
-
-def prepare() -> None:
-    """Import what reading and writing files need."""
-    import safetensors.numpy  # noqa: F401
 
 
 def lock(handle: int, seconds: float = 0.0) -> bool:
@@ -162,11 +149,9 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
     The kernel releases the lock when the handle is closed, or when the process ends, however that happens.
     """
     deadline = time.monotonic() + seconds
-    while not _flock(handle, fcntl.LOCK_EX):
-        if time.monotonic() >= deadline:
-            return False
+    while not (locked := _flock(handle, fcntl.LOCK_EX)) and time.monotonic() < deadline:
         time.sleep(_PAUSE_SECONDS)
-    return True
+    return locked
 
 
 def is_locked(handle: int) -> bool:
@@ -193,9 +178,9 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode
     Raises
     ------
     OSError
-        If the file cannot be written, as in `write_atomically`.
+        As in `write_atomically`.
     """
-    write_atomically(path, *_parts(arrays, metadata), mode=mode)
+    write_atomically(path, encode(arrays, metadata), mode=mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
@@ -222,7 +207,9 @@ def read_metadata(path: str | os.PathLike[str]) -> Metadata:
 
 def encode(arrays: Arrays, metadata: Metadata) -> bytes:
     """Return the content of the file that `write` writes."""
-    return b"".join(_parts(arrays, metadata))
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}  # as safetensors expects
+    facts = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
+    return safetensors.numpy.save(contiguous, {_KEY: json.dumps(facts, sort_keys=True)})
 
 
 def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
@@ -239,11 +226,8 @@ def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
 
 def _checked(data: bytes, name: str) -> tuple[Arrays, Metadata]:
     """The metadata and the arrays in the content of a file; the arrays are read-only and share its memory."""
-    from safetensors import SafetensorError
-    from safetensors.numpy import load
-
     try:
-        arrays = load(data)  # it checks the header
+        arrays = safetensors.numpy.load(data)  # it checks the header
         length = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][_KEY])
         metadata = header["facts"]
@@ -251,7 +235,7 @@ def _checked(data: bytes, name: str) -> tuple[Arrays, Metadata]:
             raise ValueError(f"it is of version {header['version']}, this catstream reads {_VERSION}")
         if header["checksum"] != _checksum(arrays, metadata):
             raise ValueError("its checksum does not match")
-    except (SafetensorError, KeyError, RecursionError, TypeError, ValueError) as error:
+    except (safetensors.SafetensorError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ProtocolError(
             f"{name} is not an undamaged file of catstream ({error}): use an older copy, or a file that catstream wrote"
         ) from None
@@ -272,25 +256,6 @@ def _sync(folder: Path) -> None:
         os.close(handle)
 
 
-def _parts(arrays: Arrays, metadata: Metadata) -> list[bytes | memoryview]:
-    """The content of a file, in parts: its header, and the memory of each array, of which no copy is made.
-
-    The format is that of safetensors: the length of the header, the header as JSON, and the arrays, those of the
-    longest numbers first.
-    """
-    ordered = sorted(arrays.items(), key=lambda item: (-item[1].itemsize, item[0]))
-    contiguous = {name: np.ascontiguousarray(array) for name, array in ordered}
-    facts = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
-    header: Metadata = {"__metadata__": {_KEY: json.dumps(facts, sort_keys=True)}}
-    end = 0
-    for name, array in contiguous.items():
-        begin, end = end, end + array.nbytes
-        header[name] = {"dtype": _TYPES[array.dtype.name], "shape": array.shape, "data_offsets": [begin, end]}
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 8)  # the arrays begin at a multiple of 8
-    return [len(text).to_bytes(8, "little"), text, *(array.data for array in contiguous.values())]
-
-
 def _checksum(arrays: Arrays, metadata: Metadata) -> int:
     """Return the CRC-32 of the metadata and of the arrays with their names, shapes and types."""
     check = zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
@@ -298,3 +263,63 @@ def _checksum(arrays: Arrays, metadata: Metadata) -> int:
         check = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), check)
         check = zlib.crc32(array.data, check)
     return check
+
+
+def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
+    """Arrays, their names beginning with `name`, and metadata for JSON.
+
+    Examples
+    --------
+    >>> from catstream.messages.kinds import Motion
+    >>> arrays, metadata = pack(Motion(np.eye(4), np.eye(2)), "motion")
+    >>> list(arrays), metadata
+    (['motion.process', 'motion.observation'], {})
+    >>> unpack(Motion, arrays, metadata, "motion").observation.tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    """
+    arrays: Arrays = {}
+    values = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}  # type: ignore[arg-type]
+    return arrays, _without_arrays(values, name, arrays)
+
+
+def unpack(kind: type[Message], arrays: Arrays, metadata: Metadata, name: str) -> Message:
+    """The message that `pack` took, bit for bit.
+
+    The limits of its arrays are not checked: `catstream.messages.schema` does that.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the arrays and metadata are not those of a message of this kind.
+    """
+    whole: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(metadata))  # a copy, to put the arrays into
+    for path, array in with_prefix(arrays, f"{name}.").items():
+        *groups, last = path.split(".")
+        place = whole
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = array
+    return msgspec.convert(whole, kind, dec_hook=_array)
+
+
+def _array(_: type, value: object) -> np.ndarray:
+    if not isinstance(value, np.ndarray):
+        raise ValueError("expected an array")
+    return value
+
+
+def _without_arrays(values: dict[str, Any], name: str, arrays: Arrays) -> Metadata:
+    """Values by name, as they are in JSON; arrays among them are moved to `arrays`."""
+    metadata: Metadata = {}
+    for key, value in values.items():
+        path = f"{name}.{key}"
+        if isinstance(value, np.ndarray):
+            arrays[path] = value
+        elif isinstance(value, dict):
+            metadata[key] = _without_arrays(value, path, arrays)
+        elif dataclasses.is_dataclass(value):
+            parts, metadata[key] = pack(value, path)
+            arrays.update(parts)
+        else:
+            metadata[key] = list(value) if isinstance(value, tuple) else value
+    return metadata

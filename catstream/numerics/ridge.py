@@ -9,11 +9,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-
-
-def prepare() -> None:
-    """Import scipy before the first call, which would otherwise take a quarter of a second longer."""
-    import scipy.linalg  # noqa: F401
+import scipy.linalg
 
 
 def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.ndarray:
@@ -65,8 +61,6 @@ class Regression:
 
 def _solver(gram: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
     """Solves (gram + penalty I) z = right for any right side, by its Cholesky factor; changes the array."""
-    import scipy.linalg  # imported late: a program that only starts a pipeline needs no scipy
-
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     factor = scipy.linalg.cho_factor(gram, overwrite_a=True, check_finite=False)
     return partial(scipy.linalg.cho_solve, factor, check_finite=False)  # which can be pickled

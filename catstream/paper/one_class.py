@@ -8,6 +8,7 @@ would only learn "has edges": the origin is put at the mean of the background.
 from __future__ import annotations
 
 import numpy as np
+from sklearn.svm import OneClassSVM
 
 from catstream.errors import ProtocolError
 
@@ -38,8 +39,6 @@ def one_class(rows: np.ndarray, origin: np.ndarray, nu: float = 0.5) -> np.ndarr
     >>> (direction / direction[0]).round(3)
     array([1., 0.], dtype=float32)
     """
-    from sklearn.svm import OneClassSVM  # two seconds to import: only who trains with it pays
-
     centred = rows - origin
     gram = centred @ centred.T
     if not gram.any():

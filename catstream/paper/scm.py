@@ -18,25 +18,20 @@ import warnings
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.linear_model import Lasso
 
 from catstream.box import Box
-from catstream.features.compiled import kernel
+from catstream.features.kernels import sparse_codes
 from catstream.features.pyramid import Pyramid
-from catstream.messages.storage import Arrays, Metadata
-from catstream.numerics.arrays import Float32, Float64, Int64
-from catstream.numerics.parallel import FILTERS
+from catstream.numerics.threads import FILTERS
 
 _SIDE = 32  # of a template, in pixels
 _PENALTY = 0.01  # lambda of all sparse codes
 _SPREAD = np.array([0.2, 0.2, 0.015, 0.005, 0.01])  # of particles: shares of the size, logarithms, radians
 _POSITIVES, _NEGATIVES = 50, 200
 _EVERY = 5  # frames from one update to the next
-
-
-def prepare() -> None:
-    """Import what the first frame needs, which takes two seconds: call it before there is a frame."""
-    import sklearn.cluster
-    import sklearn.linear_model  # noqa: F401
 
 
 class SparseCollaborativeModel:
@@ -62,39 +57,6 @@ class SparseCollaborativeModel:
         positives = self._cuts(grey, self._beside(_POSITIVES, 0.0, 0.02))
         self._discriminative = _Discriminative.trained(positives, self._background(grey))
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
-
-    def state(self) -> tuple[Arrays, Metadata]:
-        """Arrays and metadata from which `resumed` continues."""
-        judged, made = self._discriminative, self._generative
-        arrays = {
-            "scm.state": self._state,
-            "scm.positives": judged.positives,
-            "scm.templates": judged.templates,
-            "scm.selected": judged.selected,
-            "scm.atoms": made.atoms,
-            "scm.first": made.first,
-            "scm.histogram": made.histogram,
-        }
-        chance = self._rng.bit_generator.state
-        return arrays, {"box": self._first, "frames": self._frames, "particles": self._particles, "rng": chance}
-
-    @classmethod
-    def resumed(cls, arrays: Arrays, metadata: Metadata) -> SparseCollaborativeModel:
-        """Continue where `state` was called, bit for bit; KeyError, TypeError or ValueError if they do not fit."""
-        self = cls.__new__(cls)
-        self._first, self._frames, self._particles = (
-            Box(*metadata["box"]),
-            int(metadata["frames"]),
-            int(metadata["particles"]),
-        )
-        self._rng = np.random.default_rng()
-        self._rng.bit_generator.state = metadata["rng"]
-        self._state = arrays["scm.state"]
-        self._discriminative = _Discriminative(
-            *(arrays[f"scm.{name}"] for name in ("positives", "templates", "selected"))
-        )
-        self._generative = _Generative(*(arrays[f"scm.{name}"] for name in ("atoms", "first", "histogram")))
-        return self
 
     def follow(self, image: np.ndarray) -> tuple[float, Box]:
         """Find the object in the next frame, of the size of the first.
@@ -169,9 +131,6 @@ class _Discriminative:
     @classmethod
     def trained(cls, positives: np.ndarray, negatives: np.ndarray) -> _Discriminative:
         """Learn which pixels tell them apart."""
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.linear_model import Lasso  # two seconds to import: only who starts with this model pays
-
         templates = _unit(np.concatenate([positives, negatives]).reshape(-1, _SIDE * _SIDE))
         labels = np.repeat([1.0, -1.0], [len(positives), len(negatives)])
         # Pixels are selected by a sparse regression of the labels ("Feature Selection").
@@ -205,9 +164,6 @@ class _Generative:
     @classmethod
     def from_template(cls, template: np.ndarray, seed: int) -> _Generative:
         """Learn the object's patches."""
-        from sklearn.cluster import KMeans
-        from sklearn.exceptions import ConvergenceWarning
-
         patches = cls._patches(template[None])
         with FILTERS, warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a plain object has fewer than 50 different patches
@@ -275,76 +231,7 @@ def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
     wide = atoms.astype(np.float64)
     codes = np.zeros((len(rows), len(atoms)), np.float32)
     count = len(atoms)
-    _solve(rows @ wide.T - _PENALTY, wide @ wide.T, np.zeros((count + 4, count)), np.zeros(count, np.int64), codes)
+    sparse_codes(
+        rows @ wide.T - _PENALTY, wide @ wide.T, np.zeros((count + 4, count)), np.zeros(count, np.int64), codes
+    )
     return codes
-
-
-@kernel("void(float64[:,::1], float64[:,::1], float64[:,::1], int64[::1], float32[:,::1])")
-def _solve(gains: Float64, gram: Float64, scratch: Float64, active: Int64, codes: Float32) -> None:
-    """Active sets (Lawson and Hanson): the atom that gains most comes in, those that turn negative go.
-
-    `gains` are those at code 0. The set's Gram matrix is kept as a Cholesky factor whose diagonal is inverted, with the
-    solution of its forward substitution: an atom that comes in adds one row to both.
-    Scratch: scratch (atoms + 4, atoms), active (atoms,).
-    """
-    count = len(gram)
-    code, wanted, forward, gain, factor = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4:]
-    for row in range(len(codes)):
-        start, size = gains[row], 0
-        for atom in range(count):
-            gain[atom] = start[atom]
-        for _ in range(3 * count):
-            most, best = gain[0], 0
-            for atom in range(1, count):
-                most = max(most, gain[atom])
-            if most <= 1e-6:
-                break
-            while gain[best] < most:
-                best += 1
-            active[size], code[size] = best, 0.0
-            valid, size = size, size + 1
-            while size:
-                for i in range(valid, size):
-                    alike = gram[active[i]]
-                    for j in range(i):
-                        total = alike[active[j]]
-                        for k in range(j):
-                            total -= factor[i, k] * factor[j, k]
-                        factor[i, j] = total * factor[j, j]
-                    total, ahead = alike[active[i]], start[active[i]]
-                    for k in range(i):
-                        total -= factor[i, k] * factor[i, k]
-                        ahead -= factor[i, k] * forward[k]
-                    factor[i, i] = 1 / np.sqrt(max(total, 1e-9))
-                    forward[i] = ahead * factor[i, i]
-                for i in range(size):
-                    wanted[i] = forward[i]
-                for i in range(size - 1, -1, -1):
-                    wanted[i] *= factor[i, i]
-                    for k in range(i):
-                        wanted[k] -= factor[i, k] * wanted[i]
-                way, out = 1.0, -1
-                for i in range(size):
-                    if wanted[i] <= 0:
-                        now = code[i]
-                        part = now / (now - wanted[i]) if now > 0 else 0.0
-                        if part < way:
-                            way, out = part, i
-                for i in range(size):
-                    code[i] += way * (wanted[i] - code[i])
-                if out < 0:
-                    break
-                size -= 1
-                for i in range(out, size):
-                    active[i], code[i] = active[i + 1], code[i + 1]
-                valid = out
-            for atom in range(count):
-                gain[atom] = start[atom]
-            for i in range(size):
-                weight, alike = code[i], gram[active[i]]
-                for atom in range(count):
-                    gain[atom] -= weight * alike[atom]
-            for i in range(size):
-                gain[active[i]] = 0
-        for i in range(size):
-            codes[row, active[i]] = code[i]

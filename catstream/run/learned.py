@@ -24,12 +24,11 @@ from catstream.detection.likeness import Likeness
 from catstream.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.messages import storage
-from catstream.messages.checks import check_message
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, Features, Model
 from catstream.messages.names import check_name, listed
-from catstream.messages.packing import pack, unpack
-from catstream.messages.storage import Arrays, Metadata
+from catstream.messages.schema import check_message
+from catstream.messages.storage import Arrays, Metadata, pack, unpack
 from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer

@@ -19,7 +19,6 @@ from catstream.errors import ProtocolError
 from catstream.messages.heads import BETWEEN_RIDGE, TREES, Head, Tree
 from catstream.messages.kinds import Model, Motion, Sample
 from catstream.numerics import ridge
-from catstream.paper.one_class import one_class
 from catstream.settings import Settings
 from catstream.training.motion_em import learn_motion
 
@@ -30,7 +29,6 @@ class Trainer:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._regressions: dict[str, dict[str, ridge.Regression]] = {}  # of the last samples, by object and tree
-        ridge.prepare()  # before the first sample, because the detector waits for its model
 
     def train(self, sample: Sample) -> Model:
         """Train a model on a sample, in time that depends on n only.
@@ -63,6 +61,8 @@ class Trainer:
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
         if settings.teaching.classifier == "one-class":
+            from catstream.paper.one_class import one_class  # two seconds, for sklearn
+
             return [one_class(sample.trees["object"].rows, sample.trees["background"].mean)]
         if settings.teaching.classifier == "least-squares":
             return [_between(sample)]

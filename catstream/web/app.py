@@ -32,7 +32,7 @@ from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages.kinds import ObjectName
+from catstream.messages.schema import ObjectName
 from catstream.video.annotate import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
@@ -202,6 +202,10 @@ class Command:
     object: ObjectName = ""
     box: Box | None = None
     keep: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.box is not None) != (self.verb == "set-box"):
+            raise ProtocolError(f"expected a box with set-box and with nothing else, got {self.verb}")
 
 
 def _failed(_: Request, error: Exception) -> Response:

@@ -19,10 +19,8 @@ from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Position, Stored
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.go_back_n import HELLO, Deliver, ReceiveWindow, Reject, Reply, SendWindow
-from catstream.wire.monitor import Event
-from catstream.wire.socket import ChannelSocket
-from catstream.wire.timing import LINGER_SECONDS, PATIENCE_SECONDS
+from catstream.wire.go_back_n import HELLO, PATIENCE_SECONDS, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.socket import LINGER_SECONDS, ChannelSocket, Event
 
 _REPLIES: tuple[type[Stored | Position], ...] = (Stored, Position)
 

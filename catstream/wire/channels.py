@@ -37,12 +37,12 @@ from catstream.messages.kinds import (
     Model,
     Preview,
     Question,
-    Run,
     Sample,
     SavedModel,
     Track,
     Tracks,
 )
+from catstream.messages.schema import fields
 
 #: The permissions of a client: each role includes those before it.
 Role = Literal["watch", "control", "pipeline"]
@@ -64,6 +64,7 @@ class Channel(Generic[Message]):
     keeps            "every" message, or the "newest"
     port             offset from the first port; each further sender takes the next one
     megabytes        size of the largest message
+    public           name by which a client subscribes (`catstream.subscribe`, `catstream watch`), empty if none does
     role             role that a peer which connects needs at least
     high_water_mark  how many messages a subscriber may lag behind before it misses some
     """
@@ -75,6 +76,7 @@ class Channel(Generic[Message]):
     keeps: Literal["every", "newest"]
     port: int
     megabytes: int
+    public: str = ""
     role: Role = "pipeline"
     high_water_mark: int = 1000
 
@@ -82,6 +84,11 @@ class Channel(Generic[Message]):
     def acknowledged(self) -> bool:
         """Whether each message is repeated until its one receiver has answered it."""
         return self.receiver is not None
+
+    @property
+    def by_object(self) -> bool:
+        """Whether each message is about one object."""
+        return any(field.name == "object" for field in fields(self.messages[0]))
 
     @property
     def limit(self) -> int:
@@ -96,45 +103,27 @@ FEATURES: Channel[Features | End] = Channel(
     "features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
 )
 SAMPLES: Channel[Sample | End] = Channel(
-    "samples", (Sample, End), ("compressor",), None, "newest", port=1, megabytes=512, role="watch", high_water_mark=16
+    "samples", (Sample, End), ("compressor",), None, "newest", 1, 512, "samples", "watch", high_water_mark=16
 )
 MODELS: Channel[Model] = Channel(
-    "models", (Model,), ("trainer",), None, "newest", port=2, megabytes=1, role="watch", high_water_mark=256
+    "models", (Model,), ("trainer",), None, "newest", 2, 1, "models", "watch", high_water_mark=256
 )
-TRACKS: Channel[Track | End] = Channel(
-    "tracks", (Track, End), ("detector",), None, "every", port=3, megabytes=1, role="watch"
-)
+TRACKS: Channel[Track | End] = Channel("tracks", (Track, End), ("detector",), None, "every", 3, 1, "tracks", "watch")
 RESULTS: Channel[Tracks | End] = Channel("results", (Tracks, End), ("detector",), "owner", "every", port=4, megabytes=1)
 HEALTH: Channel[Health] = Channel(
-    "health", (Health,), _ALL, None, "newest", port=5, megabytes=1, role="watch", high_water_mark=16
+    "health", (Health,), _ALL, None, "newest", 5, 1, "health", "watch", high_water_mark=16
 )
 PREVIEWS: Channel[Preview] = Channel(
-    "previews", (Preview,), ("detector",), None, "newest", port=8, megabytes=1, role="watch", high_water_mark=8
+    "previews", (Preview,), ("detector",), None, "newest", 8, 1, "previews", "watch", high_water_mark=8
 )
 CONTROL: Channel[Command | Answer] = Channel(
     "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=64, role="control"
 )
-TRAINING: Channel[Run | Features | End] = Channel(
-    "training",
-    (Run, Features, End),
-    ("detector",),
-    None,
-    "every",
-    port=10,
-    megabytes=_FEATURES,
-    role="watch",
-    high_water_mark=64,
+TRAINING: Channel[Features | End] = Channel(
+    "training", (Features, End), ("detector",), None, "every", 10, _FEATURES, "features", "watch", high_water_mark=64
 )
 SAVED_MODELS: Channel[SavedModel] = Channel(
-    "saved-models",
-    (SavedModel,),
-    ("compressor",),
-    None,
-    "newest",
-    port=11,
-    megabytes=512,
-    role="watch",
-    high_water_mark=2,
+    "saved-models", (SavedModel,), ("compressor",), None, "newest", 11, 512, role="watch", high_water_mark=2
 )
 
 #: THE TABLE, by name.
@@ -142,6 +131,9 @@ CHANNELS: dict[str, Channel[object]] = {
     channel.name: channel
     for channel in (FEATURES, SAMPLES, MODELS, TRACKS, RESULTS, HEALTH, PREVIEWS, CONTROL, TRAINING, SAVED_MODELS)
 }
+
+#: The channels that a client may subscribe to, by their public names.
+PUBLIC: dict[str, Channel[object]] = {channel.public: channel for channel in CHANNELS.values() if channel.public}
 
 #: The only channel of the controller of a fleet, which is no process of a pipeline and has an endpoint of its own.
 REGISTRY: Channel[Question | Listing] = Channel(

@@ -14,31 +14,31 @@ A message is one frame of msgpack, `[version, kind, object, run, fields]`:
 Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may take one kind of
 message, or that of one object.
 
-Every size has a limit before memory is taken for it. Then the message is checked against its
-schema (`catstream.messages.checks`). A field that this version does not know is ignored.
+The bytes are decoded straight into the fields of their kind: what is not one of them is skipped, and takes no memory.
+A sender decodes what it sends, too, so that nothing leaves it that would be rejected on arrival.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import TypeVar
+from dataclasses import field
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import msgpack
 import msgspec
 import numpy as np
 
 from catstream.errors import ProtocolError
-from catstream.messages.checks import check_message
 from catstream.messages.kinds import Position, Stored
-from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT
+from catstream.messages.schema import Integer, Text, check_message
 from catstream.wire.channels import CHANNELS, REGISTRY
 
 Message = TypeVar("Message")
 
 #: Version of the envelope and of the meaning of the fields.
 VERSION = 4
-
-_LONGEST_TOPIC = 512  # bytes
 
 #: Kinds of message, by their name on the wire: those of the channels, and the replies on acknowledged channels.
 KINDS: dict[str, type] = {
@@ -47,72 +47,55 @@ KINDS: dict[str, type] = {
     for kind in kinds
 }
 
+#: What is wrong with bytes: msgspec raises no other error for them.
+_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+
+
+class Topic(NamedTuple):
+    """Kind and object of a message."""
+
+    kind: str
+    object: str
+
+
+class _Envelope(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
+    version: int
+    kind: Text
+    object: Text
+    run: Text
+    fields: msgspec.Raw
+
 
 def encode(message: object, run: str = "") -> bytes:
-    """A message of a run as bytes.
-
-    Raises
-    ------
-    ProtocolError
-        If it breaks its schema: it would be rejected on arrival.
-    """
+    """A message of a run as bytes; ProtocolError if it breaks its schema."""
     check_message(message)
-    return _ENCODER.encode((VERSION, type(message).__name__.lower(), getattr(message, "object", ""), run, message))
+    kind = type(message)
+    data = _ENCODER.encode((VERSION, kind.__name__.lower(), getattr(message, "object", ""), run, message))
+    _fields_in(_opened(data), kind)
+    return data
 
 
 def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
-    """The message in `data`, one of `kinds`. Its arrays are read-only.
-
-    Raises
-    ------
-    ProtocolError
-        If it is anything else; the error has the expected and the received kind.
-    """
+    """The message in `data`, one of `kinds`, with read-only arrays; ProtocolError if it is anything else."""
     return decode_with_run(data, *kinds)[0]
 
 
 def decode_with_run(data: bytes | memoryview, *kinds: type[Message]) -> tuple[Message, str]:
     """The same, and the run that the message is from."""
-    expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
-    try:
-        envelope = msgpack.unpackb(
-            data,
-            object_pairs_hook=_unique,
-            max_bin_len=len(data),
-            max_str_len=LONGEST_TEXT,
-            max_array_len=LONGEST_LIST,
-            max_map_len=LONGEST_LIST,
-            max_ext_len=0,
-        )
-    except (ValueError, msgpack.exceptions.UnpackException) as error:
-        raise ProtocolError(
-            f"expected {expected}, got {len(data)} bytes that are not its msgpack: {error}", "msgpack"
-        ) from None
-    if isinstance(envelope, list) and len(envelope) > 1 and (version := envelope[0]) != VERSION:
-        raise ProtocolError(
-            f"expected version {VERSION} of the protocol, got {_brief(version)}: run the same catstream", "version"
-        )
-    if not isinstance(envelope, list) or len(envelope) != 5:
-        raise ProtocolError(
-            f"expected {expected} as [version, kind, object, run, fields], got something else in msgpack", "envelope"
-        )
-    _, name, about, run, fields = envelope
-    kind = KINDS.get(name) if isinstance(name, str) else None
-    if kind not in kinds:
-        raise ProtocolError(f"expected {expected}, got {_brief(name)}", "kind")
-    try:
-        message: Message = msgspec.convert(fields, kind, dec_hook=_array)
-    except msgspec.ValidationError as error:
-        raise ProtocolError(f"{name}: {error}", "type") from None
-    if about != getattr(message, "object", ""):
-        raise ProtocolError(
-            f"{name}: expected one object, got {_brief(about)} in the envelope and another one in the fields",
-            "envelope",
-        )
-    if not isinstance(run, str):
-        raise ProtocolError(f"{name}: expected the id of a run, got {_brief(run)}", "envelope")
-    check_message(message)
-    return message, run
+    envelope = _opened(data)
+    if (kind := KINDS.get(envelope.kind)) not in kinds:
+        expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
+        raise ProtocolError(f"expected {expected}, got {envelope.kind!r:.40}")
+    message: Message = _fields_in(envelope, kind)
+    if type(message) is not kind:
+        try:
+            message = msgspec.convert(message, kind, from_attributes=True, dec_hook=_array)
+        except msgspec.ValidationError as error:
+            raise ProtocolError(f"{envelope.kind}: {error}") from None
+        check_message(message)
+    if envelope.object != getattr(message, "object", ""):
+        raise ProtocolError(f"{envelope.kind}: the envelope names another object, {envelope.object!r:.40}")
+    return message, envelope.run
 
 
 def opening(kind: type, about: str | None = None) -> bytes:
@@ -121,57 +104,77 @@ def opening(kind: type, about: str | None = None) -> bytes:
     return _ENCODER.encode((VERSION, *names, *[None] * (4 - len(names))))[: -(4 - len(names))]  # nil is one byte
 
 
-def topic_of(data: bytes | memoryview) -> bytes:
-    """The topic of a message: the bytes before its fields; the first bytes of the data if it is not a message.
+def topic_of(data: bytes | memoryview) -> Topic:
+    """The topic of a message; of no kind if it is not a message.
 
     >>> from catstream.messages.kinds import End
-    >>> topic_of(encode(End(1, "over"))) == opening(End, "")
-    True
+    >>> topic_of(encode(End(1, "over")))
+    Topic(kind='end', object='')
     """
-    reader = msgpack.Unpacker(max_buffer_size=len(data) + 1, max_str_len=LONGEST_TEXT)
-    reader.feed(data[:_LONGEST_TOPIC])
     try:
-        reader.read_array_header()
-        for _ in range(3):
-            reader.skip()
-    except (ValueError, msgpack.exceptions.UnpackException):
-        return bytes(data[:_LONGEST_TOPIC])
-    return bytes(data[: reader.tell()])
-
-
-def encode_json(message: object) -> bytes:
-    """A message without arrays as a JSON object of its fields, for recordings.
-
-    Raises
-    ------
-    ProtocolError
-        If a field is outside of its limits.
-    """
-    check_message(message)
-    return msgspec.json.encode(message)
+        envelope = _opened(data)
+    except ProtocolError:
+        return Topic("", "")
+    return Topic(envelope.kind, envelope.object)
 
 
 def decode_json(data: bytes, kind: type[Message]) -> Message:
-    """The message that `encode_json` wrote.
-
-    Raises
-    ------
-    ProtocolError
-        If it is not JSON, or not the fields of a message of this kind within their limits.
-    """
+    """A message without arrays, from a JSON object of its fields; ProtocolError if it is anything else."""
     try:
-        message = msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        return msgspec.json.decode(data, type=kind)
+    except _ERRORS as error:
+        raise ProtocolError(f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}") from None
+
+
+def _opened(data: bytes | memoryview) -> _Envelope:
+    try:
+        envelope = _OPENER.decode(data)
+    except _ERRORS as error:
+        raise ProtocolError(f"expected [version, kind, object, run, fields] in msgpack: {error}") from None
+    if envelope.version != VERSION:
         raise ProtocolError(
-            f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}", "json"
-        ) from None
-    check_message(message)
-    return message
+            f"expected version {VERSION} of the protocol, got {envelope.version}: run the same catstream"
+        )
+    return envelope
 
 
-def _brief(value: object) -> str:
-    """A value for an error message; lists may be nested deeper than Python can print."""
-    return f"{value!r:.40}" if isinstance(value, str | int) else f"a {type(value).__name__}"
+def _fields_in(envelope: _Envelope, kind: type) -> Any:
+    """The fields of a message of this kind, in the form that `_form` gives it."""
+    try:
+        return _decoder(kind).decode(envelope.fields)
+    except _ERRORS as error:
+        raise ProtocolError(f"{envelope.kind}: {error}") from None
+
+
+@cache
+def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(_form(kind))
+
+
+def _form(hint: Any) -> Any:
+    """The type into which bytes are decoded for a kind of message, or for a field of it.
+
+    It has an `_Array` for each array: msgspec would take any value for an array, however deeply nested.
+    """
+    if hint is np.ndarray:
+        return _Array
+    if dataclasses.is_dataclass(hint):
+        hints = get_type_hints(hint, include_extras=True)
+        forms = {name: _form(each) for name, each in hints.items()}
+        if forms == hints:
+            return hint
+        return dataclasses.make_dataclass(
+            hint.__name__,  # type: ignore[union-attr]
+            [
+                (each.name, forms[each.name], field(default=each.default, default_factory=each.default_factory))
+                for each in dataclasses.fields(hint)
+            ],
+        )
+    if (origin := get_origin(hint)) is Annotated:
+        return Annotated[(_form(hint.__origin__), *hint.__metadata__)]
+    if origin in (dict, Union, UnionType):
+        return (dict if origin is dict else Union)[tuple(map(_form, get_args(hint)))]
+    return hint
 
 
 def _plain(value: object) -> dict[str, object]:
@@ -182,28 +185,18 @@ def _plain(value: object) -> dict[str, object]:
     raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
-
-
 class _Array(msgspec.Struct, forbid_unknown_fields=True):
-    dtype: str
-    shape: list[int]
-    data: bytes
+    dtype: Literal["<f4", "<f8"]
+    shape: Annotated[tuple[Integer, ...], msgspec.Meta(min_length=1, max_length=2)]
+    data: memoryview
 
 
-def _array(_: type, value: object) -> np.ndarray:
+def _array(_: type, value: Any) -> np.ndarray:
     """The array that `_plain` converted."""
-    plain = msgspec.convert(value, _Array)
-    if plain.dtype not in ("<f4", "<f8") or not 1 <= len(plain.shape) <= 2 or min(plain.shape) < 0:
-        raise ValueError(f"an array of {plain.dtype:.20} and shape {plain.shape} cannot be received")
-    dtype = np.dtype(plain.dtype)
-    if math.prod(plain.shape) * dtype.itemsize != len(plain.data):
-        raise ValueError(f"{len(plain.data)} bytes are not an array of {plain.dtype} and shape {plain.shape}")
-    return np.frombuffer(plain.data, dtype).reshape(plain.shape)
+    if math.prod(value.shape) * np.dtype(value.dtype).itemsize != len(value.data):
+        raise ValueError(f"{len(value.data)} bytes are not an array of {value.dtype} and shape {value.shape}")
+    return np.frombuffer(bytes(value.data), value.dtype).reshape(value.shape)  # a copy, which begins at a word
 
 
-def _unique(pairs: list[tuple[object, object]]) -> dict[object, object]:
-    fields = dict(pairs)
-    if len(fields) < len(pairs):
-        raise ValueError("a name is twice in a map")
-    return fields
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
+_OPENER = msgspec.msgpack.Decoder(_Envelope)

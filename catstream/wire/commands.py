@@ -3,8 +3,8 @@
 One process binds a ROUTER socket (`Responder`); any number of clients connect DEALER sockets (`Requester`). A client
 sends a question again until an answer with its `id` arrives: as soon as it is connected again if the connection broke,
 otherwise after a time that suits the size of the question. The responder remembers its last 64 answers, and repeats the
-answer to a question that it has answered already. At most 64 questions wait; any further one is dropped and sent again
-by its client. A command is a question that asks for an action.
+answer to a question that it has answered already. A command is a question that asks for an action. At most 64 questions
+wait: any further command is rejected, except for "stop".
 """
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ from typing import Generic, Protocol, TypeVar, cast
 
 import zmq
 
+from catstream.messages.kinds import Answer as CommandAnswer
+from catstream.messages.kinds import Command
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.socket import ChannelSocket
-from catstream.wire.timing import LOOK_SECONDS, RETRY_BYTES_PER_SECOND, RETRY_SECONDS
 
+LOOK_SECONDS = 0.05  #: from one look at the connection to the next
+RETRY_SECONDS = 0.2  #: after which a question is sent again; a large one later
+RETRY_BYTES_PER_SECOND = 1e6  #: of a slow network: a large question is sent again after so much longer
 _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
 _LONGEST_QUESTION = 1 << 20  # bytes
 _MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client
@@ -35,12 +39,7 @@ Answer = TypeVar("Answer", bound=_HasId)
 
 
 class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
-    """Sends questions and receives their answers; it connects.
-
-    Parameters
-    ----------
-    channel : its first kind of message is the question, its second one the answer
-    """
+    """Sends questions, the channel's first kind of message, and receives answers, its second; it connects."""
 
     def __init__(self, channel: Channel[Question | Answer], endpoint: Endpoint) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
@@ -93,7 +92,6 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
     Parameters
     ----------
-    channel : its first kind of message is the question, its second one the answer
     longest : bytes of a question at most
     """
 
@@ -139,9 +137,13 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
             self._send(peer, answer)
             return False
         known = question.id in self._waiting
-        if known or len(self._waiting) < _MAX_QUESTIONS:
+        stops = isinstance(question, Command) and question.verb == "stop"
+        if known or len(self._waiting) < (2 if stops else 1) * _MAX_QUESTIONS:
             self._waiting[question.id] = peer
             return not known
+        if isinstance(question, Command):
+            full = f"{_MAX_QUESTIONS} commands wait for the next frame: try again later"
+            self._send(peer, self._encode(CommandAnswer(question.id, False, full)))
         return False
 
     def _send(self, peer: bytes, data: bytes) -> None:

@@ -2,7 +2,7 @@
 
 An endpoint is a folder with one Unix socket for each channel (`FOLDER/features`), which only this user may enter; or
 `tcp://127.0.0.1:5700`, from which each channel takes the port that its row in the table says. With keys other machines
-may reach the host, and processes may have hosts of their own: `tcp://10.0.0.1,compressor=10.0.0.2,trainer=10.0.0.3:5700`.
+may reach the host.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
 
 from catstream.errors import ServiceError
 from catstream.messages.storage import is_locked, lock, writing
@@ -32,15 +31,13 @@ _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
 _FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
 _ANY_BYTES = "surrogateescape"  # in notes: the name of a file need not be UTF-8
-_EARLY = f"{_PREFIX}early-"  # begins the names of the notes of subscribers that wait for a pipeline
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """The address of the sockets of a pipeline: a folder, or hosts and the first port; and the keys to connect with.
+    """The address of the sockets of a pipeline: a folder, or a host and the first port; and the keys to connect with.
 
-    host    of all processes that `hosts` does not name, as ZeroMQ takes it
-    hosts   of single processes, by name
+    host    as ZeroMQ takes it
     keys    to connect with; None if the pipeline has no keys
     source  of the pipeline's frames, without a password; empty if it is not known here, or for a fleet
     run     id of the run whose process this is; empty for a client
@@ -54,25 +51,19 @@ class Endpoint:
     folder: Path | None = None
     host: str = ""
     port: int = 0
-    hosts: dict[str, str] = field(default_factory=dict)
     keys: Keys | None = None
     source: str = field(default="", compare=False)
     run: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """As the setting `run.endpoint` says it."""
-        if self.folder is not None:
-            return str(self.folder)
-        return f"tcp://{','.join([self.host, *map('='.join, self.hosts.items())])}:{self.port}"
+        return str(self.folder) if self.folder is not None else f"tcp://{self.host}:{self.port}"
 
     @classmethod
     def parse(cls, text: str, keys: str | Keys = "") -> Endpoint:
         """Read the settings `endpoint` and `keys`; the keys may have been loaded already.
 
-        Raises
-        ------
-        ServiceError
-            If one of them is not valid, or other machines can reach the host and there are no keys.
+        ServiceError if one of them is not valid, or if other machines can reach the host and there are no keys.
         """
         if not text:
             raise ServiceError("this process needs the endpoint of its pipeline: --set run.endpoint=FOLDER")
@@ -92,31 +83,25 @@ class Endpoint:
     @classmethod
     def _tcp(cls, text: str, keys: Keys | None) -> Endpoint:
         last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
-        hosts, _, port = text.removeprefix("tcp://").rpartition(":")
-        first, *others = hosts.split(",")
-        named = dict(other.partition("=")[::2] for other in others)
-        if not all(map(_is_host, [first, *named.values()])):
-            port = ""
-        elif keys is None and not all(map(_is_loopback, map(_plain, [first, *named.values()]))):
+        host, _, port = text.removeprefix("tcp://").rpartition(":")
+        host = {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
+        address = _address(host)
+        if keys is None and _is_host(host) and (address is None or not address.is_loopback):
             raise ServiceError(
                 f"other machines can reach {text}, and without keys anybody could connect: make keys "
                 "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
-        if not (port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+        if not (_is_host(host) and port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
             raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
-        if unknown := named.keys() - _LISTENERS:
-            raise ServiceError(f"{text!r} names {', '.join(unknown)}, there are {', '.join(sorted(_LISTENERS))}")
-        first, named = _plain(first), {name: _plain(host) for name, host in named.items()}
-        return cls(host=first, port=int(port), hosts=named, keys=keys)
+        return cls(host=host, port=int(port), keys=keys)
 
     def address(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address of a channel, as ZeroMQ takes it; of the given sender if there are several."""
         sender = sender or channel.senders[0]
         if self.folder is not None:
             return f"ipc://{self.folder / _file(channel, sender)}"
-        host = self.hosts.get(channel.receiver or sender, self.host)
-        return f"tcp://{host}:{self.port + channel.port + channel.senders.index(sender)}"
+        return f"tcp://{self.host}:{self.port + channel.port + channel.senders.index(sender)}"
 
     def listening(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address to listen on; the name of a host is resolved."""
@@ -145,27 +130,12 @@ class Endpoint:
 #: The endpoint of a pipeline, as a program gives it.
 Place = str | os.PathLike[str] | Endpoint
 
-#: Processes that listen, the name of `hosts`.
-_LISTENERS = {
-    name for channel in CHANNELS.values() for name in ([channel.receiver] if channel.receiver else channel.senders)
-}
-
-
-def _plain(host: str) -> str:
-    """A host as ZeroMQ takes it, to listen and to connect."""
-    return {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
-
 
 def _is_host(host: str) -> bool:
     """Whether a text is the name of a host, or an address; an IPv6 address is in brackets."""
     if host.startswith("["):
         return host.endswith("]") and _address(host) is not None
     return bool(_HOST.fullmatch(host))
-
-
-def _is_loopback(host: str) -> bool:
-    address = _address(host)
-    return address is not None and address.is_loopback
 
 
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -186,13 +156,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes.
-
-    Raises
-    ------
-    ServiceError
-        If no folder for temporary files can be written to.
-    """
+    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes."""
     if not (homes := _homes()):
         raise ServiceError("no folder for temporary files can be written to: set TMPDIR to one")
     for path, text in _notes(homes[:1], f"{_PREFIX}*/{_OWNER}"):
@@ -202,7 +166,7 @@ def private_folder() -> Iterator[Path]:
         with writing(homes[0]):
             folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=homes[0]))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            stack.enter_context(Note(folder / _OWNER, ""))
+            stack.enter_context(note(folder / _OWNER, ""))
         yield folder
 
 
@@ -216,21 +180,24 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
     default : the private folder of the process, used if `text` is empty; `running` and `fleets` find the endpoint by it
     source : of the pipeline's frames, without a password, by which a user tells several pipelines apart
     fleet : name of the fleet whose controller has this endpoint; empty for a pipeline
-
-    Raises
-    ------
-    ServiceError
-        If another pipeline uses the folder, or other users may write to it, or a file of the keys is damaged.
     """
     endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
         endpoint.keys.listening()
         endpoint.keys.client(endpoint.keys.public.decode())
-    if endpoint.folder is None:  # the kernel gives a port to one process only
-        with _noted(endpoint, default, source, fleet):
-            yield endpoint
-        return
-    folder = endpoint.folder.absolute()
+    with contextlib.ExitStack() as stack:
+        if endpoint.folder is not None:  # of tcp, the kernel gives a port to one process only
+            folder = stack.enter_context(_locked(endpoint.folder.absolute(), text))
+            endpoint = Endpoint.parse(str(folder), endpoint.keys or "")
+        place = str(endpoint), str(endpoint.keys.folder) if endpoint.keys is not None else "", fleet or source
+        with writing(default):
+            stack.enter_context(note(default / (_FLEET_NOTE if fleet else _NOTE), "\n".join(place)))
+        yield endpoint
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, text: str) -> Iterator[Path]:
+    """A folder for the sockets of one pipeline, which is made; the sockets are removed afterwards."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -248,21 +215,12 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
                 "wait for it, or give another folder (--set run.endpoint=FOLDER)"
             )
         try:
-            endpoint = Endpoint.parse(str(folder), keys)
-            with _noted(endpoint, default, source, fleet):
-                yield endpoint
+            yield folder
         finally:
             for file in _files(folder):
                 file.unlink(missing_ok=True)
     finally:
         os.close(handle)
-
-
-def _noted(endpoint: Endpoint, folder: Path, source: str, fleet: str) -> Note:
-    """Note an endpoint with its source or its fleet, until the note is closed or the process ends."""
-    keys = str(endpoint.keys.folder) if endpoint.keys is not None else ""
-    with writing(folder):
-        return Note(folder / (_FLEET_NOTE if fleet else _NOTE), "\n".join([str(endpoint), keys, fleet or source]))
 
 
 def running() -> list[Endpoint]:
@@ -301,10 +259,7 @@ def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
         already is returned
     source : of a pipeline of this user, as it was given, or its file name
 
-    Raises
-    ------
-    ServiceError
-        If there is none, or more than one.
+    ServiceError if there is none, or more than one.
     """
     if isinstance(text, Endpoint):
         return text
@@ -359,60 +314,20 @@ def _follows(endpoint: Endpoint, source: str) -> bool:
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
-class Note:
-    """A file that is locked until it is closed or its process ends; it is never visible without its lock and text.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
-
-    def __init__(self, path: Path, text: str) -> None:
-        hidden = path.with_name(f".{path.name}")
-        self._path, self._file = path, hidden.open("w", encoding="utf-8", errors=_ANY_BYTES)
-        with contextlib.ExitStack() as unfinished:
-            unfinished.callback(self._file.close)
-            unfinished.callback(hidden.unlink)
-            lock(self._file.fileno(), math.inf)
-            self._file.write(text)
-            self._file.flush()
+@contextlib.contextmanager
+def note(path: Path, text: str) -> Iterator[None]:
+    """A file that is locked as long as its process uses it; it is never visible without its lock and text."""
+    hidden = path.with_name(f".{path.name}")
+    with hidden.open("w", encoding="utf-8", errors=_ANY_BYTES) as file:
+        try:
+            lock(file.fileno(), math.inf)
+            file.write(text)
+            file.flush()
             hidden.rename(path)
-            unfinished.pop_all()
-
-    def close(self) -> None:
-        """Remove the file."""
-        self._path.unlink(missing_ok=True)
-        self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def note_early_subscriber(name: str, channel: Channel[object], endpoint: Endpoint) -> Note | None:
-    """A note that a subscriber waits for a pipeline; None if this user may write no note anywhere."""
-    with contextlib.suppress(OSError, IndexError):
-        return Note(_homes()[0] / f"{_EARLY}{name}", f"{channel.name} {_place(endpoint)}")
-    return None
-
-
-def names_of_early_subscribers(channel: Channel[object], endpoint: Endpoint) -> set[str]:
-    """The names in the notes of this user's subscribers that wait at an endpoint; removes the notes of dead ones."""
-    names = set()
-    for path, text in _notes(_homes(), f"{_EARLY}*"):
-        if text is None:
+            yield
+        finally:
+            hidden.unlink(missing_ok=True)
             path.unlink(missing_ok=True)
-        elif text == f"{channel.name} {_place(endpoint)}":
-            names.add(path.name.removeprefix(_EARLY))
-    return names
-
-
-def _place(endpoint: Endpoint) -> str:
-    """A text of the endpoint that does not depend on how its folder was written."""
-    return str(endpoint.folder.resolve() if endpoint.folder is not None else endpoint)
 
 
 def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:

@@ -30,7 +30,9 @@ from dataclasses import dataclass
 
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import Position, Stored
-from catstream.wire.timing import AGAIN_SECONDS, PATIENCE_SECONDS
+
+PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the position; between two reports of a gap
+AGAIN_SECONDS = 2.0  #: within which a sender goes back once only on the same connection
 
 #: The frame by which a sender asks for the receiver's position.
 HELLO = b""

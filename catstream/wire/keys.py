@@ -9,7 +9,7 @@ A pipeline that can be reached from other machines has a folder of keys, made by
 
 A client has a folder with `server.pub` and its own `client.key`. Every file is TOML, and only its owner can read it,
 from its first byte on. The files in `clients` are read at each handshake, so a client can be added or removed without
-a restart.
+a restart. What is wrong with a folder of keys is a ServiceError.
 """
 
 from __future__ import annotations
@@ -62,25 +62,13 @@ class Keys:
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Keys:
-        """Read a folder of keys, a pipeline's or a client's.
-
-        Raises
-        ------
-        ServiceError
-            If a file is missing, damaged, or can be read by other users.
-        """
+        """Read a folder of keys, a pipeline's or a client's."""
         folder = Path(folder).absolute()
-        server, own = _read(folder / _SERVER_PUBLIC), _read(folder / _CLIENT)
-        return cls(folder, _key(server, "public", folder), _key(own, "public", folder), _key(own, "secret", folder))
+        own = _read(folder / _CLIENT)
+        return cls(folder, public_key(folder).encode(), _key(own, "public", folder), _key(own, "secret", folder))
 
     def listening(self) -> bytes:
-        """The secret key of the sockets that listen.
-
-        Raises
-        ------
-        ServiceError
-            If this is the folder of a client.
-        """
+        """The secret key of the sockets that listen."""
         if not (self.folder / _SERVER).exists():
             raise ServiceError(
                 f"{self.folder} holds the keys of a client, a pipeline needs those that `catstream keys new` made: "
@@ -89,37 +77,22 @@ class Keys:
         return _key(_read(self.folder / _SERVER), "secret", self.folder)
 
     def for_server(self, public: str) -> Keys:
-        """The same key pair, to connect to sockets with another public key.
-
-        Raises
-        ------
-        ServiceError
-            If it is not a public key.
-        """
-        _check_public(public)
-        return replace(self, server=public.encode())
+        """The same key pair, to connect to sockets with another public key."""
+        return replace(self, server=_checked(public).encode())
 
     def client(self, public: str) -> tuple[str, Role] | None:
         """Current name and role of the client with this public key; None if it is not allowed to connect."""
-        for name, client in clients(self.folder).items():
-            if client.public == public:
-                return name, client.role
-        return None
+        known = clients(self.folder)
+        return next(((name, client.role) for name, client in known.items() if client.public == public), None)
 
 
 def create(folder: Path) -> None:
-    """Make the keys of a pipeline: a pair for its sockets that listen, and one for its processes that connect.
-
-    Raises
-    ------
-    ServiceError
-        If the folder holds keys already, or cannot be written.
-    """
+    """Make the keys of a pipeline: a pair for its sockets that listen, and one for its processes that connect."""
     if any((folder / name).exists() for name in (_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS)):
         raise ServiceError(f"{folder} holds keys already, and clients that have them would be locked out: give another")
-    server = zmq.curve_keypair()
-    _write(folder / _SERVER, public=server[0], secret=server[1])
-    _write(folder / _SERVER_PUBLIC, public=server[0])
+    public, secret = zmq.curve_keypair()
+    _write(folder / _SERVER, public=public, secret=secret)
+    _write(folder / _SERVER_PUBLIC, public=public)
     _write(folder / _CLIENTS / _OWN, role=b"pipeline", public=_pair(folder))
 
 
@@ -136,39 +109,25 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
     ----------
     output : new folder for the keys of the client; or
     public : the public key of a client that has a key pair already
-
-    Raises
-    ------
-    ServiceError
-        If there is a client with that name or key, or `output` holds keys already.
     """
-    _check_name(name)
-    if public is not None:
-        _check_public(public)
-    server = public_key(folder).encode()
-    known = clients(folder)
-    if name in known:
+    known, server = clients(folder), public_key(folder).encode()
+    if _named(name) in known:
         raise ServiceError(f"there is a client {name} already: take another name, or `catstream keys revoke` it first")
     for other, client in known.items():
         if client.public == public:
             raise ServiceError(f"this key is that of {other}, a {client.role} client: `catstream keys revoke` it first")
-    if output is not None:
+    if public is not None:
+        _checked(public)
+    elif output is not None:
         _write(output / _SERVER_PUBLIC, public=server)
         public = _pair(output).decode()
-    if public is None:
+    else:
         raise ServiceError("a new client needs a folder for its keys, or its public key")
     _write(folder / _CLIENTS / name, role=role.encode(), public=public.encode())
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Remove a client: it cannot connect any more.
-
-    Raises
-    ------
-    ServiceError
-        If there is no client of that name, or it is the pipeline, which could not start any more, or its file cannot be
-        removed. A damaged file can be.
-    """
+    """Remove a client, also one whose file is damaged: it cannot connect any more."""
     known = [path.name for path in _listed(folder)]
     if name not in known:
         raise ServiceError(f"there is no client {name!r}: there are {', '.join(known)}")
@@ -184,11 +143,6 @@ def allowed(folder: Path) -> dict[str, Client]:
     Parameters
     ----------
     folder : keys of the fleet; its own processes are one of the clients
-
-    Raises
-    ------
-    ServiceError
-        If the folder holds no keys, or one of its files is damaged.
     """
     return {_FLEET if name == _OWN else name: client for name, client in clients(folder).items()}
 
@@ -197,36 +151,24 @@ def synchronise(folder: Path, wanted: Mapping[str, Client]) -> None:
     """Allow these clients and no others, besides the pipeline's own processes; all others are revoked.
 
     A client that stays is allowed at any time. A connection that is open stays open.
-
-    Raises
-    ------
-    ServiceError
-        If a name or a key is not valid, or the folder holds no keys, or cannot be written.
     """
-    for name, client in wanted.items():
-        _check_name(name)
-        _check_public(client.public)
+    texts = {
+        _named(name): _text(role=client.role.encode(), public=_checked(client.public).encode())
+        for name, client in wanted.items()
+        if name != _OWN
+    }
     known = {path.name for path in _listed(folder)} - {_OWN}
-    try:
-        for name in known - wanted.keys():
+    with writing(folder / _CLIENTS):
+        for name in known - texts.keys():
             (folder / _CLIENTS / name).unlink(missing_ok=True)
-        for name in wanted.keys() - {_OWN}:
-            client, path = wanted[name], folder / _CLIENTS / name
-            text = _text(role=client.role.encode(), public=client.public.encode())
+        for name, text in texts.items():
+            path = folder / _CLIENTS / name
             if name not in known or path.read_bytes() != text:
                 write_atomically(path, text, mode=0o600)
-    except OSError as error:
-        raise ServiceError(f"cannot write the clients in {folder} ({error.strerror})") from None
 
 
 def clients(folder: Path) -> dict[str, Client]:
-    """The clients that may connect, by name.
-
-    Raises
-    ------
-    ServiceError
-        If the folder holds no keys, or one of its files is damaged.
-    """
+    """The clients that may connect, by name."""
     found = {}
     for path in _listed(folder):
         try:
@@ -235,8 +177,7 @@ def clients(folder: Path) -> dict[str, Client]:
             if not path.exists():  # it was revoked meanwhile
                 continue
             raise
-        role = facts.get("role")
-        if role not in ROLES:
+        if (role := facts.get("role")) not in ROLES:
             raise ServiceError(
                 f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, and allow it again"
             )
@@ -245,13 +186,7 @@ def clients(folder: Path) -> dict[str, Client]:
 
 
 def public_key(folder: Path) -> str:
-    """The public key of the sockets that listen.
-
-    Raises
-    ------
-    ServiceError
-        If the folder holds no keys, or its file is damaged.
-    """
+    """The public key of the sockets that listen."""
     return _key(_read(folder / _SERVER_PUBLIC), "public", folder).decode()
 
 
@@ -271,13 +206,12 @@ def _pair(folder: Path) -> bytes:
 
 def _write(path: Path, **facts: bytes) -> None:
     """Write a new file atomically; only its owner can read it at any time."""
-    try:
+    with writing(path):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
-    except FileExistsError:
-        raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
-    except OSError as error:
-        raise ServiceError(f"cannot write {path} ({error.strerror}): give another folder") from None
+        try:
+            create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
+        except FileExistsError:
+            raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
 
 
 def _text(**facts: bytes) -> bytes:
@@ -285,14 +219,16 @@ def _text(**facts: bytes) -> bytes:
     return b"".join(b'%s = "%s"\n' % (name.encode(), value) for name, value in facts.items())
 
 
-def _check_name(name: str) -> None:
+def _named(name: str) -> str:
     if not _NAME.fullmatch(name):
         raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
+    return name
 
 
-def _check_public(public: str) -> None:
+def _checked(public: str) -> str:
     if not _KEY.fullmatch(public):
         raise ServiceError(f"a public key is 40 characters of Z85, got {public!r}")
+    return public
 
 
 def _read(path: Path) -> dict[str, object]:

@@ -1,54 +1,237 @@
-"""The base class of all sockets of a channel: limits, keys, connection events, and the check of messages.
+"""The sockets of all channels: context, limits, connection events, keys, and the check of messages.
 
-Every queue, message and handshake has a limit. A frame that is not a message of the channel is counted, logged
-once and dropped (`catstream.wire.rejects`). If the endpoint has keys, everything is encrypted (CURVE), and a peer that
-connects needs a key with the role of the channel (`catstream.wire.zap`).
+Every queue, message and handshake has a limit. A frame that is not a message of the channel is counted, logged once and
+dropped. If the endpoint has keys, everything is encrypted (CURVE), and a peer that connects needs a key with the role
+of the channel: `_ZapHandler` decides.
 """
 
 from __future__ import annotations
 
 import atexit
+import itertools
+import logging
 import os
+import struct
+import threading
 import warnings
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from enum import Enum
+from functools import cache
 from typing import Any, Generic, Self, TypeVar
 from weakref import WeakSet
 
 import zmq
+import zmq.utils.garbage  # with the first message that is not copied, zmq would import it
+from zmq.utils import z85
 
 from catstream.errors import ProtocolError, ServiceError
-from catstream.wire import timing
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
-from catstream.wire.context import arrives, context
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.monitor import Event, Monitor
-from catstream.wire.rejects import count, reject
-from catstream.wire.zap import ZAP
+from catstream.wire.keys import ROLES, Keys
 
-
-def _milliseconds(seconds: float) -> int:
-    return round(seconds * 1000)
-
+LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last messages
+RECONNECT_SECONDS = 0.02  #: before the first attempt to connect again; doubled each time
+RECONNECT_MOST_SECONDS = 0.5  #: between two attempts at most
+HANDSHAKE_SECONDS = 5.0  #: limit for a peer to prove its key
+KEEPALIVE_SECONDS = 5  #: without traffic, after which TCP probes the other host
+KEEPALIVE_PROBE_SECONDS = 2  #: between two probes
+KEEPALIVE_PROBES = 3  #: without an answer, after which the connection is closed
 
 #: No ZeroMQ heartbeats: libzmq aborts the process if one is due to a peer that disconnected while its queue was full
 #: (libzmq issue 4767). On one machine the kernel reports that a peer has ended. If a host loses its power, TCP
 #: keepalive reports it after 11 s, or once the host is up again.
 _OPTIONS = {
-    zmq.LINGER: _milliseconds(timing.LINGER_SECONDS),
-    zmq.HANDSHAKE_IVL: _milliseconds(timing.HANDSHAKE_SECONDS),
+    zmq.LINGER: round(LINGER_SECONDS * 1000),
+    zmq.HANDSHAKE_IVL: round(HANDSHAKE_SECONDS * 1000),
     zmq.TCP_KEEPALIVE: 1,
-    zmq.TCP_KEEPALIVE_IDLE: round(timing.KEEPALIVE_SECONDS),
-    zmq.TCP_KEEPALIVE_INTVL: round(timing.KEEPALIVE_PROBE_SECONDS),
-    zmq.TCP_KEEPALIVE_CNT: timing.KEEPALIVE_PROBES,
-    zmq.RECONNECT_IVL: _milliseconds(timing.RECONNECT_SECONDS),
-    zmq.RECONNECT_IVL_MAX: _milliseconds(timing.RECONNECT_MOST_SECONDS),
+    zmq.TCP_KEEPALIVE_IDLE: KEEPALIVE_SECONDS,
+    zmq.TCP_KEEPALIVE_INTVL: KEEPALIVE_PROBE_SECONDS,
+    zmq.TCP_KEEPALIVE_CNT: KEEPALIVE_PROBES,
+    zmq.RECONNECT_IVL: round(RECONNECT_SECONDS * 1000),
+    zmq.RECONNECT_IVL_MAX: round(RECONNECT_MOST_SECONDS * 1000),
 }
+
+_POLLIN = int(zmq.POLLIN)  # an operation with a member of an enumeration would take half as long as to look
+_MOST_CAUSES = 1024  # causes of rejects that are remembered; each is logged once
+
+_log = logging.getLogger(__name__)
 
 Message = TypeVar("Message")
 Kind = TypeVar("Kind")
 
 _OPEN: WeakSet[ChannelSocket[Any]] = WeakSet()  # sockets that were not closed yet
+_lock = threading.Lock()  # the ZAP handler has a thread of its own
+_counts: Counter[str] = Counter()
+_logged: set[tuple[str, str]] = set()
+
+
+@cache
+def context() -> zmq.Context[zmq.Socket[bytes]]:
+    """Return the ZeroMQ context of catstream in this process, not the user's own; a forked process gets its own.
+
+    Only the limit of open files of the process limits the number of its sockets.
+    """
+    made = zmq.Context()
+    made.set(zmq.MAX_SOCKETS, made.get(zmq.SOCKET_LIMIT))
+    return made
+
+
+os.register_at_fork(after_in_child=context.cache_clear)
+
+
+def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
+    """Return whether a socket has a message, or gets one within so many seconds."""
+    # To look costs half as much as `poll`, and most sockets that are looked at have no message.
+    has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
+    return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))
+
+
+def reject(channel: str, cause: str, text: str) -> None:
+    """Count a message or a connection that was rejected on a channel, and log it unless its cause was logged before."""
+    with _lock:
+        _counts["rejected"] += 1
+        known = (channel, cause) in _logged
+        if len(_logged) >= _MOST_CAUSES:
+            _logged.clear()
+        _logged.add((channel, cause))
+    if not known:
+        _log.warning("%s: %s", channel, text)
+
+
+def rejects() -> dict[str, float]:
+    """How many messages and connections this process has rejected, and how many connections ended, for its health."""
+    return {name: float(_counts[name]) for name in ("rejected", "disconnected")}
+
+
+class Event(Enum):
+    """What ZeroMQ reports of a connection."""
+
+    STOPPED = "the socket is closed: nothing is reported after it"
+    DISCONNECTED = "a connection ended"
+    DENIED = "the handshake failed: the key was denied (ZAP status 400)"
+    OTHER_MECHANISM = "the handshake failed: one side has keys, the other has none"
+    FAILED = "the handshake failed for another reason"
+
+
+_EVENTS = {
+    zmq.EVENT_MONITOR_STOPPED: Event.STOPPED,
+    zmq.EVENT_DISCONNECTED: Event.DISCONNECTED,
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: Event.DENIED,
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Event.FAILED,
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: Event.FAILED,
+}
+_MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+
+
+class Monitor:
+    """Receives the connection events of one socket.
+
+    libzmq's I/O thread blocks if a monitor is not read, or has no reader any more: so the queue has no limit, and a
+    socket that listens is drained until the event `STOPPED` before its monitor is closed.
+    """
+
+    _numbers = itertools.count(1)  # a closed monitor keeps its address a little longer: each gets a new one
+
+    def __init__(self, socket: zmq.Socket[bytes]) -> None:
+        address = f"inproc://events-{next(self._numbers)}"
+        self._events: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)  # first: nothing is reported without it
+        self._events.set(zmq.RCVHWM, 0)
+        try:
+            socket.monitor(address, sum(_EVENTS))
+        except zmq.ZMQError:
+            self._events.close()
+            raise
+        self._events.connect(address)
+
+    def events(self, seconds: float) -> Iterator[Event]:
+        """The events that are here, and those that come within so many seconds of the one before."""
+        while not self._events.closed and arrives(self._events, seconds):
+            report, _ = self._events.recv_multipart()  # and the address of the other end
+            kind, value = struct.unpack("=Hi", report)
+            event = _EVENTS[kind]
+            yield Event.OTHER_MECHANISM if event is Event.FAILED and value == _MECHANISM_MISMATCH else event
+
+    def close(self) -> None:
+        """Close the monitor socket."""
+        self._events.close()
+
+
+class _ZapHandler:
+    """Decides which peers may connect to the sockets of this process that listen, if the pipeline has keys.
+
+    libzmq asks once for each connection, before it reads a message of it, by its protocol ZAP (RFC 27). A question
+    names the socket, as a "domain", and the peer's public key; the peer has proved by then that it holds the secret
+    one. The list of clients is read for each question, so no process has to be restarted if a client is allowed or
+    revoked. A connection that is open stays open. A thread answers while a socket is registered.
+
+    pyzmq's own handler, `zmq.auth`, is not used: see docs/decisions/0023-roles.md.
+    """
+
+    _address = "inproc://zeromq.zap.01"
+
+    def __init__(self) -> None:
+        self._sockets: dict[bytes, tuple[Channel[object], Keys]] = {}  # by domain
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def register(self, channel: Channel[object], keys: Keys) -> bytes:
+        """Register a socket that listens; returns its domain."""
+        with self._lock:
+            domain = f"{channel.name} {next(self._numbers)}".encode()
+            self._sockets[domain] = channel, keys
+            if self._thread is None:
+                socket = context().socket(zmq.REP)
+                socket.bind(self._address)
+                self._thread = threading.Thread(target=self._serve, args=(socket,), name="zap", daemon=True)
+                self._thread.start()
+        return domain
+
+    def unregister(self, domain: bytes) -> None:
+        """Unregister a closed socket."""
+        with self._lock:
+            self._sockets.pop(domain, None)
+            if self._thread is not None and not self._sockets:
+                with context().socket(zmq.REQ) as last:
+                    last.connect(self._address)
+                    last.send(b"")
+                    self._thread.join()
+                self._thread = None
+
+    def _serve(self, socket: zmq.Socket[bytes]) -> None:
+        with socket:
+            while len(question := socket.recv_multipart()) > 1:
+                _, request, domain, address, _, mechanism, *credentials = question
+                status = self._status(domain, address.decode(errors="replace"), mechanism, credentials)
+                socket.send_multipart([b"1.0", request, status, b"", b"", b""])
+            socket.unbind(self._address)  # at once, for the next thread: libzmq closes some time later
+
+    def _status(self, domain: bytes, address: str, mechanism: bytes, credentials: list[bytes]) -> bytes:
+        """The status that lets a peer connect (200), try again later (300), or not (400)."""
+        if domain not in self._sockets or mechanism != b"CURVE":
+            return b"400"
+        channel, keys = self._sockets[domain]
+        public = z85.encode(credentials[0]).decode()
+        try:
+            client = keys.client(public)
+        except ServiceError as error:
+            reject(channel.name, str(error), f"nobody can connect: {error}")
+            return b"300"
+        if client is None:
+            reject(channel.name, public, f"{address} was rejected, its key {public} is not allowed")
+            return b"400"
+        name, role = client
+        if ROLES.index(role) < ROLES.index(channel.role):
+            text = f"{name} at {address} was rejected, its role is {role} and not {channel.role}"
+            reject(channel.name, public, text)
+            return b"400"
+        return b"200"
+
+
+#: The handler of this process: libzmq asks one for each context.
+_ZAP = _ZapHandler()
 
 
 def _too_many(error: zmq.ZMQError) -> ServiceError:
@@ -118,7 +301,7 @@ class ChannelSocket(Generic[Message]):
             self._socket.close()
             # libzmq stops listening some time later, and would remove the socket file of the next one with its own.
             # Unbinding first would be faster, but drops queued messages.
-            self._read_events(2 * timing.LINGER_SECONDS, until=Event.STOPPED)
+            self._read_events(2 * LINGER_SECONDS, until=Event.STOPPED)
             self._listens = False
         elif not self._socket.closed:
             self._socket.disable_monitor()
@@ -126,7 +309,7 @@ class ChannelSocket(Generic[Message]):
         if self._monitor is not None:
             self._monitor.close()
         if self._domain:
-            ZAP.unregister(self._domain)
+            _ZAP.unregister(self._domain)
             self._domain = b""
 
     def __del__(self) -> None:
@@ -153,7 +336,7 @@ class ChannelSocket(Generic[Message]):
             if keys is not None:
                 self._socket.set(zmq.CURVE_SECRETKEY, keys.listening())
                 self._socket.set(zmq.CURVE_SERVER, 1)
-                self._domain = ZAP.register(self.channel, keys)
+                self._domain = _ZAP.register(self.channel, keys)
                 self._socket.set(zmq.ZAP_DOMAIN, self._domain)
                 self._socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without a ZAP handler nobody may connect
             if self._endpoint.taken(self.channel, sender):
@@ -202,7 +385,7 @@ class ChannelSocket(Generic[Message]):
             if check is not None:
                 check(message)
         except ProtocolError as error:
-            self._reject(error.reason, f"a message was dropped: {error}")
+            self._reject("message", f"a message was dropped: {error}")
             return None
         return message
 
@@ -223,10 +406,10 @@ class ChannelSocket(Generic[Message]):
             return peer, None
         return peer, data
 
-    def _reject(self, reason: str, text: str) -> None:
-        """Count a message that is not what the channel carries, and log it once."""
+    def _reject(self, cause: str, text: str) -> None:
+        """Count a message that is not what the channel carries, and log it once for each cause."""
         self.rejected += 1
-        reject(self.channel.name, reason, text)
+        reject(self.channel.name, cause, text)
 
     def _read_events(self, seconds: float = 0.0, until: Event | None = None) -> None:
         """Handle what was reported about connections; wait so long for each event, until a certain one.
@@ -251,7 +434,7 @@ class ChannelSocket(Generic[Message]):
     def _disconnected(self) -> None:
         """A connection ended."""
         if self._listens:
-            count("disconnected")
+            _counts["disconnected"] += 1
 
     def _failed_to_connect(self, event: Event) -> None:
         """A peer failed the handshake; a key that was denied is counted by the ZAP handler already."""

@@ -14,7 +14,7 @@ CATSTREAM = Path(sys.executable).with_name("catstream")
 
 #: Modules that the processes import: of libraries, of the standard library, of catstream, and of the start of Python.
 TRAPS = [
-    *("av", "click", "cv2", "llvmlite", "msgpack", "msgspec", "numba", "numpy", "psutil", "rich", "safetensors"),
+    *("av", "click", "cv2", "msgpack", "msgspec", "numba", "numpy", "psutil", "rich", "safetensors"),
     *("scipy", "zmq"),
     *("asyncio", "json", "logging", "multiprocessing", "random", "select", "signal", "socket", "subprocess", "typing"),
     *("catstream/__init__", "services/__init__", "sitecustomize", "usercustomize"),

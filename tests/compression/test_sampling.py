@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from catstream.compression.node import sample, spread
 from catstream.compression.reduce import reduce
-from catstream.compression.sampling import sample, share, spread
 from catstream.compression.tree import CoresetTree
 
 SIZE = 16
@@ -42,26 +42,11 @@ def test_a_node_gives_its_strongest_n_rows_times_2_to_the_level_below_the_top(st
     assert start == len(rows)
 
 
-def test_rows_too_young_for_a_whole_row_are_left_out():
-    assert share(level=0, top=4, size=SIZE) == 1
-    assert share(level=0, top=5, size=SIZE) == 0
-    rows = grown(np.ones((SIZE * 33, 3))).sample().rows
-    assert len(rows) == SIZE
-
-
 def test_each_row_weighs_one_original_row(rng):
     """A stream of one row again and again is sampled as that row, whatever its age."""
     row = rng.uniform(size=30).astype(np.float32)
     rows = grown(np.tile(row, (SIZE * 13, 1))).sample().rows
     assert_allclose(rows, np.tile(row, (len(rows), 1)), rtol=1e-4)
-
-
-def test_every_row_lies_within_the_span_of_the_data():
-    """Without the spread, all but the first would be variations around zero."""
-    rng = np.random.default_rng(0)
-    stream = (5 + rng.normal(size=(SIZE * 13, 30))).astype(np.float32)
-    rows = grown(stream).sample().rows
-    assert np.all(rows.mean(axis=1) > 3)
 
 
 @given(st.integers(1, 20), st.integers(0, 2**32 - 1))

@@ -88,15 +88,6 @@ def test_sums_counts_and_leaves_are_exact(kind, count, seed):
     assert_array_equal(tree.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
 
 
-@given(counts, seeds)
-def test_a_node_stands_for_consecutive_rows(count, seed):
-    rows = whole_numbers(count, seed)
-    start = 0
-    for node in grown(rows, size=4).nodes:
-        assert_array_equal(node.sum, rows[start : start + node.count].sum(axis=0, dtype=np.float64))
-        start += node.count
-
-
 # --- what it costs ---------------------------------------------------------------------------------
 
 
@@ -170,12 +161,6 @@ def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
     assert bits(loaded) == bits(tree)
 
 
-def test_a_damaged_size_takes_no_memory(stream):
-    tree = grown(stream[:3])
-    arrays, metadata = tree.state()
-    assert CoresetTree.from_state(arrays, metadata | {"size": 10**15}).nbytes == tree.nbytes
-
-
 def test_rows_inserted_into_a_tree_are_not_in_its_copy(stream):
     tree = grown(stream[:3])
     copy, other = tree.copy(), tree.copy()
@@ -227,8 +212,3 @@ def test_trees_of_other_sizes_or_rows_are_rejected():
         tree.merged(grown(np.ones((9, 6)), size=5))
     with pytest.raises(ProtocolError, match=r"length 6 .* length 7"):
         tree.merged(grown(np.ones((9, 7)), size=4))
-
-
-def test_a_size_below_one_is_rejected():
-    with pytest.raises(ValueError, match="size=0"):
-        CoresetTree(0)

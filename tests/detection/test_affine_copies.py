@@ -24,13 +24,6 @@ def test_copies_are_seeded_and_the_first_is_the_window(image, moved):
     assert np.abs(one[1:] - one[0]).max(axis=1).min() > 0
 
 
-def test_copies_differ_less_from_their_window_than_another_window_does(image):
-    smooth = np.repeat(np.repeat(image[:50, :60], 4, axis=0), 4, axis=1)
-    rows = copies(smooth, WINDOW, 8)
-    other = copies(smooth, Window(128, 100, 64, 64), 1)
-    assert np.linalg.norm(rows[1:] - rows[0], axis=1).max() < np.linalg.norm(other - rows[0])
-
-
 @pytest.mark.parametrize(("moved", "changed"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])
 def test_a_share_of_them_is_put_on_another_background(rng, moved, changed):
     image = np.full((200, 240, 3), 60, np.uint8)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box, Window
-from catstream.detection.assignment import assigned
+from catstream.detection.objects import assigned
 from catstream.detection.search import Detection, local
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -60,17 +59,6 @@ def test_a_lost_object_is_not_reported_changes_nothing_and_is_searched_for_in_ea
     assert TABLE["lost"].search_interval == 1
 
 
-def test_only_a_confident_detection_trains():
-    assert {level for level in TABLE if TABLE[level].teach} == {"confident"}
-
-
-def test_the_table_cannot_be_changed():
-    with pytest.raises(TypeError):
-        TABLE["weak"] = TABLE["confident"]
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        TABLE["weak"].teach = True
-
-
 @given(states(), SCORES, st.booleans())
 def test_a_lost_object_needs_at_least_the_score_to_return_that_it_needs_to_stay(state, score, redetected):
     lost, present = (
@@ -85,13 +73,6 @@ def test_an_object_is_distrusted_from_its_redetection_until_it_scores_high(state
     after = belief.updated(state, score, redetected, BELIEF)
     assert after.trusted == (score >= BELIEF.trusted_score or (state.trusted and not redetected))
     assert (after.level == "redetected") == (not after.trusted and after.level != "lost")
-
-
-@given(states(), SCORES, st.booleans())
-def test_a_belief_that_is_updated_leaves_the_state_before_as_it_was(state, score, redetected):
-    before = dataclasses.replace(state)
-    belief.updated(state, score, redetected, BELIEF)
-    assert state == before
 
 
 def test_an_object_that_was_never_found_is_lost_whatever_it_scores():

@@ -1,6 +1,5 @@
 """The detector alone: no trees, no trainer, only the initial model of the first frame."""
 
-import copy
 import dataclasses
 
 import cv2
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 
 from catstream.box import Box
-from catstream.detection.detector import Detector, looked, settled, taught
+from catstream.detection.detector import Detector
 from catstream.detection.likeness import Likeness
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import row_length
@@ -65,16 +64,6 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene, moved):
     assert (training.labels == 1).sum() == size <= (training.labels == 0).sum()
     assert set(features.training) == set(GROUPS)
     assert min(map(len, features.training.values())) >= size
-
-
-def test_half_of_the_first_copies_are_put_on_another_background(scene):
-    one, other = (
-        Follower({"teaching.other_backgrounds": share}).start(scene((60, 50)), START)[1].training[APPEARANCE].rows[:64]
-        for share in (0, 0.5)
-    )
-    differ = (one != other).any(axis=1)
-    assert differ.sum() == 31
-    assert not differ[0]
 
 
 @pytest.mark.parametrize("detection", ["local", "full"])
@@ -146,33 +135,6 @@ def test_another_detector_continues_bit_for_bit_from_the_state_after_a_frame(sce
         (track, features), (again, repeated) = (stage.step(scene((left, 50))) for stage in (detector, other))
         assert again == track
         np.testing.assert_equal(dataclasses.asdict(repeated), dataclasses.asdict(features))
-
-
-def stepped(state, frame, seq, model, settings):
-    """State, detection and training rows of the next frame."""
-    state, found = looked(state, frame, seq, model, None, settings)
-    state = settled(state, found, frame.size, settings)
-    return state, found, taught(state, found, frame, seq, model, None, settings)
-
-
-def test_a_step_depends_on_nothing_but_state_frame_model_and_settings_and_changes_none_of_them(scene):
-    detector = started(scene)
-    detector.adopt(dataclasses.replace(detector.model, version=1, motion=Motion(np.eye(4), np.eye(2))))
-    for at in ((64, 50), (68, 50)):
-        detector.step(scene(at))
-    for frame in (scene((72, 50)), scene(), scene((250, 180))):
-        given = detector.state, Pyramid(frame), detector.seq + 1, detector.model, detector.settings
-        before = copy.deepcopy(given[0])
-        one, two = stepped(*given), stepped(*given)
-        np.testing.assert_equal(_plain(one), _plain(two))
-        np.testing.assert_equal(dataclasses.asdict(given[0]), dataclasses.asdict(before))
-        detector.step(frame)
-
-
-def _plain(results):
-    state, found, training = results
-    rows = {name: dataclasses.asdict(each) for name, each in training.items()}
-    return dataclasses.asdict(state), found.score, found.window, rows
 
 
 def test_a_detector_that_is_resumed_adopts_no_model_of_the_object_before_either(scene):

@@ -11,7 +11,7 @@ from catstream.features.layout import WINDOW as WINDOW_CELLS
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import ASPECT, EXTENT, HEADS, SIZE
 from catstream.numerics import ridge
-from catstream.settings import ExtentSettings, Settings
+from catstream.settings import Settings
 from catstream.tracker import Tracker
 
 WINDOW = Window(60, 50, 48, 40)
@@ -61,38 +61,6 @@ def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(d
         weights, bias = regression.fit(rows.offsets[:, int(head == ASPECT)], HEADS[head].penalty)
         row = Cells.within(frame.around(wrong, WINDOW_CELLS)).row(0, 0)
         assert (row @ weights + bias - 0.5) * 16 == pytest.approx(steps, abs=0.7)
-
-
-def test_trials_are_windows_of_wrong_sizes_and_of_wrong_aspect_ratios():
-    trials = extent.trials(WINDOW, ExtentSettings(size_count=5, aspect_count=3))
-    sizes, aspects = trials
-    assert [(each.larger, each.wider) for each in sizes] == [(-2, 0), (-1, 0), (1, 0), (2, 0)]
-    assert [(each.larger, each.wider) for each in aspects] == [(0, -1), (0, 1)]
-    for window, steps, _ in sizes:
-        assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h)
-        assert window.w / WINDOW.w == pytest.approx(1.04**steps)
-    for window, _, steps in aspects:
-        assert window.area == pytest.approx(WINDOW.area)
-        assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * 1.08**steps)
-
-
-def test_without_a_weight_of_the_extent_head_there_are_no_trials():
-    assert extent.trials(WINDOW, ExtentSettings(weight=0)) == []
-
-
-def test_the_cost_of_an_offset_is_quadratic_up_to_a_step_and_then_linear(rng):
-    row, head = rng.normal(size=(2, 9))
-    steps = (0, 0.5, -0.5, 1, 2, 3)
-    costs = [extent.offset_cost(row, head, 0.5 + each / 16 - float(row @ head)) for each in steps]
-    assert costs == pytest.approx([0, 0.005, 0.005, 0.02, 0.06, 0.1])
-
-
-def test_a_window_follows_by_its_rates():
-    found = WINDOW.scaled(1.1).scaled(1.05, 1 / 1.05).centred(90, 80)
-    window = extent.followed(WINDOW, found, True)
-    assert window.centre == pytest.approx((90, 80))
-    assert window.area == pytest.approx(WINDOW.area * 1.1 ** (2 * 0.7))
-    assert window.w / window.h == pytest.approx(WINDOW.w / WINDOW.h * 1.05 ** (2 * 0.2))
 
 
 def test_if_the_belief_is_low_only_the_place_is_followed():

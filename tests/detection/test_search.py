@@ -6,14 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Window
-from catstream.detection import extent, search
+from catstream.detection import search
 from catstream.detection.search import due
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
 from catstream.messages.kinds import Model
-from catstream.settings import ExtentSettings
 
 
 def test_cells_around_a_window_are_those_of_the_frame(image):
@@ -80,15 +79,6 @@ def test_in_a_round_each_window_of_each_size_is_searched_for_and_a_frame_costs_n
         parts = [region for region, sized in visited if sized.w == pytest.approx(w)]
         for x, y in np.random.default_rng(1).uniform(0, (320 - w, 240 - w), (50, 2)):
             assert any(r.left <= x <= r.left + r.width - w and r.top <= y <= r.top + r.height - w for r in parts)
-
-
-def test_a_window_fits_by_the_extent_head_less_the_cost_of_its_error_and_without_a_weight_no_head_counts(rng):
-    row, extent_head, size_head = rng.normal(size=(3, 9)).astype(np.float32)
-    model = Model(1, 0, None, 0.0, None, {"extent": extent_head, "size": size_head}, {"size": 0.25})
-    cost = extent.offset_cost(row, size_head, 0.25)
-    assert search._fit(row, model, "size", ExtentSettings(weight=2)) == pytest.approx(2 * row @ extent_head - cost)
-    assert search._fit(row, model, "aspect", ExtentSettings(weight=2)) == pytest.approx(2 * row @ extent_head)
-    assert search._fit(row, model, "size", ExtentSettings(weight=0)) == 0
 
 
 def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):

@@ -82,23 +82,6 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
     assert np.isfinite(rows.rows).all()
 
 
-@pytest.mark.parametrize("known", [True, False], ids=["model", "none"])
-def test_without_the_cells_of_a_search_new_ones_are_cut_around_the_box(frame, model, known):
-    rows, own, misses, background = cut(frame, model if known else None)
-    assert own.sum() == 1 + SETTINGS.teaching.copies
-    assert misses.any()
-    assert background.sum() == 12
-    scored = ScoreMap.around(frame, OBJECT, 20, model)
-    assert scored.scores.shape == (20 - WINDOW + 1,) * 2
-    assert len(places(scored, rows.rows[~own])) > 20
-
-
-def test_scores_of_a_narrow_search_are_not_enough(frame, model):
-    narrow = ScoreMap.around(frame, OBJECT, 12, model)
-    for one, other in zip(cut(frame, model, narrow), cut(frame, model), strict=True):
-        np.testing.assert_array_equal(getattr(one, "rows", one), getattr(other, "rows", other))
-
-
 def test_a_wrong_size_or_aspect_ratio_is_labelled_with_a_gaussian_of_its_steps_and_with_the_steps(frame, model):
     settings = SETTINGS.but({"extent.size_count": 5, "extent.aspect_count": 3})
     training = teacher.training_at(frame, OBJECT, 3, model, settings)
@@ -124,21 +107,6 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
     assert not rows.labels.any()
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
     assert min(np.abs(rows.rows - own).max(axis=1)) > 0.01
-
-
-@pytest.mark.parametrize("most", [5000, 700, 200], ids=["at once", "in parts", "in more parts than frames"])
-def test_hard_negatives_of_a_round_are_as_many_however_many_parts_are_searched_in_turn(frame, model, monkeypatch, most):
-    monkeypatch.setattr(teacher, "_MOST_CELLS", most)
-    monkeypatch.setattr(teacher, "_strongest", lambda scores, _, most: [scores.cells.row(0, 0)] * most)
-    teaching = SETTINGS.teaching
-    parts = frame.region.split(OBJECT, most)
-    frames = max(len(parts), teacher._MINING_INTERVAL)
-    mined = [teacher._mined(frame, OBJECT, seq, model, teaching) for seq in range(frames)]
-    counts = [len(each) for each in mined if each is not None]
-    assert sum(counts) == teaching.hard_negatives * frames // teacher._MINING_INTERVAL
-    assert max(counts) <= -(-teaching.hard_negatives // min(len(parts), teacher._MINING_INTERVAL))
-    again = teacher._mined(frame, OBJECT, 0, model, teaching)
-    np.testing.assert_array_equal(again.rows, mined[0].rows)
 
 
 def test_colours_that_are_not_used_are_0_in_every_row(frame, model):

@@ -1,10 +1,13 @@
-"""Cells: rows and scores of every window."""
+"""Cells: HOG, mean colours and histograms of colours; rows and scores of every window."""
 
+import cv2
 import numpy as np
 import pytest
 
+from catstream.features import cells as features
+from catstream.features import kernels
 from catstream.features.cells import Cells
-from catstream.features.layout import COLOURS, row_length
+from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, SHADES, row_length
 from catstream.features.pyramid import planes_of
 
 
@@ -41,3 +44,138 @@ def test_the_scores_from_a_threshold_on_are_those_of_all_windows(cells, rng, qua
     least = float(np.quantile(scores, quantile)) + 1e-3
     expected = np.where(scores >= least, scores, -np.inf)
     np.testing.assert_allclose(cells.respond_above(weights, 0.5, least), expected, rtol=1e-4, atol=1e-3)
+
+
+@pytest.fixture
+def soft(rng):
+    noise = rng.integers(0, 256, (120, 168, 3), np.uint8)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
+
+
+def grid(image, margin=0):
+    return features.grid(planes_of(image), margin)
+
+
+def plain_hog(image):
+    """The published definition (Felzenszwalb et al. 2010), one pixel at a time."""
+    height, width, rows, columns = *image.shape[:2], image.shape[0] // CELL, image.shape[1] // CELL
+    wide = np.pad(image.astype(float), ((1, 1), (1, 1), (0, 0)), mode="edge")
+    histogram = np.zeros((rows + 2, columns + 2, 18))
+    for y in range(rows * CELL):
+        for x in range(columns * CELL):
+            dx, dy = wide[y + 1, x + 2] - wide[y + 1, x], wide[y + 2, x + 1] - wide[y, x + 1]
+            strongest = np.argmax(dx**2 + dy**2)
+            dx, dy = dx[strongest], dy[strongest]
+            orientation = int(np.rint(np.float32(np.arctan2(np.float32(dy), np.float32(dx))) / (2 * np.pi) * 18)) % 18
+            v, u = (y + 0.5) / CELL + 0.5, (x + 0.5) / CELL + 0.5
+            for row, share_y in ((int(v), 1 - v % 1), (int(v) + 1, v % 1)):
+                for column, share_x in ((int(u), 1 - u % 1), (int(u) + 1, u % 1)):
+                    histogram[row, column, orientation] += np.hypot(dx, dy) * share_y * share_x
+    histogram = histogram[1:-1, 1:-1]
+    unsigned = histogram[:, :, :9] + histogram[:, :, 9:]
+    energy = np.pad((unsigned**2).sum(axis=2), 1, mode="edge")
+    out = np.zeros((rows, columns, 31))
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        block = sum(energy[a : a + rows, b : b + columns] for a in (i, i + 1) for b in (j, j + 1))
+        norm = 1 / np.sqrt(block + 1e-4)[:, :, None]
+        signed = np.minimum(histogram * norm, 0.2)
+        out[:, :, :18] += signed / 2
+        out[:, :, 18:27] += np.minimum(unsigned * norm, 0.2) / 2
+        out[:, :, 27 + 2 * i + j] = signed.sum(axis=2) * 0.2357
+    assert height >= rows * CELL
+    assert width >= columns * CELL
+    return out
+
+
+def test_hog_is_the_published_definition(soft):
+    np.testing.assert_allclose(grid(soft[:48, :64])[:, :, :31], plain_hog(soft[:48, :64]), atol=2e-4)
+
+
+def test_features_of_a_crop_equal_the_slice_of_the_frames_grid(soft):
+    crop = soft[2 * CELL : 12 * CELL, 5 * CELL : 17 * CELL]
+    expected = grid(soft)[2 + MARGIN : 12 - MARGIN, 5 + MARGIN : 17 - MARGIN]
+    np.testing.assert_array_equal(grid(crop)[MARGIN:-MARGIN, MARGIN:-MARGIN], expected)
+    np.testing.assert_array_equal(grid(crop, MARGIN), expected)
+
+
+def test_light_added_everywhere_changes_no_gradient(soft):
+    dim = soft // 2
+    np.testing.assert_array_equal(grid(dim)[:, :, :31], grid(dim + 50)[:, :, :31])
+
+
+def test_colour_channels_tell_red_from_green():
+    red, green = (np.full((64, 64, 3), colour, np.uint8) for colour in ((0, 0, 200), (0, 200, 0)))
+    assert np.abs(grid(red)[0, 0, 31:] - grid(green)[0, 0, 31:]).max() > 1
+    np.testing.assert_allclose(grid(np.full((64, 64, 3), 128, np.uint8))[:, :, 32:], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("height", "width"), [(7, 100), (64, 64), (65, 71), (8, 8), (33, 9)])
+def test_any_size_gives_its_whole_cells(height, width, rng):
+    cells = grid(rng.integers(0, 256, (height, width, 3), np.uint8))
+    assert cells.shape == (height // 8, width // 8, CHANNELS)
+    assert np.isfinite(cells).all()
+
+
+def shades(image):
+    return features.shades(planes_of(image))
+
+
+def colour_features(image, row=0, column=0):
+    return Cells.of(image).row(row, column)[COLOURS]
+
+
+def test_a_shade_is_the_lab_colour_in_levels(rng):
+    image = cv2.resize(rng.integers(0, 256, (20, 20, 3), np.uint8), (40, 40), interpolation=cv2.INTER_NEAREST)
+    lab = cv2.cvtColor(image[::2, ::2] // 8 * 8 + 4, cv2.COLOR_BGR2LAB).astype(int)
+    light, a, b = lab[..., 0] // 32, *((lab[..., k] - 98) // 10 for k in (1, 2))
+    expected = (light * 6 + a.clip(0, 5)) * 6 + b.clip(0, 5)
+    np.testing.assert_array_equal(shades(image), expected)
+
+
+def test_a_histogram_is_the_root_of_shares_in_the_middle_6_by_6_cells():
+    image = np.zeros((64, 64, 3), np.uint8)
+    image[8:56, 8:20] = 255  # a quarter of the middle
+    found = colour_features(image)
+    assert sorted(found[found > 0]) == pytest.approx([3 * np.sqrt(0.25), 3 * np.sqrt(0.75)])
+
+
+def test_neither_the_place_of_a_colour_nor_the_edge_of_the_image_changes_the_features(rng):
+    image = np.repeat(np.repeat(rng.integers(0, 256, (32, 32, 3), np.uint8), 2, axis=0), 2, axis=1)
+    turned = image.copy()
+    turned[8:56, 8:56] = np.rot90(image[8:56, 8:56])
+    turned[:8] = 0
+    np.testing.assert_array_equal(colour_features(image), colour_features(turned))
+
+
+@pytest.mark.parametrize("writeable", [True, False], ids=["learned", "received"])
+def test_scores_are_added_for_each_window(rng, writeable):
+    image = np.repeat(np.repeat(rng.integers(0, 256, (24, 32, 3), np.uint8), 4, axis=0), 4, axis=1)
+    weights = rng.normal(size=SHADES).astype(np.float32)
+    weights.flags.writeable = writeable
+    scores = np.full((5, 9), 7, np.float32)
+    features.add_colour_scores(shades(image), weights, scores)
+    expected = [[7 + colour_features(image, row, column) @ weights for column in range(9)] for row in range(5)]
+    np.testing.assert_allclose(scores, expected, atol=1e-4)
+
+
+def test_no_histogram_scores_higher_than_the_highest_score(rng):
+    image = np.repeat(np.repeat(rng.integers(0, 256, (16, 16, 3), np.uint8), 4, axis=0), 4, axis=1)
+    for weights in rng.normal(size=(20, SHADES)).astype(np.float32):
+        assert colour_features(image) @ weights <= features.highest_colour_score(weights)
+    own = colour_features(image)
+    assert own @ own == pytest.approx(features.highest_colour_score(own), rel=1e-5)
+
+
+def test_every_third_level_of_each_channel_is_converted_as_opencv_does_but_for_one_level_in_few_colours():
+    levels = np.arange(0, 256, 3, np.uint8)
+    colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    ours = features.lab(colours).astype(int)
+    off = np.abs(ours - cv2.cvtColor(colours[None], cv2.COLOR_BGR2LAB)[0])
+    assert off.max() <= 1
+    assert np.mean(off > 0) < 1e-3
+
+
+def test_no_root_is_so_near_to_a_half_that_a_processor_could_round_it_otherwise():
+    light = np.arange(len(kernels._ROOTS)) / kernels._LINEAR[-1]
+    root = np.where(light < 216 / 24389, light * (841 / 108) + 16 / 116, light ** (1 / 3)) * (1 << kernels._ROOT_BITS)
+    np.testing.assert_array_less(np.abs(root - kernels._ROOTS), 0.5 - 1e-6)

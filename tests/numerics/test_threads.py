@@ -1,4 +1,4 @@
-"""Linear algebra on one thread, inside a program that has set something else."""
+"""Linear algebra on one thread, inside a program that has set something else; and calls in threads."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import cv2
+import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from catstream.numerics.threads import _VARIABLES, _Libraries, one_thread
+from catstream.numerics import threads
+from catstream.numerics.threads import _VARIABLES, Scratch, in_parallel, one_thread
 
 
 def counts():
@@ -22,14 +24,13 @@ def counts():
 
 
 @pytest.fixture
-def libraries(monkeypatch):
-    """As in a user's program with two threads: nobody else in this process holds it at one."""
-    own = _Libraries()
-    monkeypatch.setattr("catstream.numerics.threads._libraries", own)
+def two_threads(monkeypatch):
+    """As in a user's program, which runs BLAS on two threads."""
+    monkeypatch.setattr(threads, "_limit", threads._Limit())  # that of this process holds it at one
     with threadpool_limits(2):
         if set(counts().values()) != {2}:
             pytest.skip("this machine has one core, or BLAS without threads")
-        yield own
+        yield
 
 
 FIRST_USE = """
@@ -49,7 +50,7 @@ def test_a_library_that_is_imported_inside_is_on_one_thread_too():
     assert said.stdout == "{1}\n"
 
 
-@pytest.mark.usefixtures("libraries")
+@pytest.mark.usefixtures("two_threads")
 def test_all_libraries_are_on_one_thread_inside_and_as_before_outside():
     before = counts()
     with one_thread(), one_thread():
@@ -57,7 +58,7 @@ def test_all_libraries_are_on_one_thread_inside_and_as_before_outside():
     assert counts() == before
 
 
-@pytest.mark.usefixtures("libraries")
+@pytest.mark.usefixtures("two_threads")
 def test_an_exception_restores_the_number_of_threads():
     before = counts()
     with pytest.raises(ZeroDivisionError), one_thread():
@@ -65,7 +66,7 @@ def test_an_exception_restores_the_number_of_threads():
     assert counts() == before
 
 
-@pytest.mark.usefixtures("libraries")
+@pytest.mark.usefixtures("two_threads")
 def test_the_last_of_two_threads_restores_the_number():
     before, both, first_left = counts(), Barrier(2), Barrier(2)
 
@@ -86,18 +87,6 @@ def test_the_last_of_two_threads_restores_the_number():
     assert counts() == before
 
 
-@pytest.mark.usefixtures("libraries")
-def test_a_number_of_threads_set_by_the_user_meanwhile_is_kept():
-    with one_thread():
-        with threadpool_limits(1):
-            pass
-        libraries = [library for library in ThreadpoolController().lib_controllers if library.user_api == "blas"]
-        for each in libraries:
-            each._real_set_num_threads(3) if hasattr(each, "_real_set_num_threads") else each.set_num_threads(3)
-        meant = [library.get_num_threads() for library in libraries]
-    assert [library.get_num_threads() for library in libraries] == meant
-
-
 def test_opencv_is_limited_only_if_requested():
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
@@ -109,3 +98,45 @@ def test_opencv_is_limited_only_if_requested():
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
+
+
+@pytest.fixture(params=[1, 3], ids="{} cores".format)
+def cores(request, monkeypatch):
+    monkeypatch.setattr(threads, "_cores", lambda: request.param)
+    threads._pool.cache_clear()
+    yield request.param
+    threads._pool.cache_clear()
+
+
+@pytest.mark.usefixtures("cores")
+def test_results_have_the_order_of_the_items():
+    assert in_parallel(lambda item: item**2, range(50)) == [item**2 for item in range(50)]
+    assert in_parallel(str, []) == []
+
+
+def test_items_are_processed_at_the_same_time_if_there_are_cores(cores):
+    barrier = Barrier(min(cores, 2))
+    if cores > 1:
+        assert len(set(in_parallel(lambda _: barrier.wait(60), range(2)))) == 2
+
+
+def test_the_first_error_is_raised(cores):
+    ended = []
+
+    def call(item):
+        if item in (1, 2):
+            raise ValueError(item)
+        ended.append(item)
+
+    with pytest.raises(ValueError, match="1"):
+        in_parallel(call, range(4))
+    assert set(ended) == ({0, 3} if cores > 1 else {0})
+
+
+def test_scratch_is_kept_for_a_size_and_no_two_threads_share_it():
+    scratch = Scratch(lambda size: (np.empty(size),))
+    (here,) = scratch.kept(3)
+    assert scratch.kept(3)[0] is here
+    assert scratch.kept(4)[0] is not here
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: scratch.kept(3)).result()[0] is not here

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import psutil
 import pytest
 
 from catstream.errors import BoxError, ServiceError, VideoError
-from catstream.features import COMPILING, compiled
+from catstream.features.kernels import COMPILING
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
@@ -225,9 +224,7 @@ def test_a_path_is_a_source(video):
 
 
 def test_a_first_start_that_compiles_is_logged(video, tmp_path, monkeypatch, caplog):
-    without_one = shutil.ignore_patterns("catstream.features.cells.*")
-    shutil.copytree(compiled._FOLDER, tmp_path / "kernels", ignore=without_one)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     path, truth = video
     with Pipeline(path, truth[0], part=slice(0, 5)) as pipeline:
         assert len(list(pipeline)) == 5

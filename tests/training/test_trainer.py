@@ -87,9 +87,3 @@ def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_betwe
     model = Trainer(Settings(teaching={"classifier": "one-class"})).train(few)
     between = Trainer(Settings(teaching={"classifier": "least-squares"})).train(few)
     np.testing.assert_allclose(model.weights, between.weights, atol=1e-6)  # BLAS need not round the same twice
-
-
-def test_a_model_is_of_the_object_of_its_sample(sample):
-    model = Trainer(Settings()).train(dataclasses.replace(sample, object="anna"))
-    assert model.object == "anna"
-    assert model.weights.tobytes() == Trainer(Settings()).train(sample).weights.tobytes()

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
-import numpy as np
 import pytest
 import zmq
 
-from catstream.messages.kinds import End, Health, Model, Preview, Run, Sample, SavedModel, Track
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
+from tests.wire.examples import example
 
 
 @pytest.fixture(params=["ipc", "tcp"])
@@ -35,14 +34,5 @@ def stranger(endpoint):
 
 @pytest.fixture
 def message_of():
-    """A message of a published channel, by its name."""
-    messages = {
-        Track: Track(1, 0, 0.0, "absent", None, 0.0, 0),
-        Sample: End(1, "nothing was learned"),
-        Model: Model(1, 1, np.ones(3, np.float32), 0.0),
-        Health: Health("detector", 0.0),
-        Preview: Preview(1, 64, 48, {}, b"\xff\xd8\xff"),
-        SavedModel: SavedModel(1, b"the bytes of a file"),
-        Run: End(1, "nothing was learned"),
-    }
-    return lambda name: messages[CHANNELS[name].messages[0]]
+    """A message of a channel, by its name."""
+    return lambda name: example(CHANNELS[name].messages[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
+import tracemalloc
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgpack
@@ -19,97 +20,29 @@ from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import (
     LARGEST_GIVEN_MODELS,
-    Answer,
     Command,
-    DetectorState,
-    End,
     Features,
     Health,
-    Listing,
-    Model,
-    Motion,
     ObjectFeatures,
-    ObjectPosition,
-    Position,
     Preview,
-    Question,
-    Run,
-    Sample,
-    SavedModel,
     Stored,
-    Summary,
     Track,
-    Tracks,
     TrainingRows,
 )
-from catstream.messages.schema import (
-    LARGEST_INTEGER,
-    Array,
-    ByObject,
-    Bytes,
-    Field,
-    Name,
-    Named,
-    OnlyWith,
-    Whole,
-    fields,
-)
+from catstream.messages.schema import LARGEST_INTEGER, LONGEST_TEXT, Array, Field, fields
 from catstream.settings import RunSettings, Settings
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
+from tests.wire.examples import example as example_of
 
 
 def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
     return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=dtype).reshape(shape)
 
 
-def summary(columns: int) -> Summary:
-    return Summary(array(6, columns), array(columns), 40, (3, 1, 0))
-
-
-MOTION = Motion(array(4, 4, dtype="<f8"), array(2, 2, dtype="<f8"))
-WINDOWS = Window(4.0, 2.0, 25.0, 12.5), Window(4.5, 2.0, 25.0, 12.5), Window(9.0, 2.0, 25.0, 12.5)
-DETECTOR = DetectorState(3, "weak", *WINDOWS, False, 2, MOTION, array(5, 4, dtype="<f8"))
-TRAINING = TrainingRows(array(3, 5), array(3), array(3), array(3, 2))
-TREES = {
-    "object": summary(5),
-    "background": summary(5),
-    "loss": summary(7),
-    "extent": summary(9),
-}
 BOX = Box(4.5, 3.0, 20.0, 10.0)
-TRACK = Track(3, 2, 0.08, "present", BOX, 0.75, 4, 1234.5, "anna")
-EXAMPLES = {
-    "answer": Answer("7f", True, "followed from frame 9 on", 9, BOX, 4, "anna"),
-    "command": Command("7f", "set-box", BOX, True, "anna"),
-    "end": End(8, "the source has ended", False, {"sent": 7.0, "stored": 7.0}),
-    "features": Features(
-        3,
-        2,
-        0.08,
-        {
-            "anna": ObjectFeatures(
-                BOX, {"appearance": TRAINING, "extent": TrainingRows(array(1, 5), array(1), array(1))}, DETECTOR
-            ),
-            "ben": ObjectFeatures(None, begins=True),
-        },
-    ),
-    "health": Health(
-        "detector", 1.7e9, {"sent": 4.0}, "the disk is full", "walk.mp4", {"anna": {"present": 1.0}, "ben": {}}
-    ),
-    "listing": Listing("7f", b'{"name": "site", "time": 1.7e9}'),
-    "model": Model(4, 20, array(5), -0.25, MOTION, {"extent": array(5), "size": array(5)}, {"size": 0.5}, "anna"),
-    "position": Position(5, 4, {"anna": ObjectPosition(BOX, 2, DETECTOR), "ben": ObjectPosition()}, 1),
-    "preview": Preview(2, 1280, 720, {"anna": BOX, "ben": BOX}, b"\xff\xd8\xff\xe0 and so on"),
-    "question": Question("7f", "cam-7"),
-    "run": Run("0.1.0", {"coreset.size": "64", "classifier": "joint"}),
-    "sample": Sample(4, 20, TREES, np.array([[1.0, 2.0], [np.nan, np.nan]]), "anna"),
-    "savedmodel": SavedModel(4, b"the bytes of a file", "anna"),
-    "stored": Stored(5, 7, {"anna": 2}),
-    "track": TRACK,
-    "tracks": Tracks(3, 2, {"anna": TRACK, "ben": Track(3, 2, 0.08, "absent", None, 0.1, 2, object="ben")}),
-}
+EXAMPLES = {name: example_of(kind) for name, kind in KINDS.items()}
 MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
 ALL = tuple(KINDS.values())
 FUZZ = settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
@@ -143,10 +76,6 @@ def plain(dtype: str, shape: list[int], data: bytes) -> dict[str, object]:
     return {"dtype": dtype, "shape": shape, "data": data}
 
 
-def test_every_kind_has_an_example():
-    assert set(EXAMPLES) == set(KINDS)
-
-
 FINITE = st.floats(-1e6, 1e6)
 SIDE = st.floats(0.5, 1e6)
 NAMES = st.just("") | st.from_regex(r"\w[\w.-]{0,63}", fullmatch=True)
@@ -160,10 +89,11 @@ def messages(draw: st.DrawFn, kind: type, width: int | None = None) -> Any:
     """
     lengths = {"d": draw(st.integers(3, 6)) if width is None else width}
     values = {field.name: _value(draw, field, lengths) for field in fields(kind)}
-    for field in fields(kind):
-        if (rule := field.limit(OnlyWith)) is not None:
-            wanted = values[rule.field] == rule.value
-            values[field.name] = _value(draw, dataclasses.replace(field, optional=False), lengths) if wanted else None
+    if kind is Preview:
+        values["jpeg"] = b"\xff\xd8\xff" + values["jpeg"]
+    if kind is Command:
+        values["box"] = (values["box"] or BOX) if values["verb"] == "set-box" else None
+        values["model"] = (values["model"] or b"") if values["verb"] == "search" else None
     return kind(**values)
 
 
@@ -174,19 +104,17 @@ def _value(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> Any:
         return _map(draw, field, lengths)
     if field.is_message:
         return draw(messages(field.type))
-    if field.limit(Name):
+    if field.is_name:
         return draw(NAMES)
-    if array := field.limit(Array):
+    if array := field.array:
         return draw(_arrays(array, tuple(_length(draw, side, lengths) for side in array.shape)))
-    if limits := field.limit(Bytes):
-        return limits.begin + draw(st.binary(max_size=8))
     return draw(_plain(field))
 
 
 def _map(draw: st.DrawFn, field: Field, lengths: dict[str, int]) -> dict[str, Any]:
-    named = field.limit(Named)
+    named = field.named
     if named is None:
-        names = NAMES if field.limit(ByObject) else st.text(max_size=8)
+        names = NAMES if field.keys.is_name else st.text(max_size=8)
         return {name: _value(draw, field.values, lengths) for name in draw(st.sets(names, max_size=3))}
     names = [name for name in named.columns if name in named.required or draw(st.booleans())]
     if field.values.is_message:
@@ -207,12 +135,11 @@ def _arrays(limits: Array, shape: tuple[int, ...]) -> st.SearchStrategy[np.ndarr
 def _plain(field: Field) -> st.SearchStrategy[Any]:
     if get_origin(field.type) is Literal:
         return st.sampled_from(get_args(field.type))
-    least = field.limit(Whole)
-    whole = st.integers(least.low if least else 0, LARGEST_INTEGER)
+    whole = st.integers(1, LARGEST_INTEGER)
     if get_origin(field.type) is tuple:
         return st.lists(whole, max_size=4).map(tuple)
-    kinds = {bool: st.booleans(), int: whole, float: FINITE, str: st.text(max_size=8)}
     rectangle = field.type in (Box, Window)
+    kinds = {bool: st.booleans(), int: whole, float: FINITE, str: st.text(max_size=8), bytes: st.binary(max_size=8)}
     return st.builds(field.type, FINITE, FINITE, SIDE, SIDE) if rectangle else kinds[field.type]
 
 
@@ -311,14 +238,13 @@ REJECTED = {
     "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
     "more than a message": encode(EXAMPLES["track"]) + b"\x00",
-    "a name twice in a map": b"\x95\x04\xa3end\xa0\xa0\x82\xa3seq\x01\xa3seq\x02",
     "a map of bytes": b"\x95\x04\xa3end\xa0\xa0\x82\xc4\x03seq\x01\xa6reason\xa1x",
     "a list of four thousand million": b"\x95\x04\xa3end\xa0\xa0\xdd\xff\xff\xff\xff",
     "a map of four thousand million": b"\x95\x04\xa3end\xa0\xa0\xdf\xff\xff\xff\xff",
     "bytes of four gigabytes": b"\x95\x04\xa3end\xa0\xa0\xc6\xff\xff\xff\xff",
     "a text of four gigabytes": b"\x95\x04\xdb\xff\xff\xff\xff",
     "a list longer than any message's": msgpack.packb([VERSION, "end", "", "", [None] * 257]),
-    "a reason longer than a page": packed("end", reason="x" * 4097),
+    "a reason longer than a page": packed("end", reason="x" * (LONGEST_TEXT + 1)),
     "an extension type": b"\x95\x04\xa3end\xa0\xa0\xd4\x05\x00",
     "a timestamp": b"\x95\x04\xa3end\xa0\xa0\xd6\xff\x00\x00\x00\x00",
     "lists in lists, as version": b"\x95" + b"\x91" * 1015 + b"\x90\xa3end\xa0\xa0\x80",
@@ -345,12 +271,32 @@ def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
         dataclasses.replace(EXAMPLES["track"], seq=-1),
         dataclasses.replace(EXAMPLES["track"], object="an na"),
         Stored(5, 7, {"an/na": 2}),
+        Health("detector", 0.0, trouble="x" * (LONGEST_TEXT + 1)),
     ],
-    ids=["dtype", "shape", "NaN", "negative", "name", "name in a map"],
+    ids=["dtype", "shape", "NaN", "negative", "name", "name in a map", "a text that is too long"],
 )
 def test_a_message_that_would_be_rejected_on_arrival_is_not_sent(message):
     with pytest.raises(ProtocolError):
         encode(message)
+
+
+def nested(bytes_of_it: int) -> bytes:
+    """As msgpack, a list of lists in lists: objects of some bytes each, if they are made."""
+    inner = b"\x91" * 255 + b"\x80"
+    return b"\xdd" + struct.pack(">I", bytes_of_it // 256) + inner * (bytes_of_it // 256)
+
+
+@pytest.mark.parametrize("place", ["a field that is unknown", "an array", "a number"])
+def test_lists_in_lists_take_no_memory(place):
+    field = {"a field that is unknown": b"colour", "an array": b"weights", "a number": b"seq"}[place]
+    bomb = b"\x95\x04\xa5model\xa0\xa0\x81" + bytes([0xA0 + len(field)]) + field + nested(4 << 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ProtocolError):
+            decode(bomb, *ALL)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 VALUES = st.recursive(

@@ -140,20 +140,28 @@ def test_a_flood_of_invalid_commands_is_counted_and_the_next_one_is_answered(ans
     assert responder.rejected == 50
 
 
-def test_a_flood_of_commands_is_bounded_and_dropped_commands_may_be_repeated(endpoint, raw, until):
+def test_of_a_flood_of_commands_64_wait_the_others_are_rejected_and_stop_is_let_through(endpoint, raw, until):
     with Responder(CONTROL, endpoint) as responder:
-        heard = []
-        for number in range(60):
+        heard, answers = [], []
+
+        def turn():
+            heard.extend(responder.receive_all())
+            answers.extend([decode(raw.recv(), Answer)] if raw.poll(0) else [])
+
+        for number in range(100):
             raw.send(encode(Command(f"{number}", "pause")))
-        until(lambda: len(heard) == 60, lambda: heard.extend(responder.receive_all()))
-        for number in range(60, 100):
-            raw.send(encode(Command(f"{number}", "pause")))
-        until(lambda: len(heard) == 64 and not responder._wait(0.1), lambda: heard.extend(responder.receive_all()))
+            turn()
+        until(lambda: len(answers) == 100 - 64, turn)
+        raw.send(encode(Command("stop", "stop")))
+        until(lambda: len(heard) == 65, turn)
         for command in heard:
             responder.answer(done(command))
-        raw.send(encode(Command("99", "pause")))
-        until(lambda: heard[-1].id == "99", lambda: heard.extend(responder.receive_all()))
-    assert len(heard) == 65
+        raw.send(encode(Command("99", "pause")))  # rejected before, so it may be sent again
+        until(lambda: len(heard) == 66, turn)
+    assert [command.id for command in heard] == [*map(str, range(64)), "stop", "99"]
+    assert {(answer.done, answer.reason) for answer in answers[:36]} == {
+        (False, "64 commands wait for the next frame: try again later")
+    }
 
 
 def test_control_sends_each_command_with_an_id_of_its_own(endpoint, answering):
@@ -188,5 +196,5 @@ def test_a_command_without_an_answer_raises_an_error(endpoint):
 
 
 def test_a_box_that_cannot_be_encoded_is_rejected_before_it_is_sent(endpoint):
-    with Control(str(endpoint)) as control, pytest.raises(ProtocolError, match="above 0"):
+    with Control(str(endpoint)) as control, pytest.raises(ProtocolError, match="> 0"):
         control.set_box((1, 2, 0, 4))

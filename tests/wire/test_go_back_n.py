@@ -16,8 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import ObjectPosition, Position, Stored
-from catstream.wire.go_back_n import HELLO, Deliver, ReceiveWindow, Reject, Reply, SendWindow
-from catstream.wire.timing import PATIENCE_SECONDS
+from catstream.wire.go_back_n import HELLO, PATIENCE_SECONDS, Deliver, ReceiveWindow, Reject, Reply, SendWindow
 
 STRANGER = b"stranger"
 

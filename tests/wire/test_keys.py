@@ -26,7 +26,7 @@ from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys, allow, clients, create, revoke
 from catstream.wire.newest import Publisher, Subscriber
-from catstream.wire.rejects import rejects
+from catstream.wire.socket import rejects
 
 WINDOW = 4
 CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # name and role of some
@@ -45,8 +45,8 @@ def track(seq):
     return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
 
 
-def rejected(reason):
-    return rejects().get(f"rejected_{reason}", 0)
+def rejected():
+    return rejects()["rejected"]
 
 
 @pytest.fixture
@@ -223,9 +223,9 @@ def test_a_client_without_permission_receives_nothing_and_is_counted_and_logged_
     if who == "revoked":
         who, reason = "host", "key"
         revoke(keys, who)
-    turn, taken, before = listener(name), [], rejected(reason)
+    turn, taken, before = listener(name), [], rejected()
     one, two = stranger(name, place(who)), stranger(name, place("none" if who == "wrong" else who))
-    until(lambda: rejected(reason) >= before + 2, lambda: taken.append(turn()))
+    until(lambda: rejected() >= before + 2, lambda: taken.append(turn()))
     assert not any(taken)
     assert not one.poll(50)
     assert not two.poll(0)
@@ -299,7 +299,7 @@ def test_a_client_that_is_allowed_later_needs_no_restart(keys, place, until):
 
 
 def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_afterwards(keys, place, until):
-    heard, before = [], rejected("unreadable")
+    heard, before = [], rejected()
     good = (keys / "clients" / "operator").read_bytes()
     (keys / "clients" / "operator").write_bytes(b"role = ")
     with Publisher(TRACKS, place()) as tracks, Subscriber(TRACKS, place("watcher")) as reader:
@@ -308,7 +308,7 @@ def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_after
             tracks.send(track(1))
             heard.extend(reader.receive_all())
 
-        until(lambda: rejected("unreadable") > before, turn)
+        until(lambda: rejected() > before, turn)
         assert not heard
         (keys / "clients" / "operator").write_bytes(good)
         until(lambda: heard, turn)

@@ -32,19 +32,7 @@ from catstream.messages.kinds import (
     Track,
     TrainingRows,
 )
-from catstream.messages.schema import (
-    LARGEST_INTEGER,
-    LONGEST_LIST,
-    LONGEST_TEXT,
-    Array,
-    ByObject,
-    Bytes,
-    Name,
-    Named,
-    OnlyWith,
-    Whole,
-    fields,
-)
+from catstream.messages.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, fields
 from catstream.wire import codec
 from catstream.wire.channels import CHANNELS, REGISTRY, TRACKS
 from catstream.wire.endpoint import Endpoint
@@ -78,30 +66,28 @@ def listed(kind):
 
 def described(field):
     """The type of a field and its limits, in words."""
-    if (rule := field.limit(OnlyWith)) is not None:
-        return f"{kind_of(field)} with `{rule.field}` `{rule.value}`, otherwise nil"
     return kind_of(field) + (" or nil" if field.optional else "")
 
 
 def kind_of(field):
     if field.values is not None:
-        names = "objects" if field.limit(ByObject) else names_of(field.limit(Named))
+        names = "objects" if field.keys.is_name else names_of(field.named)
         return f"map of {names} to {kind_of(field.values)}"
-    if field.limit(Name):
+    if field.is_name:
         return "name of an object"
     if field.is_message:
         return f"`{field.type.__name__.lower()}`"
-    if array := field.limit(Array):
+    if array := field.array:
         nan = ", may be NaN" if array.may_be_nan else ""
         return f"{array.dtype} ({', '.join(map(str, array.shape))}){array.range()}{nan}"
-    if limits := field.limit(Bytes):
-        return f"bytes, {limits.kind} of at most {limits.longest}"
+    limits = field.meta
     if get_origin(field.type) is Literal:
         return f"text: {', '.join(f'`{value}`' for value in get_args(field.type))}"
     if get_origin(field.type) is tuple:
         return "array of integers"
-    least = field.limit(Whole)
-    return PLAIN[field.type] + (f", at least {least.low}" if least else "")
+    if field.type is bytes:
+        return f"bytes, at most {limits.max_length}"
+    return PLAIN[field.type] + (f", at least {limits.ge}" if field.type is int and limits.ge else "")
 
 
 def names_of(named):
@@ -153,7 +139,7 @@ def test_the_table_of_heads_is_that_of_the_library():
 
 
 def test_the_limits_are_those_of_the_codec():
-    text = f"Text is at most {LONGEST_TEXT} bytes, a list or map at most {LONGEST_LIST} entries"
+    text = f"Text is at most {LONGEST_TEXT} characters, a list or map at most {LONGEST_LIST} entries"
     assert text in PAGE
     assert f"The version is {codec.VERSION}." in PAGE
     assert LARGEST_INTEGER == 2**53

@@ -29,10 +29,9 @@ from catstream.messages.kinds import (
 )
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
-from catstream.wire.context import context
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.socket import Event, Monitor, context
 
 WINDOW = 4
 

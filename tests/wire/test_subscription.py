@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -15,11 +14,11 @@ import zmq
 import catstream
 from catstream.box import Box
 from catstream.errors import ObjectError, ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Run, Track, TrainingRows
+from catstream.messages.kinds import End, Features, Health, Model, ObjectFeatures, Track, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
-from catstream.wire.endpoint import Endpoint, meeting_place, names_of_early_subscribers
-from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.endpoint import meeting_place
+from catstream.wire.newest import Publisher
 
 
 def track(seq, name="", version=1):
@@ -141,15 +140,17 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
         assert (subscription.missed, subscription.missed_before) == (missed, 0)
 
 
-@pytest.mark.parametrize("channel", ["features", "health", "previews"])
-def test_a_channel_whose_messages_are_about_all_objects_has_none_of_one_object(endpoint, channel):
-    with pytest.raises(ServiceError, match="about all objects: subscribe to tracks, models, samples for one object"):
-        catstream.subscribe(str(endpoint), channel, object="anna")
-
-
-def test_one_object_is_asked_for_by_a_valid_name(endpoint):
-    with pytest.raises(ObjectError, match="'an na' is not a name"):
-        catstream.subscribe(str(endpoint), "tracks", object="an na")
+@pytest.mark.parametrize(
+    ("channel", "name", "words"),
+    [
+        *((channel, "anna", "about all objects: subscribe to samples, models") for channel in ("features", "health")),
+        ("tracks", "an na", "'an na' is not a name"),
+        *((channel, None, "expected one of the channels") for channel in ("training", "results", "frames")),
+    ],
+)
+def test_what_cannot_be_subscribed_to_is_an_error(endpoint, channel, name, words):
+    with pytest.raises((ServiceError, ObjectError), match=words):
+        catstream.subscribe(str(endpoint), channel, object=name)
 
 
 @pytest.fixture
@@ -210,7 +211,7 @@ def test_the_health_of_each_process_arrives_once(endpoint):
 
 def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
     with (
-        Publisher(TRAINING, endpoint, first_message=Run("0", {"coreset.size": "64"})) as training,
+        Publisher(TRAINING, endpoint) as training,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
     ):
         until(lambda: training.has_subscribers, training.serve_late_joiners)
@@ -250,11 +251,17 @@ def test_silence_is_an_error_after_the_timeout_and_iteration_may_continue(endpoi
         assert next(subscription).seq == 2
 
 
-def test_async_for_gives_the_same(endpoint, tracks):
+def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
     async def read(subscription):
         return [message.seq async for message in subscription]
 
     async def both():
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(anext(subscription), 0.05)
+        subscription.timeout = 0.05
+        with pytest.raises(SilenceError):
+            await anext(subscription)
+        subscription.timeout = 20
         reading = asyncio.create_task(read(subscription))
         for seq in range(2, 40):
             tracks.send(track(seq))
@@ -267,46 +274,12 @@ def test_async_for_gives_the_same(endpoint, tracks):
         assert subscription.missed == 2
 
 
-def test_a_waiting_task_can_be_cancelled_and_times_out(endpoint, tracks):
-    async def waits():
-        with pytest.raises(asyncio.TimeoutError):
-            await asyncio.wait_for(anext(subscription), 0.05)
-        subscription.timeout = 0.05
-        with pytest.raises(SilenceError):
-            await anext(subscription)
-        tracks.send(track(2))
-        subscription.timeout = 20
-        return await anext(subscription)
-
-    with attached(endpoint, tracks) as subscription:
-        assert asyncio.run(waits()).seq == 2
-
-
-@pytest.mark.parametrize("channel", ["training", "results", "frames"])
-def test_subscribing_to_a_channel_with_one_receiver_is_an_error(endpoint, channel):
-    with pytest.raises(ServiceError, match="expected one of the channels samples, models, tracks, health"):
-        catstream.subscribe(str(endpoint), channel)
-
-
 def test_a_subscriber_that_receives_only_the_end_has_missed_all(endpoint, tracks, until):
     with catstream.subscribe(str(endpoint), "tracks", timeout=20) as subscription:
         until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
         tracks.send(End(61, "the source has ended"))
         assert list(subscription) == []
         assert (subscription.missed, subscription.missed_before) == (60, 60)
-
-
-@pytest.mark.parametrize("channel", ["tracks", "features"])
-def test_a_pipeline_waits_for_a_subscriber_that_started_first(endpoint, until, channel):
-    with catstream.subscribe(str(endpoint), channel, timeout=20) as subscription:
-        row = CHANNELS["tracks" if channel == "tracks" else "training"]
-        with Publisher(row, endpoint) as publisher:
-            assert publisher.awaited
-            until(lambda: not publisher.awaited, publisher.serve_late_joiners)
-            message = track(1) if channel == "tracks" else features(1)
-            publisher.send(message)
-            assert next(subscription).seq == 1
-        assert not names_of_early_subscribers(row, endpoint), "it has heard the pipeline: no other one waits for it"
 
 
 def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_folder(folder, until):
@@ -317,32 +290,3 @@ def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_fold
             assert next(subscription).seq == 1
         assert list(subscription) == []
         assert "did not receive its end" in subscription.end.reason
-
-
-def test_subscribers_that_are_not_awaited_do_not_count_for_those_that_are(endpoint, until):
-    with (
-        catstream.subscribe(str(endpoint), "models"),  # it subscribes to the end of the tracks, too
-        Subscriber(CHANNELS["tracks"], endpoint),
-        Publisher(CHANNELS["tracks"], endpoint) as publisher,
-    ):
-        publisher.awaited.add("recorder")
-        until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
-        assert publisher.awaited == {"recorder"}
-        with Subscriber(CHANNELS["tracks"], endpoint, name="recorder"):
-            until(lambda: not publisher.awaited, publisher.serve_late_joiners)
-
-
-def test_a_subscriber_is_early_for_one_channel_of_one_endpoint_and_as_long_as_it_lives(folder, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    here, there = Endpoint.parse(str(folder)), Endpoint.parse("tcp://127.0.0.1:5700")
-    tracks, training = CHANNELS["tracks"], CHANNELS["training"]
-    with Subscriber(tracks, here, early=True):
-        (name,) = names_of_early_subscribers(tracks, here)
-        assert not names_of_early_subscribers(training, here)
-        assert not names_of_early_subscribers(tracks, there)
-        monkeypatch.chdir(folder.parent)
-        assert names_of_early_subscribers(tracks, Endpoint.parse(folder.name)) == {name}, "however the folder is named"
-        shutil.copy(tmp_path / f"catstream-early-{name}", dead := tmp_path / "catstream-early-0")
-        assert names_of_early_subscribers(tracks, here) == {name}
-        assert not dead.exists()
-    assert not list(tmp_path.iterdir())
