@@ -53,8 +53,8 @@ IMPORTERS = {
     "numba": ["catstream/features/kernels.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],
-    "obstore": ["catstream/fleet/objects.py"],
-    "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
+    "obstore": ["catstream/fleet/store.py"],
+    "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
@@ -70,6 +70,7 @@ IMPORTERS = {
     "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
+        "catstream/client/registry.py",
         *("catstream/box.py", "catstream/messages"),
         *("services/decisions.py", "catstream/compression/forest.py"),
         *("catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
@@ -98,7 +99,7 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/fleet/desired.py"),
+    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py"),
     *("services/decisions.py", "services/control_commands.py"),
 ]
 

@@ -43,10 +43,6 @@ class Forest:
         self.compressors: dict[str, Compressor] = {}
         self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MOST_STATES)  # of the last messages
 
-    def skip(self, frames: int) -> None:
-        """Count frames of a live source that were not tracked: the next message has a number after theirs."""
-        self.seq, self.frame = self.seq + frames, self.frame + frames
-
     def check_features(self, features: Features) -> None:
         """Raise ProtocolError if rows have another length than those before."""
         width = max((compressor.width for compressor in self.compressors.values()), default=0)

@@ -109,27 +109,6 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
             raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 
 
-def skip(folder: Path, settings: Settings, seq: int, frames: int) -> int:
-    """Count frames of a live source as lost: the numbers continue after them.
-
-    Parameters
-    ----------
-    seq : number of the last message that is known; that of the newest checkpoint counts if it is higher
-    frames : how many were lost after that message
-
-    Returns
-    -------
-    how many there are after the newest checkpoint
-    """
-    store = CheckpointStore(folder / TREES)
-    forest = store.load(settings)
-    lost = max(seq, forest.seq) + frames - forest.seq
-    forest.skip(lost)
-    if not store.save(forest):
-        raise ServiceError(f"cannot keep the state in {str(folder)!r}: {store.trouble}")
-    return lost
-
-
 @contextlib.contextmanager
 def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
     """Lock a folder for this process alone; the folder is made if it does not exist.

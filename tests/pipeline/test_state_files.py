@@ -9,7 +9,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
-from catstream.run.state import files, last_seq, restore, skip
+from catstream.run.state import files, last_seq, restore
 from catstream.services.decisions import DESIRED, DesiredState
 from catstream.settings import Settings
 
@@ -29,13 +29,6 @@ def test_a_restored_state_is_at_the_same_position(state, tmp_path):
     assert {"job.safetensors", "desired_state.json"} < content.keys()
     assert files(tmp_path / "there") == content
     assert last_seq(tmp_path / "there") == 12
-
-
-@pytest.mark.parametrize(("known", "frames"), [(10, 30), (20, 22)])
-def test_numbers_go_on_after_the_frames_that_were_lost(state, known, frames):
-    settings = Pipeline(resume=state).settings
-    assert skip(state, settings, known, frames) == 30, "the checkpoint is of message 12"
-    assert last_seq(state) == 42
 
 
 def test_a_run_is_resumed_with_all_settings_that_are_given_also_if_they_are_the_defaults(state):

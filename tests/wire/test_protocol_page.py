@@ -86,7 +86,9 @@ def kind_of(field):
         return "array of integers"
     if field.type is bytes:
         return f"bytes, at most {limits.max_length}"
-    return PLAIN[field.type] + (f", at least {limits.ge}" if field.type is int and limits.ge else "")
+    return PLAIN[field.type] + (
+        f", at least {limits.ge}" if field.type is int and limits is not None and limits.ge else ""
+    )
 
 
 def names_of(named):
