@@ -24,6 +24,7 @@ _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
 _PICTURES = 64  # number of pictures that a page with a slow connection may still request
+_SHOWN_OF_A_PICTURE = ("frame", "width", "height", "boxes")
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
@@ -256,7 +257,7 @@ class Dashboard(Parts):
 
     def _picture_part(self, _: int) -> dict[str, object] | None:
         preview = next(reversed(self._pictures.values()), None)
-        return preview and {name: getattr(preview, name) for name in ("frame", "width", "height", "boxes")}
+        return preview if preview is None else {name: getattr(preview, name) for name in _SHOWN_OF_A_PICTURE}
 
     def _trees_part(self, _: int) -> dict[str, object]:
         counted = self.health["compressor"].objects if "compressor" in self.health else {}
