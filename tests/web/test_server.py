@@ -181,9 +181,12 @@ def test_the_response_to_head_ends_and_its_client_is_no_viewer(page, path):
     assert "\ncatstream_viewers 0.0\n" in page.get("/metrics").text, "on the same connection"
 
 
-def test_a_request_with_a_foreign_host_name_is_rejected_and_a_page_of_another_origin_cannot_steer(page):
+def test_a_request_with_a_foreign_host_name_is_rejected(page):
     for host in ("evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1"):
         assert page.get("/", headers={"Host": host}).status_code == 400, host
+
+
+def test_a_page_of_another_origin_cannot_steer(page):
     for origin in ("http://evil.example", "null", "https://127.0.0.1:1"):
         assert page.post("/control", json={"verb": "pause"}, headers={"Origin": origin}).status_code == 403, origin
     assert page.post("/control", data={"verb": "pause"}).status_code == 415, "a form, without an origin header"
@@ -291,16 +294,15 @@ def test_a_browser_may_open_two_pages_at_two_ports(serve):
     assert [page.get("/metrics").status_code for page in (one, other)] == [200, 200]
 
 
-@pytest.mark.parametrize(
-    ("host", "token", "problem"),
-    [
-        *((host, None, "without --token none") for host in ("0.0.0.0", "192.168.1.5", "::")),
-        ("127.0.0.1", "secret", "can be guessed"),
-    ],
-)
-def test_a_public_address_requires_a_token_and_a_short_one_is_an_error(host, token, problem):
-    with pytest.raises(ServiceError, match=problem):
-        Server(pipeline_site(), host=host, port=0, token=token)
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
+def test_a_public_address_requires_a_token(host):
+    with pytest.raises(ServiceError, match="without --token none"):
+        Server(pipeline_site(), host=host, port=0)
+
+
+def test_a_short_token_is_an_error():
+    with pytest.raises(ServiceError, match="can be guessed"):
+        Server(pipeline_site(), port=0, token="secret")
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])

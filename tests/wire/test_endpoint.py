@@ -139,9 +139,7 @@ def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
         assert endpoint.folder == folder
 
 
-def test_a_killed_pipeline_is_not_found_and_its_folder_is_removed_by_the_next_one_unlike_that_of_a_running_one(
-    folder, monkeypatch
-):
+def test_the_folder_of_a_killed_process_is_removed_by_the_next_one_and_of_a_running_one_kept(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)

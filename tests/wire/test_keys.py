@@ -11,7 +11,7 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, Position, Track
+from catstream.messages.kinds import Answer, Command, End, Features, Position, Track
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, CONTROL, FEATURES, MODELS, TRACKS
 from catstream.wire.codec import encode
@@ -151,7 +151,7 @@ def test_a_client_has_a_name_that_is_no_path(keys, name):
     assert set(clients(keys)) == {*CLIENTS, "pipeline"}
 
 
-def test_a_secret_key_is_not_printed_and_one_that_other_users_can_read_is_rejected(keys):
+def test_a_secret_key_that_other_users_can_read_is_rejected(keys):
     known = Keys.load(keys)
     assert known.secret.decode() not in repr(known)
     (keys / "client.key").chmod(0o640)
@@ -190,6 +190,22 @@ def test_a_client_that_may_send_commands_receives_answers(place, until):
 
         turn()
         until(lambda: answers[-1] is not None, turn)
+
+
+def test_an_acknowledged_channel_works_with_the_keys_of_the_pipeline(place, until):
+    taken = []
+    with Receiver(FEATURES, place(), Position(), WINDOW) as receiver, Sender(FEATURES, place(), WINDOW) as sender:
+
+        def turn():
+            sender.poll(0)
+            if (seq := sender.window.sent + 1) <= 50 and not sender.window.full:
+                sender.send(Features(seq, seq, 0.0, {}))
+            if (message := receiver.receive(0.02)) is not None:
+                taken.append(message.seq)
+                receiver.acknowledge(Position(message.seq, message.seq))
+
+        until(lambda: sender.window.stored == 50, turn)
+    assert taken == list(range(1, 51))
 
 
 @pytest.mark.parametrize(("name", "who"), OUTSIDE)
@@ -261,9 +277,16 @@ def test_a_revoked_client_receives_until_its_connection_ends_and_cannot_reconnec
     assert {message.seq for message in heard if message} <= {1, 2, 3}
 
 
-def test_clients_are_rejected_while_a_key_cannot_be_read_and_one_that_is_allowed_later_needs_no_restart(
-    keys, place, until
-):
+def test_a_client_that_is_allowed_later_needs_no_restart(keys, place, until):
+    heard = []
+    with Publisher(TRACKS, place()) as tracks:
+        tracks.send(track(1))
+        allow(keys, "late", "watch", output=keys.parent / "late")
+        with Subscriber(TRACKS, place("late")) as reader:
+            until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
+
+
+def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_afterwards(keys, place, until):
     heard, before = [], rejected()
     good = (keys / "clients" / "operator").read_bytes()
     (keys / "clients" / "operator").write_bytes(b"role = ")
@@ -277,10 +300,6 @@ def test_clients_are_rejected_while_a_key_cannot_be_read_and_one_that_is_allowed
         assert not heard
         (keys / "clients" / "operator").write_bytes(good)
         until(lambda: heard, turn)
-        allow(keys, "late", "watch", output=keys.parent / "late")
-        with Subscriber(TRACKS, place("late")) as reader:
-            heard.clear()
-            until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
 
 
 def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, folder, message_of, until):
