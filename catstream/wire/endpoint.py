@@ -26,7 +26,7 @@ from catstream.wire.keys import Keys
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
-_TCP = re.compile(r"tcp://(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,252}|\[[0-9A-Fa-f:.]+\]):([0-9]{1,5})")
+_TCP = re.compile(r"tcp://(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,252}|\[[^\[\]]+\]):([0-9]{1,5})")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
 _FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
@@ -84,17 +84,19 @@ class Endpoint:
     def _tcp(cls, text: str, keys: Keys | None) -> Endpoint:
         last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
         parts = _TCP.fullmatch(text)
-        if parts is None or not 1 <= int(parts[2]) <= 65535 - last:
-            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
-        host = {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(parts[1], parts[1])
+        host, port = (parts[1], int(parts[2])) if parts is not None else ("", 0)
+        host = {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
         address = _address(host)
-        if keys is None and (address is None or not address.is_loopback):
+        is_host = bool(host) and (address is not None or not host.startswith("["))
+        if keys is None and is_host and (address is None or not address.is_loopback):
             raise ServiceError(
                 f"other machines can reach {text}, and without keys anybody could connect: make keys "
                 "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
-        return cls(host=host, port=int(parts[2]), keys=keys)
+        if not (is_host and 1 <= port <= 65535 - last):
+            raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
+        return cls(host=host, port=port, keys=keys)
 
     def address(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address of a channel, as ZeroMQ takes it; of the given sender if there are several."""

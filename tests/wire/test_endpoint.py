@@ -41,7 +41,7 @@ def test_ports_follow_the_table():
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "localhost", "[::1]"])
-@pytest.mark.parametrize("other", ["0.0.0.0", "192.168.1.1", "[fe80::1]", "example.org", "*", "127.0.0.1.nip.io"])
+@pytest.mark.parametrize("other", ["0.0.0.0", "192.168.1.1", "[fe80::1%eth0]", "example.org", "*", "127.0.0.1.nip.io"])
 def test_without_keys_this_machine_is_accepted_and_a_host_that_others_can_reach_is_not(host, other):
     assert Endpoint.parse(f"tcp://{host}:5700").port == 5700
     with pytest.raises(ServiceError, match="other machines"):
@@ -61,7 +61,7 @@ def test_a_pipeline_with_keys_is_found_with_them(folder):
         ("", "--set run.endpoint"),
         ("udp://127.0.0.1:1", "a folder or tcp"),
         ("x" * 100, "too long.*TMPDIR"),
-        *((f"tcp://{rest}", "more ports after PORT") for rest in ("", "127.0.0.1", "[:5700")),
+        *((f"tcp://{rest}", "more ports after PORT") for rest in ("", "127.0.0.1", ":5700", "[:5700", "[12]:5700")),
         *((f"tcp://127.0.0.1:{port}", "more ports after PORT") for port in ("0", "65535", "x")),
     ],
 )
