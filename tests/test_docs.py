@@ -25,6 +25,7 @@ from mypy import api as mypy
 import catstream
 from catstream.cli import COMMANDS, load_command
 from catstream.fleet import life
+from catstream.run.job import Results
 from catstream.settings import PRESETS, describe
 from catstream.sinks.destinations import EXPORTS, SINKS
 from catstream.sinks.run_files import places_of
@@ -159,7 +160,7 @@ def test_the_page_of_the_command_line_shows_every_command_and_option():
 
 def test_every_destination_and_format_of_tracks_is_explained():
     shown = page("docs/how-to/sinks.md")
-    for name in places_of("NAME", Path(), video=True):
+    for name in places_of("NAME", Results(Path(), video=True)):
         assert f"`{name}`" in shown
         assert f"`{name}`" in page("docs/tutorial.md")
     for key in [*(f"FILE{key}" if key[0] == "." else key for key in SINKS), *EXPORTS]:

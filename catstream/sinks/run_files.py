@@ -11,16 +11,18 @@ from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import ObjectPosition, Position
 from catstream.messages.storage import writing
+from catstream.run.job import Results
 from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
 from catstream.sinks.track_log import is_log, read_frames, whole_frames
 from catstream.video.frames import without_password
 from catstream.video.source import is_live
 
 
-def places_of(name: str, output: Path | None, video: bool) -> list[str]:
-    """Return the files of a run of this name in a folder of results: the log in both forms, and the video."""
-    kinds = ("ndjson", "csv", *(["mp4"] if video else []))
-    return [] if output is None else [str(output / f"{name}.{kind}") for kind in kinds]
+def places_of(name: str, results: Results) -> list[str]:
+    """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
+    kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
+    own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
+    return [*dict.fromkeys([*own, *results.write])]
 
 
 @dataclass(frozen=True, slots=True)

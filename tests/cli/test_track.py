@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.cli.common import RunProgress
+from catstream.cli.track import RunProgress
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline

@@ -1,20 +1,48 @@
-"""`catstream sink`: write the tracks of a running pipeline to files and elsewhere."""
+"""`catstream sink` and `export`: write the tracks of a running pipeline, or other formats from the log of a run."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
+from inspect import cleandoc
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
-from catstream.cli.export import with_table
 from catstream.client.subscription import subscribe
+from catstream.errors import VideoError
 from catstream.messages.names import counted, listed
-from catstream.services.options import with_overwrite
-from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
+from catstream.services.options import PATH, with_overwrite
+from catstream.sinks.destinations import (
+    EXPORTS,
+    SINKS,
+    Origin,
+    TrackedFrame,
+    check_file,
+    export_of,
+    is_file,
+    open_sink,
+    sink_of,
+)
+from catstream.sinks.destinations import export as make
+from catstream.sinks.track_log import is_log, read_frames
+
+Command = Callable[..., Any]
+
+
+def with_table(*, sinks: bool) -> Callable[[Command], Command]:
+    """Replace {table} in the help of a command by the lines of the sinks, or of the exports."""
+
+    def changed(command: Command) -> Command:
+        lines = (f"  {key:9} {row.meaning}" for key, row in (SINKS if sinks else EXPORTS).items())
+        command.__doc__ = cleandoc(command.__doc__ or "").replace("{table}", "\n".join(["\b", *lines]))
+        return command
+
+    return changed
 
 
 @click.command()
@@ -71,3 +99,34 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
             reason = f": {tracks.end.reason}"
         of = f" of {listed(newest)}" if any(newest) else ""
         click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{reason}", err=True)
+
+
+@click.command()
+@click.argument("log", type=PATH)
+@click.argument("dest", type=PATH)
+@click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
+@with_overwrite
+@with_table(sinks=False)
+def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
+    """Make another format from the log of a run.
+
+    LOG is an .ndjson or .csv file of `catstream track` or `catstream sink`. The
+    extension of DEST selects the format, or --format, which a folder needs. A
+    folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
+    that of LOG. Processing times are in .csv only.
+
+    {table}
+
+    \b
+    EXAMPLES
+      catstream export out/walk.ndjson walk.sqlite
+      catstream export out/walk.csv results --format otb
+    """
+    row = export_of(dest, name)
+    if not is_log(log) or not log.is_file():
+        raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
+    if next(read_frames(log), None) is None:
+        raise VideoError(f"{log} contains no tracks")
+    if row.suffix:
+        check_file(dest, may_exist=overwrite, source=str(log))
+    make((frame for frame, _ in read_frames(log)), dest, row, log.stem)
