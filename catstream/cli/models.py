@@ -36,42 +36,17 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
-@click.option(
-    "--model",
-    "models",
-    type=PATH,
-    multiple=True,
-    required=True,
-    metavar="FILE",
-    help="Model of an object, written by `catstream save`; may be repeated.",
-)
+@click.option("--model", "models", type=PATH, multiple=True, required=True, help="Model of an object; may be repeated.")
 @click.option("--output", type=PATH, default="found", show_default=True, help="Folder for the results.")
 @with_overwrite
+@click.option("--threshold", type=NumberRange(0, 2), default=0.5, show_default=True, help="Least score of a sighting.")
 @click.option(
-    "--threshold",
-    type=NumberRange(0, 2),
-    default=0.5,
-    show_default=True,
-    metavar="N",
-    help="Least score of a sighting.",
+    "--every", type=NumberRange(0, 3600), default=0.2, show_default=True, help="Seconds of a video between two frames."
 )
 @click.option(
-    "--every",
-    type=NumberRange(0, 3600),
-    default=0.2,
-    show_default=True,
-    metavar="SECONDS",
-    help="Time between two frames of a video that are searched; 0 for every frame.",
+    "--sizes", default="0.4,2.5", show_default=True, callback=_sizes, help="Least and largest multiple of the size."
 )
-@click.option(
-    "--sizes",
-    default="0.4,2.5",
-    show_default=True,
-    callback=_sizes,
-    metavar="LOW,HIGH",
-    help="Smallest and largest size, as multiples of the learned size.",
-)
-@click.option("--fps", type=float, default=25.0, show_default=True, metavar="N", help="Images of a folder per second.")
+@click.option("--fps", type=float, default=25.0, show_default=True, help="Images of a folder per second.")
 @with_skip_damaged
 def find(
     paths: tuple[Path, ...],
@@ -89,7 +64,9 @@ def find(
     PATH is a video, an image, or a folder, which is searched with all its
     subfolders. The images of one folder are treated as one sequence.
 
-    Of a video, one frame in 0.2 seconds is searched. After Ctrl-C, the same
+    Of a video, one frame in 0.2 seconds is searched (--every); 0 searches every
+    frame. --sizes LOW,HIGH are multiples of the size that was learned. A model
+    is a file that `catstream save` wrote. After Ctrl-C, the same
     command continues with the file that was not finished; finished files are
     not searched again, unless they have changed or --overwrite is given.
 
@@ -107,7 +84,6 @@ def find(
     \b
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --save-model anna.safetensors
-      catstream find --model anna.safetensors holiday.mp4
       catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output found
       catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
     """
