@@ -28,7 +28,7 @@ from catstream.fleet import life
 from catstream.run.job import Results
 from catstream.settings import PRESETS, describe
 from catstream.sinks.destinations import EXPORTS, SINKS
-from catstream.sinks.run_files import places_of
+from catstream.sinks.track_log import places_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

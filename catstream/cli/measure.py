@@ -30,8 +30,7 @@ from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.applications.evaluation.accuracy import Row
-    from catstream.applications.loadtest.load_test import Result
-    from catstream.applications.loadtest.plan import Limit
+    from catstream.applications.loadtest.load_test import Limit, Result
 
 _FAILED = 1  # exit code if a limit was not met or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
@@ -231,8 +230,7 @@ def loadtest(
     # Imported here so that --help and the other commands start faster.
     from catstream.applications.loadtest.latency import percentiles
     from catstream.applications.loadtest.load_report import milliseconds, to_json, write_report
-    from catstream.applications.loadtest.load_test import run_load_test
-    from catstream.applications.loadtest.plan import Limit, Plan, violations
+    from catstream.applications.loadtest.load_test import Limit, Plan, run_load_test, violations
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)

@@ -36,7 +36,7 @@ from catstream.services.options import (
     with_reading,
 )
 from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file
-from catstream.sinks.run_files import RunFiles, places_of
+from catstream.sinks.track_log import RunFiles, places_of
 
 _SHORTEST_SECONDS = 1.0  # of a run whose rate is told
 _REFRESH_SECONDS = 0.1  # between two updates of the progress

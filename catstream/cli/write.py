@@ -17,18 +17,8 @@ from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.messages.names import counted, listed
 from catstream.services.options import PATH, with_overwrite
-from catstream.sinks.destinations import (
-    EXPORTS,
-    SINKS,
-    Origin,
-    TrackedFrame,
-    check_file,
-    export_of,
-    is_file,
-    open_sink,
-    sink_of,
-)
-from catstream.sinks.destinations import export as make
+from catstream.sinks import destinations
+from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
 from catstream.sinks.track_log import is_log, read_frames
 
 Command = Callable[..., Any]
@@ -71,16 +61,17 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
       catstream sink - | jq .box
     """
     for place in places:
-        sink_of(place).load()
-        if is_file(place):
-            check_file(Path(place), may_exist=overwrite)
+        destinations.sink_of(place).load()
+        if destinations.is_file(place):
+            destinations.check_file(Path(place), may_exist=overwrite)
     written, reason, run = 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
             origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys)
-            sinks = [stack.enter_context(closing(open_sink(place, origin))) for place in dict.fromkeys(places)]
+            opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
+            sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
                 run = run or tracks.run
@@ -122,11 +113,11 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
       catstream export out/walk.ndjson walk.sqlite
       catstream export out/walk.csv results --format otb
     """
-    row = export_of(dest, name)
-    if not is_log(log) or not log.is_file():
+    row = destinations.export_of(dest, name)
+    if not is_log(log) or not log.destinations.is_file():
         raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:
-        check_file(dest, may_exist=overwrite, source=str(log))
-    make((frame for frame, _ in read_frames(log)), dest, row, log.stem)
+        destinations.check_file(dest, may_exist=overwrite, source=str(log))
+    destinations.export((frame for frame, _ in read_frames(log)), dest, row, log.stem)

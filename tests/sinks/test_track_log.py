@@ -21,8 +21,7 @@ from catstream.errors import VideoError
 from catstream.messages.kinds import ObjectPosition, Position, Track
 from catstream.run.job import Results
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
-from catstream.sinks.run_files import RunFiles, places_of
-from catstream.sinks.track_log import read_frames
+from catstream.sinks.track_log import RunFiles, places_of, read_frames
 from catstream.video.rendered import write
 from catstream.video.source import open_source
 

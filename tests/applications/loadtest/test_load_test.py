@@ -10,8 +10,7 @@ import psutil
 import pytest
 
 from catstream.applications.loadtest.latency import REST, Usage
-from catstream.applications.loadtest.load_test import run_load_test
-from catstream.applications.loadtest.plan import Limit, Plan, violations
+from catstream.applications.loadtest.load_test import Limit, Plan, run_load_test, violations
 
 
 @pytest.fixture
