@@ -114,7 +114,7 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
       catstream export out/walk.csv results --format otb
     """
     row = destinations.export_of(dest, name)
-    if not is_log(log) or not log.destinations.is_file():
+    if not is_log(log) or not log.is_file():
         raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
