@@ -34,7 +34,9 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
-@click.option("--model", "models", type=PATH, multiple=True, required=True, help="Model of an object; may be repeated.")
+@click.option(
+    "--model", "models", type=PATH, multiple=True, required=True, metavar="FILE", help="A saved model; may be repeated."
+)
 @click.option("--output", type=PATH, default="found", show_default=True, help="Folder for the results.")
 @with_overwrite
 @click.option("--threshold", type=NumberRange(0, 2), default=0.5, show_default=True, help="Least score of a sighting.")
@@ -42,7 +44,7 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
     "--every", type=NumberRange(0, 3600), default=0.2, show_default=True, help="Seconds of a video between two frames."
 )
 @click.option(
-    "--sizes", default="0.4,2.5", show_default=True, callback=_sizes, help="Least and largest multiple of the size."
+    "--sizes", default="0.4,2.5", show_default=True, callback=_sizes, metavar="LOW,HIGH", help="Sizes to search."
 )
 @click.option("--fps", type=float, default=25.0, show_default=True, help="Images of a folder per second.")
 @with_skip_damaged
@@ -62,11 +64,11 @@ def find(
     PATH is a video, an image, or a folder, which is searched with all its
     subfolders. The images of one folder are treated as one sequence.
 
-    Of a video, one frame in 0.2 seconds is searched (--every); 0 searches every
-    frame. --sizes LOW,HIGH are multiples of the size that was learned. A model
-    is a file that `catstream save` wrote. After Ctrl-C, the same
-    command continues with the file that was not finished; finished files are
-    not searched again, unless they have changed or --overwrite is given.
+    Of a video, one frame in 0.2 seconds is searched (--every; 0 for every
+    frame), for objects of 0.4 to 2.5 times the learned size (--sizes). A model
+    is a file that `catstream save` wrote. After Ctrl-C, the same command
+    continues with the file that was not finished; finished files are not
+    searched again, unless they have changed or --overwrite is given.
 
     \b
     Writes
