@@ -39,8 +39,7 @@ COMMANDS = {
 
 #: Module of the commands that share a module.
 _MODULES = {
-    **dict.fromkeys(("watch", "status"), "attach"),
-    **dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "operate"),
+    **dict.fromkeys(("watch", "status", "set-box", "search", "forget", "pause", "resume", "save", "stop"), "attach"),
     **dict.fromkeys(("find", "merge"), "models"),
     **dict.fromkeys(("evaluate", "loadtest", "demo"), "measure"),
     **dict.fromkeys(("sink", "export"), "write"),

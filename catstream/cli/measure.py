@@ -98,33 +98,26 @@ def evaluate(
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
-        from catstream.applications.evaluation.accuracy import describe_flips, mean_of, rows_of, to_json, write_report
-        from catstream.applications.evaluation.datasets import (
-            choose_starts,
-            find_sequences,
-            read_attributes,
-            with_attributes,
-        )
-        from catstream.applications.evaluation.onepass import evaluate as run_all
+        from catstream.applications.evaluation import accuracy, datasets, onepass
 
     if (starts is not None) + shifts + (jitter is not None) > 1:
         raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
     if attributes is not None and output is None and json_file is None:
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
-    sequences = [sequence for path in paths for sequence in find_sequences(path)]
-    seen = {} if attributes is None else read_attributes(attributes)
+    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path)]
+    seen = {} if attributes is None else datasets.read_attributes(attributes)
 
     errors: list[CatstreamError] = []
     try:
         columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
         with line_of(messages(), *columns) as progress:
             task = progress.add_task("starting", total=None)
-            runs = run_all(
+            runs = onepass.evaluate(
                 sequences,
                 names,
                 settings,
-                starts=choose_starts(starts, jitter, shifts=shifts),
+                starts=datasets.choose_starts(starts, jitter, shifts=shifts),
                 peer_models=peer_models,
                 jobs=jobs,
                 output=output,
@@ -139,15 +132,15 @@ def evaluate(
         complain(error)
     if not runs:
         raise CatstreamError("all runs have failed: see above")
-    rows = rows_of(runs)
-    screen().print(_table(rows, mean_of(rows)))
-    for line in describe_flips(rows):
+    rows = accuracy.rows_of(runs)
+    screen().print(_table(rows, accuracy.mean_of(rows)))
+    for line in accuracy.describe_flips(rows):
         click.echo(line)
     if json_file is not None or output is not None:
-        shared = with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
-        write_json(json_file, to_json(rows, settings, shared))
+        shared = datasets.with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
+        write_json(json_file, accuracy.to_json(rows, settings, shared))
         if output is not None:
-            click.echo(f"report: {write_report(output / 'report.html', runs, settings, shared)}")
+            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared)}")
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
