@@ -25,6 +25,8 @@ from catstream.client.subscription import Subscription, subscribe, wait_until_ru
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Health
 from catstream.messages.names import UNNAMED, check_name, counted, split_name
+from catstream.run.job import Job
+from catstream.run.state import learned
 from catstream.services.options import (
     FOLDER,
     PATH,
@@ -431,10 +433,6 @@ def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: 
       catstream save anna.safetensors --object anna
       catstream save walker.safetensors --state checkpoints
     """
-    # Imported here so that --help and the other commands start faster.
-    from catstream.run.job import Job
-    from catstream.run.state import learned
-
     check_file(file, overwrite=overwrite)
     if state is None:
         with target.control() as pipeline:

@@ -21,7 +21,7 @@ from typing import IO, get_args
 
 from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages.kinds import ObjectPosition, Position, State, Track
+from catstream.messages.kinds import State, Track
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing
 from catstream.run.job import Results
@@ -227,17 +227,10 @@ class RunFiles:
                     raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
                 check_file(Path(place), may_exist=overwrite or continued, source=source, made=self.output)
 
-    def position(self) -> Position | None:
-        """Return the position of the last frame that the log holds whole; None if there is to be no log."""
-        log, frames = self._log(), 0
-        if log is None:
-            return None
-        boxes: dict[str, Box | None] = {}
-        objects: list[str] = []
-        for frame, _ in whole_frames(log):
-            frames, objects = frame.number + 1, [track.object for track in frame.tracks]
-            boxes |= {track.object: track.box for track in frame.tracks if track.box is not None}
-        return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
+    def position(self) -> int | None:
+        """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log."""
+        log = self._log()
+        return None if log is None else max((frame.number + 1 for frame, _ in whole_frames(log)), default=0)
 
     def make_folder(self) -> None:
         """Make the folder of the results, in which other files of the run may be, too."""

@@ -22,7 +22,7 @@ from typing import Any, Self, cast
 
 from catstream.applications.workers import SPAWN, sigint_blocked
 from catstream.errors import ServiceError
-from catstream.services.loop import die_with
+from catstream.services.process import die_with
 
 _TICKS_PER_SECOND = 1_000_000  # time base of the stream
 _STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
