@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +16,7 @@ from catstream.applications.evaluation.accuracy import describe_flips, flips_of,
 from catstream.applications.evaluation.datasets import FIRST, Sequence, Start, jittered, spatial, temporal
 from catstream.applications.evaluation.onepass import evaluate, follow
 from catstream.applications.evaluation.runs import EvaluationRun, load, save
-from catstream.errors import CatstreamError, ServiceError, SettingsError
+from catstream.errors import CatstreamError, SettingsError
 from catstream.settings import Settings
 
 SETTINGS = Settings()
@@ -142,18 +141,6 @@ def test_runs_of_another_version_or_with_other_settings_are_not_mixed_in(
     monkeypatch.setattr(runs, "OPENCV", version)
     with pytest.raises(SettingsError, match=named):
         evaluate([sequence], ["catstream"], settings, output=tmp_path)
-    assert len(counted) == 1
-
-
-def test_a_full_disk_leaves_no_settings_that_a_repetition_cannot_read(tmp_path, sequence, counted):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
-    try:
-        with pytest.raises(ServiceError, match="cannot write"):
-            evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
     assert len(counted) == 1
 
 
