@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from catstream.applications.html.page import DASHES, SHARES, Axis, Bar, plot, timeline
+from catstream.applications.page import DASHES, SHARES, Axis, Bar, plot, timeline
 
 
 def parsed(svg):
