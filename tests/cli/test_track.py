@@ -255,7 +255,8 @@ def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, s
     tracking, close = [], LineSink.close
 
     def closed(sink):
-        tracking.extend(each for each in psutil.Process().children(recursive=True) if each.name() == "detector")
+        servers = psutil.Process().children()
+        tracking.extend(each for server in servers for each in server.children() if each.status() != "zombie")
         close(sink)
 
     monkeypatch.setattr(RunProgress, "show", lambda *_: signal.raise_signal(signal.SIGINT))
@@ -287,6 +288,6 @@ def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video
     run = catstream("track", source, "--box", box, "--paused", "--set", f"run.endpoint={endpoint}")
     assert "paused: to continue, catstream resume --endpoint" in run.stderr.readline()
     with subscribe(endpoint, "tracks", timeout=60) as tracks:
-        succeed("resume", "--endpoint", endpoint)
+        succeed("resume", "--endpoint", endpoint, "--timeout", 60)
         assert [track.frame for track in tracks] == list(range(32))
     assert run.wait(60) == 0

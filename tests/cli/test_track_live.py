@@ -131,8 +131,9 @@ def test_a_restarted_detector_follows_a_stream_over_http_also_if_its_frames_have
     ) as run:
         sent = run.until(lambda counters: counters["model_version"] >= 3)["sent"]
         scale[0] = 2
-        family = psutil.Process(run.process.pid).children(recursive=True)
-        next(process for process in family if process.name() == "detector").kill()
+        (server,) = psutil.Process(run.process.pid).children()
+        detector, *_ = sorted(server.children(), key=psutil.Process.create_time)  # it is the first that is started
+        detector.kill()
         run.until(lambda counters: counters["sent"] > sent + 80)
         rows, errors = run.stopped()
     assert "processes restarted: 1" in errors
