@@ -8,6 +8,7 @@ itself is the owner of the run, which receives every track.
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import socket
@@ -24,16 +25,16 @@ from typing import Self
 from catstream.box import Box
 from catstream.client.control import Control, control
 from catstream.errors import ServiceError
-from catstream.messages.kinds import Answer, End, ObjectPosition, Position, Track, Tracks
+from catstream.messages.kinds import Answer, End, Track, Tracks
 from catstream.run.job import Job
-from catstream.services.child import Child
-from catstream.services.loop import PERMANENT_FAILURE
-from catstream.services.start_server import NAMES, start_server
+from catstream.services.process import PERMANENT_FAILURE
+from catstream.services.start_server import NAMES, close_start_server, start_server
+from catstream.services.supervisor import Child
 from catstream.settings import Settings
-from catstream.wire.acknowledged import Receiver
-from catstream.wire.channels import CHANNELS, MODELS, RESULTS
+from catstream.wire.channels import CHANNELS, MODELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
+from catstream.wire.results import ResultsReceiver
 
 #: Address of each process; the consumer of the tracks has that of the detector.
 HOSTS = {"compressor": "127.0.0.1", "trainer": "127.0.0.2", "detector": "127.0.0.3"}
@@ -161,7 +162,6 @@ class Arena:
         self.state, self.tracks, self.deaths = state, list[dict[str, Track]](), 0
         self.end: End | None = None
         self._settings, self._source, self._boxes, self._folder = settings, source, boxes, scratch
-        self._found = {name: ObjectPosition(box) for name, box in boxes.items()}
         self._clock = scratch / "clock"
         self._children: dict[str, Child] = {}
         self._places: dict[str, Endpoint] = {}
@@ -178,18 +178,19 @@ class Arena:
             for link in self.links.values():
                 stack.callback(link.close)
             (self._folder / "sitecustomize.py").write_text(_CLOCK)
-            self._results = stack.enter_context(
-                Receiver(RESULTS, self._places["detector"], Position(), self._settings.run.unstored_frames)
-            )
+            window = self._settings.run.unstored_frames + 1
+            self._results = stack.enter_context(ResultsReceiver(self._places["detector"], window, 0))
             self._models = stack.enter_context(Subscriber(MODELS, self._places["trainer"]))
             self._control = stack.enter_context(control(str(self._places["detector"]), timeout=_PATIENCE_SECONDS))
             self._pool = stack.enter_context(ThreadPoolExecutor(1))
             path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+            close_start_server()  # the next one has these variables
+            stack.callback(close_start_server)
             stack.enter_context(_variables({"PYTHONPATH": path, "ARENA_CLOCK": str(self._clock)}))
             for name in NAMES:
                 self._children[name] = Child(name, self._job(name), self._folder)
                 stack.callback(self._children[name].close)
-                self._children[name].start()
+                self._children[name].start(0)
             self._stack = stack.pop_all()
         return self
 
@@ -209,13 +210,11 @@ class Arena:
             self._last_received = monotonic()
             if isinstance(message, Tracks):
                 self.tracks.append(message.tracks)
-                found = {name: ObjectPosition(track.box) for name, track in message.tracks.items() if track.box}
-                lost = {name: self._found.get(name, ObjectPosition()) for name in message.tracks}
-                self._found = lost | found
-                self._results.acknowledge(Position(message.seq, message.frame, self._found))
+                if message.seq != len(self.tracks):
+                    raise ServiceError(f"frame {len(self.tracks) - 1} is missing, frame {message.frame} came instead")
             else:
-                self._results.acknowledge(Position(message.seq))
                 self.end = message
+            self._children["detector"].watchdog.read = math.inf if self.end is not None else message.seq
         elif monotonic() - self._last_received > _PATIENCE_SECONDS:
             raise ServiceError(
                 f"no track arrived for {_PATIENCE_SECONDS:.0f} s after {len(self.tracks)}: {self.words()}"
@@ -226,7 +225,7 @@ class Arena:
                 raise ServiceError(f"the {name} gave up: {self.words()}")
             if code and self.end is None:
                 self.deaths += 1
-                child.start()
+                child.start(self._results.last)
 
     def until(self, done: Callable[[], bool]) -> None:
         """Call `turn` until a condition is true or the run has ended."""
@@ -257,9 +256,8 @@ class Arena:
 
     def signal(self, name: str, number: int) -> None:
         """Send a signal to a process if it runs."""
-        if (pid := self._children[name].pid) is not None:
-            with suppress(ProcessLookupError):
-                os.kill(pid, number)
+        if (process := self._children[name].process) is not None:
+            process.send_signal(number)
 
     def kill_start_server(self) -> None:
         """Kill the process that has forked all the others; they end with it."""

@@ -1,10 +1,9 @@
 """Injects a random schedule of faults into a running pipeline, and checks that no track and no row is lost.
 
 One fault follows the other: processes are killed (kill -9) or frozen (SIGSTOP), links are cut or slowed, the disk is
-full, or the clock is wrong. With several objects, some are forgotten and others begin between the faults. In lockstep,
-the trees must contain every message exactly once and be equal, bit for bit, to those of a run without faults in which
-the same objects begin and are forgotten in the same frames. Otherwise, the success rate must be as high as without
-faults.
+full, or the clock is wrong. With several objects, some are forgotten and others begin between the faults. Every frame
+must have exactly one track, and every message must be in the trees exactly once; the success rate must be as high as
+without faults. In lockstep it is also shown whether tracks and trees are the same, bit for bit, as without faults.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from sequences import sequences
 from table import command
 
 from catstream.applications.evaluation.datasets import Sequence
+from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
@@ -22,7 +23,6 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import ObjectFeatures, Track
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
-from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

@@ -274,7 +274,7 @@ _SAVED = """
     [Saved models](../docs/how-to/saved-models.md)."""
 _ACROSS = """
     An object is learned at three cameras and searched for at a fourth one, by the model of the first camera, by those
-    that a fleet merges in pairs, and by one tree that has seen the frames of all three. The cameras are four parts of a
+    that a fleet merges, and by one tree that has seen the frames of all three. The cameras are four parts of a
     long sequence, or rendered scenes with four backgrounds in four lights. `recall` is the share of frames in which the
     box overlaps the true one by half, `wrong` the share with another box, and `stranger` the share of frames of a
     camera without the object in which a box is reported. See [the
@@ -283,7 +283,7 @@ _FLEET = """
     Six streams on three nodes of one machine with two cores, and a real S3 server as the store. First, three are live,
     and three are short films, as fast as the cores allow, whose trees are compared, bit for bit, with those without
     faults; `wrong` counts other trees, streams that stood still or were started again when they should not, and what
-    did not happen in three minutes; frames lost are of the live streams. Then all are live and slow, so that a core is
+    did not happen in three minutes. Then all are live and slow, so that a core is
     free. The second and the last table begin when Ray has noticed the fault. See [the
     how-to](../docs/how-to/fleet.md)."""
 _SCALE_HEAD = """
@@ -298,12 +298,11 @@ _HEAD_OF_A_FLEET = """
     as the web page, has the state of all streams. Beyond some thousands of streams, run several fleets: a client names
     the fleet in the address of a stream."""
 _NODE_OF_A_FLEET = """
-    A stream needs 0.3 to 1 cores, by the size of its frames and their rate: `catstream fleet status` shows what it
-    uses, and `cores` in the file is what Ray reserves. A node writes the state of each stream every 5 seconds, about
+    A stream needs 0.3 to 1 cores, by the size of its frames and their rate; `cores` in the file is what Ray reserves. A
+    node writes the state of each stream every 5 seconds, about
     14 MB for one object of four trees once it has tracked for long: 100 streams write 280 MB a second to the store.
     With `every = 30`, it is a sixth of that; a failure then costs a live stream up to 30 s of learning, and no row of
-    a file. Requests to a bucket are one PUT and one listing for each state. Merging takes two saved models at a time,
-    as tasks on all nodes: merging 1,000 streams takes 999 merges, a few at a time on each node."""
+    a file. Requests to a bucket are one PUT and one listing for each state. Merging is one task on one node."""
 _FOUND = """
     Every fourth object is learned from the first third of its sequence, and searched in frames of the rest and of all
     other sequences. A sighting is right if it overlaps the object by half; the average precision counts all others as

@@ -12,12 +12,12 @@ from time import perf_counter
 from sequences import rendered
 from table import Table, benchmark, command
 
+from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.detection.objects import Detectors
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import End, Features, Position
 from catstream.messages.names import UNNAMED
-from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES
@@ -68,7 +68,7 @@ def delivered(endpoint: str, features: Features, messages: int) -> float:
     receiver = SPAWN.Process(target=receive, args=(endpoint,), daemon=True)
     receiver.start()
     with Sender(FEATURES, Endpoint.parse(endpoint), WINDOW) as sender:
-        while sender.ask_position() is None:  # no receiver yet
+        while sender.ask_position(0) is None:  # no receiver yet
             receiver.join(0.01)
         begin = perf_counter()
         for seq in range(1, messages + 1):

@@ -91,8 +91,8 @@ EXTRAS = {
     "loadtest": ("the load test", ("psutil",)),
     "mcap": ("an MCAP file", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
-    "fleet": ("a fleet", ("ray",)),
-    "s3": ("a store on S3", ("obstore", "boto3")),
+    "fleet": ("a fleet", ("ray", "obstore")),
+    "s3": ("a store on S3", ("boto3",)),
 }
 
 

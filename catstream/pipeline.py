@@ -6,12 +6,12 @@ for track in catstream.Pipeline("walk.mp4", {"anna": (120, 80, 64, 48), "ben": (
 
 from __future__ import annotations
 
-import asyncio
 import math
 import os
 import time
 import warnings
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from copy import copy
 from dataclasses import replace
@@ -21,20 +21,19 @@ from types import TracebackType
 from typing import Self
 
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.messages.kinds import Health, Position, Track
+from catstream.messages.kinds import Track
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
-from catstream.run.state import begun, position, saved
-from catstream.services.desired import DESIRED, DesiredState
-from catstream.services.run_reader import RunReader
+from catstream.run.state import begun, last_seq, saved
+from catstream.services.decisions import DESIRED, DesiredState
 from catstream.services.start_server import start_server
+from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
-from catstream.wire.readable import finish, finish_async
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _CLOSED = ExitStack()  # marks a pipeline that was closed
@@ -43,13 +42,13 @@ _CLOSED = ExitStack()  # marks a pipeline that was closed
 class Pipeline:
     """Tracks objects with three processes, and yields exactly one `Track` for each object and frame.
 
-    Iterate over it with `for` or `async for`: the processes are started, and stopped at the end of the loop. Use it in
-    a `with` or `async with` to read its endpoint and its counters too, and to iterate over it in parts. A pipeline runs
-    once; make another one to track the source again.
+    Iterate over it: the processes are started, and stopped at the end of the loop. Use it in a `with` to read its
+    endpoint and its counters too, and to iterate over it in parts. A pipeline runs once; make another one to track the
+    source again. In an event loop, wait for its tracks with `asyncio.to_thread`.
 
-    A process that dies is restarted, and the run continues. Backpressure: on a file, a slow consumer blocks the
-    detector; on a live source, frames are skipped and counted. A live source has no end, and is opened again whenever
-    it is lost.
+    A process that dies or hangs is restarted, and the run continues, however long the loop takes with each track.
+    Backpressure: on a file, a slow consumer blocks the detector; on a live source, frames are skipped and counted. A
+    live source has no end, and is opened again whenever it is lost.
 
     Parameters
     ----------
@@ -67,18 +66,16 @@ class Pipeline:
         from the file.
     part : slice
         The frames of a file or folder to track: `slice(100, 200, 2)` for 100, 102 ... 198.
-    paused : bool
-        Whether the run starts paused, so that subscribers can connect before its first frame, until
-        `catstream.control(...).resume()`.
     state : path
         Folder for checkpoints, written once a second and at the end, from which the run can be resumed.
     resume : path
         State folder of an earlier run, which continues at the frame that it had reached. The folder also contains the
         source, the box, the part and the settings.
-    after : Position
-        With `resume`: the last track that the caller has; the run continues with the next one. If None, it continues
-        after the last track that was received. If the program was killed, it continues after the last checkpoint:
-        tracks of the last second may be repeated, and those that it had not received yet may be missing.
+    after : int
+        With `resume`: `seq` of the last track that the caller has; the run continues with the next frame. If None, it
+        continues after the last checkpoint, which may be ahead of the tracks that were read.
+    paused : bool
+        Whether the run starts paused: `catstream resume` continues it, for example once all subscribers are there.
     results : Results
         The files that the program writes, stored in the state folder for the program that resumes the run. A run that
         is resumed keeps those of each kind that are not given again.
@@ -113,7 +110,7 @@ class Pipeline:
         resume contains no run or a damaged one.
     ServiceError
         At the start, if the endpoint or the state folder is in use, or if the pipeline has run already. While
-        iterating, if a process fails repeatedly, or another thread or task closes the pipeline.
+        iterating, if a process fails repeatedly, or another thread closes the pipeline.
     VideoError
         While iterating, if the source fails, after its last valid frame.
     """
@@ -126,10 +123,10 @@ class Pipeline:
         *,
         model: Models | None = None,
         part: slice = ALL_FRAMES,
-        paused: bool = False,
         state: str | os.PathLike[str] | None = None,
         resume: str | os.PathLike[str] | None = None,
-        after: Position | None = None,
+        after: int | None = None,
+        paused: bool = False,
         results: Results | None = None,
         save_model: Models | None = None,
     ) -> None:
@@ -155,14 +152,16 @@ class Pipeline:
             part=job.part if part == ALL_FRAMES else part,
             settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
             results=job.results if results is None else results.after(job.results),
-            read=None,
             paused=paused,
         )
         saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
         for file in saved_models.values():
             if reason := why_not_writable(file):
                 raise ServiceError(reason)
-        _check(job)
+        if not job.source:
+            raise SettingsError("a new run needs a source: give one")
+        if job.settings.run.lockstep and is_live(job.source):
+            raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
         # The source is closed here, because the detector opens it, and a camera can be open in one program only.
         with open_source(job.source, part=job.part, settings=job.settings.run) as first:
             self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
@@ -178,7 +177,9 @@ class Pipeline:
         self._after = after
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
-        self._reader: RunReader | None = None
+        self._rows = 0
+        self._rest: deque[Track] = deque()  # tracks of the last frame that were not yielded yet
+        self._supervisor: Supervisor | None = None
 
     @property
     def source(self) -> str:
@@ -205,10 +206,10 @@ class Pipeline:
         """The files of the run that is resumed; none for a new run."""
         return self._resumed_job.results if self._resumed_job is not None else Results()
 
-    def starting_after(self, position: Position | None) -> Self:
+    def starting_after(self, seq: int | None) -> Self:
         """A copy of a pipeline that has not started yet, with another `after`."""
         other = copy(self)
-        other._after = position
+        other._after = seq
         return other
 
     def __getstate__(self) -> object:
@@ -224,14 +225,12 @@ class Pipeline:
             settings, shown = self.settings, without_password(self.source)
             endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
             if self._state is not None:
-                stack.enter_context(begun(self._state, self._resumed_job, self._job, self._start))
+                stack.enter_context(begun(self._state, self._resumed_job, self._job))
             job = self._started(str(endpoint))
-            reader = stack.enter_context(RunReader(job, endpoint, self._start, folder, live=self.live))
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
-            if self._state is not None:
-                stack.callback(_store_position, self._state, self._job, reader)
-            stack.callback(reader.stop)  # before the models are saved, from the compressor's last checkpoint
-            self._endpoint, self._reader, self._stack = str(endpoint), reader, stack.pop_all()
+            self._supervisor = Supervisor(job, folder, self._start, live=self.live)
+            stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
+            self._endpoint, self._stack = str(endpoint), stack.pop_all()
             self._pid = os.getpid()  # a copy of this process that is forked later does not end the run
         return self
 
@@ -253,14 +252,6 @@ class Pipeline:
         if stack is not None and stack is not _CLOSED and self._pid == os.getpid():
             stack.__exit__(kind, error, trace)
 
-    async def __aenter__(self) -> Self:
-        return self.__enter__()  # it does not block; the processes end with this thread
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await asyncio.shield(asyncio.to_thread(self.__exit__, kind, error, trace))
-
     def close(self) -> None:
         """Stop the processes in order, after they have stored everything. The pipeline cannot be started again."""
         self.__exit__(None, None, None)
@@ -278,17 +269,9 @@ class Pipeline:
     def __iter__(self) -> Iterator[Track]:
         return self._run() if self._stack is None else self._tracks()
 
-    def __aiter__(self) -> AsyncIterator[Track]:
-        return self._run_async() if self._stack is None else self._tracks_async()
-
     def _run(self) -> Iterator[Track]:
         with self:
             yield from self._tracks()
-
-    async def _run_async(self) -> AsyncIterator[Track]:
-        async with self:
-            async for track in self._tracks_async():
-                yield track
 
     def by_frame(self, seconds: float = math.inf) -> Iterator[dict[str, Track]]:
         """Iterate over the frames: the track of each object, by name. The pipeline must be used in a `with`.
@@ -303,27 +286,32 @@ class Pipeline:
         ServiceError
             If the pipeline was not started, or was closed.
         """
-        while (tracks := finish(self._running.next_frame(seconds))) is not None:
+        while (tracks := self._next_frame(seconds)) is not None:
             yield tracks
 
     def _tracks(self) -> Iterator[Track]:
         """The tracks that arrive from now on; the loop before may have ended within a frame."""
-        while (track := finish(self._running.next_track())) is not None:
-            yield track
+        while True:
+            while self._rest:
+                yield self._rest.popleft()
+            if (tracks := self._next_frame()) is None:
+                return
+            self._rest.extend(tracks.values())
 
-    async def _tracks_async(self) -> AsyncIterator[Track]:
-        """The same for an event loop, without blocking it."""
-        while (track := await finish_async(self._running.next_track())) is not None:
-            yield track
+    def _next_frame(self, seconds: float = math.inf) -> dict[str, Track] | None:
+        """The track of each object in the next frame; none if the time is over, None at the end."""
+        tracks = self._running.next_frame(seconds)
+        self._rows += len(tracks or ())
+        return tracks
 
     @property
-    def _running(self) -> RunReader:
-        """The reader of the run, while it is open."""
+    def _running(self) -> Supervisor:
+        """The processes of the run, while it is open."""
         if self._stack is _CLOSED:
             raise ServiceError(_ONCE)
-        if self._reader is None:
+        if self._supervisor is None:
             raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
-        return self._reader
+        return self._supervisor
 
     @property
     def endpoint(self) -> str:
@@ -346,35 +334,37 @@ class Pipeline:
         frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`, and
         how often it was `reopened`.
         """
-        if self._reader is None or self._reader.end is None:
+        if self._supervisor is None or self._supervisor.end is None:
             return {}
-        own = {"rows": self._reader.rows, "restarts": self.restarts}
-        return {name: int(value) for name, value in self._reader.end.totals.items()} | own
+        own = {"rows": self._rows, "restarts": self.restarts}
+        return {name: int(value) for name, value in self._supervisor.end.totals.items()} | own
 
     @property
     def reason(self) -> str:
         """At the end: why the stream ended; empty before."""
-        return self._reader.end.reason if self._reader is not None and self._reader.end is not None else ""
+        return self._supervisor.end.reason if self._supervisor is not None and self._supervisor.end is not None else ""
 
     @property
     def health(self) -> dict[str, dict[str, float]]:
         """The counters of each process that were received last, by the name of the process."""
-        return {name: health.counters for name, health in self._reports.items()}
+        reports = self._supervisor.health if self._supervisor is not None else {}
+        return {name: health.counters for name, health in reports.items()}
 
     @property
     def trouble(self) -> dict[str, str]:
         """Descriptions of current problems, by the name of the process; empty if there are none."""
-        return {name: health.trouble for name, health in self._reports.items() if health.trouble}
+        reports = self._supervisor.health if self._supervisor is not None else {}
+        return {name: health.trouble for name, health in reports.items() if health.trouble}
 
     @property
     def pids(self) -> dict[str, int]:
         """Process ids of the running processes, by name."""
-        return self._reader.supervisor.pids if self._reader is not None else {}
+        return self._supervisor.pids if self._supervisor is not None else {}
 
     @property
     def restarts(self) -> int:
         """How many times a process was restarted."""
-        return self._reader.supervisor.restarts if self._reader is not None else 0
+        return self._supervisor.restarts if self._supervisor is not None else 0
 
     @property
     def lost_seconds(self) -> float:
@@ -398,36 +388,11 @@ class Pipeline:
         return {"waiting": waiting, "paused": paused}
 
     @property
-    def _reports(self) -> dict[str, Health]:
-        """The newest health report of each process, by its name."""
-        return self._reader.health if self._reader is not None else {}
-
-    @property
-    def _start(self) -> Position:
-        """The track after which the run continues."""
-        if self._resumed_job is None:
-            return Position()
-        after = self._after or self._resumed_job.read
-        if after is not None and not self.live:
-            return after
+    def _start(self) -> int:
+        """Number of the last frame before the run: that of the caller, or of the checkpoint."""
+        if self._resumed_job is None or self._state is None:
+            return 0
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
-        return max(self._learned, after or self._learned, key=lambda start: start.seq)
-
-    @cached_property
-    def _learned(self) -> Position:
-        """The position of the checkpoint from which the run is resumed."""
-        return position(self._state) if self._state is not None else Position()
-
-
-def _store_position(state: Path, job: Job, reader: RunReader) -> None:
-    """Store how far the program has read: the checkpoint may be ahead of it."""
-    with suppress(ServiceError):  # on a full disk, the run is resumed from its checkpoint
-        replace(job, read=reader.position).save(state)
-
-
-def _check(job: Job) -> None:
-    """Raise an error if a run cannot start, before anything is opened."""
-    if not job.source:
-        raise SettingsError("a new run needs a source: give one")
-    if job.settings.run.lockstep and is_live(job.source):
-        raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
+        if self._after is not None and not self.live:
+            return self._after
+        return max(last_seq(self._state), self._after or 0)

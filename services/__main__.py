@@ -1,7 +1,6 @@
 """`python -P -m catstream.services NAME`: runs one process of a pipeline.
 
-Each process can be started by hand, in any order; `catstream track` starts them all. A process works on a
-`catstream.run.job.Job`: the options of a command define it, or the parent process passes a file that contains it.
+Each process can be started by hand, in any order, as the three containers do; `catstream track` starts them all.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ import click
 
 from catstream.errors import CatstreamError
 from catstream.run.job import Job
-from catstream.services.loop import log_as, run
-from catstream.services.options import PATH, with_model, with_object, with_part, with_settings
+from catstream.services.options import PATH, with_object, with_part, with_settings
+from catstream.services.process import run
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
@@ -38,30 +37,22 @@ def main() -> None:
 
 _source = click.argument("source")
 _state = click.option("--state", type=PATH, help="Folder for the checkpoints and the desired state.")
-_record = click.option("--record", type=PATH, help="Recording that the compressor writes or continues.")
 
 
 @main.command()
 @_source
 @click.option("--resume", is_flag=True, help="Continue after the last message that a previous detector sent.")
-@click.option("--owned", is_flag=True, help="Send the tracks to another process too, which must acknowledge them.")
-@_record
 @_state
 @with_object
 @with_part
 @with_settings
 def detector(**options: Any) -> None:
-    """Track the object in the frames of SOURCE; send tracks and features.
-
-    With --record, it waits until the compressor has subscribed to the tracks.
-    """
+    """Track the object in the frames of SOURCE; send tracks and features."""
     sys.exit(run("detector", Job(**options)))
 
 
 @main.command()
 @_state
-@_record
-@with_model
 @with_settings
 def compressor(**options: Any) -> None:
     """Compress the features in coreset trees; send samples."""
@@ -73,19 +64,6 @@ def compressor(**options: Any) -> None:
 def trainer(**options: Any) -> None:
     """Train models on the samples; send models."""
     sys.exit(run("trainer", Job(**options)))
-
-
-@main.command()
-@_source
-@with_object
-@with_part
-@with_settings
-def supervisor(**options: Any) -> None:
-    """Start the other three processes for SOURCE, and restart any that dies."""
-    from catstream.services import supervisor
-
-    log_as("supervisor")
-    sys.exit(supervisor.main(Job(**options)))
 
 
 def start() -> None:

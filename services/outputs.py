@@ -1,20 +1,34 @@
-"""The channels that a detector sends on."""
+"""What a detector sends, and the files of the saved models that its objects begin with."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import logging
+from contextlib import ExitStack, suppress
+from hashlib import blake2b
+from pathlib import Path
+from time import monotonic
 from typing import Self
 
-from catstream.messages.kinds import End, Features, Tracks
-from catstream.services.loop import Process
-from catstream.services.previews import Previews
-from catstream.services.timing import TURN_SECONDS
-from catstream.wire.acknowledged import Sender
-from catstream.wire.channels import FEATURES, RESULTS, TRACKS, TRAINING
-from catstream.wire.newest import Publisher
+import numpy as np
 
-#: Sends one of the two streams that are received without a loss.
-DataSender = Sender[Features | End] | Sender[Tracks | End]
+from catstream.box import Box
+from catstream.errors import CatstreamError
+from catstream.messages import storage
+from catstream.messages.kinds import End, Features, Preview, Tracks
+from catstream.run.learned import Learned
+from catstream.services.decisions import DesiredObject
+from catstream.services.process import Process
+from catstream.video.frames import jpeg
+from catstream.wire.acknowledged import Sender
+from catstream.wire.channels import FEATURES, PREVIEWS, TRACKS, TRAINING
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Publisher
+from catstream.wire.results import ResultsSender
+
+_PREVIEW_SECONDS = 0.1  # shortest time between two pictures for subscribers
+_SIDE = 640  # longest side of a picture, in pixels
+
+_log = logging.getLogger(__name__)
 
 
 class Outputs:
@@ -24,7 +38,6 @@ class Outputs:
     ----------
     features : sender of the features to the compressor
     results : sender of the tracks to the owner of the run; None if it has no owner
-    senders : both senders by the names of their channels, `features` first; without `results` if it is None
     previews : pictures of frames for subscribers
     """
 
@@ -32,20 +45,11 @@ class Outputs:
         window, endpoint = process.settings.run.unstored_frames, process.endpoint
         with ExitStack() as stack:
             self.features = stack.enter_context(Sender(FEATURES, endpoint, window))
-            owned = process.job.owned
-            self.results = stack.enter_context(Sender(RESULTS, endpoint, window)) if owned else None
+            self.results = stack.enter_context(ResultsSender(endpoint, window + 1)) if process.job.owned else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
             self._training = stack.enter_context(Publisher(TRAINING, endpoint))
             self.previews = stack.enter_context(Previews(endpoint))
             self._stack = stack.pop_all()
-        self.senders: dict[str, DataSender] = {"features": self.features}
-        if self.results is not None:
-            self.senders["results"] = self.results
-
-    def poll(self, awaited: str | None = None) -> None:
-        """Process acknowledgements; wait a short time for one on the channel `awaited`."""
-        for name, sender in self.senders.items():
-            sender.poll(TURN_SECONDS if name == awaited else 0)
 
     def serve_late_joiners(self) -> None:
         """Send the end or the newest preview to new subscribers."""
@@ -64,3 +68,82 @@ class Outputs:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+
+class Previews(Publisher[Preview]):
+    """Sends the newest frame as a small picture, at most ten a second; none is made if there are no subscribers."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(PREVIEWS, endpoint)
+        self._waiting: tuple[int, np.ndarray, dict[str, Box]] | None = None
+        self._shown = 0.0
+
+    def show(self, frame: int, image: np.ndarray, boxes: dict[str, Box]) -> None:
+        """Send a frame, unless a newer one arrives before it is due.
+
+        Parameters
+        ----------
+        frame : number of the frame
+        image : uint8 (h, w, 3) BGR, not to be changed afterwards
+        boxes : the objects in the frame, by name
+        """
+        self._waiting = frame, image, boxes
+        self.turn()
+
+    def turn(self) -> None:
+        """Send a preview if one is due; call it in every turn, even if no frame arrives, as subscribers may join."""
+        self.serve_late_joiners()
+        if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < _PREVIEW_SECONDS:
+            return
+        (frame, image, boxes), self._waiting, self._shown = self._waiting, None, monotonic()
+        height, width = image.shape[:2]
+        self.send(Preview(frame, width, height, boxes, jpeg(image, _SIDE)))
+
+
+class ModelFiles:
+    """The saved models that objects begin with: a restarted detector begins the objects again.
+
+    Each has a name, which is a digest of its content. They are in memory and in a folder.
+
+    Parameters
+    ----------
+    folder : folder of the files; None if they are kept in memory only
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._models: dict[str, Learned] = {}
+
+    def add(self, learned: Learned, begins: int = 1) -> DesiredObject:
+        """Keep a saved model in memory; returns the object that it begins in message `begins`, with its name."""
+        data = learned.to_bytes()
+        name = blake2b(data, digest_size=16).hexdigest()
+        self._models[name] = learned
+        return DesiredObject(learned.box, begins, name, len(data), learned.model.version)
+
+    def get(self, name: str) -> Learned | None:
+        """The saved model of a name, None if its file cannot be read."""
+        if name not in self._models and self._folder is not None:
+            try:
+                self._models[name] = Learned.load(self._file(name))
+            except CatstreamError as error:
+                _log.warning("the object of a saved model is not searched for any more: %s", error)
+        return self._models.get(name)
+
+    def store(self) -> None:
+        """Write the saved models in memory that have no file yet; OSError if that fails."""
+        for name, learned in self._models.items():
+            if self._folder is not None and not self._file(name).exists():
+                self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+                storage.write_atomically(self._file(name), learned.to_bytes(), mode=0o600)
+
+    def keep_only(self, names: set[str]) -> None:
+        """Remove all saved models but those of these names; a file that cannot be removed is left to a later call."""
+        self._models = {name: learned for name, learned in self._models.items() if name in names}
+        with suppress(OSError):
+            for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
+                if file.stem not in names:
+                    file.unlink()
+
+    def _file(self, name: str) -> Path:
+        return (self._folder or Path()) / f"{name}.safetensors"

@@ -47,20 +47,21 @@ IMPORTERS = {
         "catstream/applications/loadtest/crowd.py",
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
-        "services/detector.py",
+        "services/detector_process.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/kernels.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],
-    "obstore": ["catstream/fleet/objects.py"],
-    "boto3": ["catstream/fleet/objects.py"],  # obstore imports it
+    "obstore": ["catstream/fleet/store.py"],
+    "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
     "zmq": [
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",
+        "catstream/wire/results.py",
         "catstream/wire/newest.py",
         "catstream/wire/commands.py",
         "catstream/wire/keys.py",
@@ -69,9 +70,10 @@ IMPORTERS = {
     "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
+        "catstream/client/registry.py",
         *("catstream/box.py", "catstream/messages"),
-        *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
-        *("services/desired.py", "catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
+        *("services/decisions.py", "catstream/compression/forest.py"),
+        *("catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
         *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
     ],
     "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/runs.py"],
@@ -97,8 +99,8 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/fleet/desired.py"),
-    *("services/core.py", "services/core_state.py", "services/commands.py", "services/actions.py"),
+    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py"),
+    *("services/decisions.py", "services/control_commands.py"),
 ]
 
 FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
@@ -191,7 +193,7 @@ def test_slow_libraries_are_imported_by_the_functions_that_use_them():
 @pytest.mark.parametrize("name", ["compressor", "trainer"])
 def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
     unused = SLOW | {"asyncio", "cv2", "numba", "sklearn"}
-    check = f"import sys, catstream.services.{name}; sys.exit({unused!r} & sys.modules.keys() or 0)"
+    check = f"import sys, catstream.services.{name}_process; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")
 

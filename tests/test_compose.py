@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -18,7 +19,6 @@ from catstream.cli import group
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Health
 from catstream.services.__main__ import main
-from catstream.services.start import environment
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
 from catstream.web.app import pipeline_site
@@ -189,7 +189,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
                 line = [word.replace(there, place) for word in line]
             stack.enter_context(
                 ended(
-                    subprocess.Popen([sys.executable, "-m", "catstream.services", *line], env=environment() | variables)
+                    subprocess.Popen([sys.executable, "-m", "catstream.services", *line], env=os.environ | variables)
                 )
             )
         with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:

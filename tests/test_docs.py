@@ -74,14 +74,10 @@ def anchors(path: Path) -> set[str]:
 
 
 def life_of_a_stream() -> str:
-    """The tables of the life of a stream, as `docs/how-to/fleet.md` shows them."""
-    lines = ["", "| state | an actor in it |", "| --- | --- |"]
-    lines += [f"| `{state}` | {what} |" for state, what in life.STATES.items()]
-    lines += ["", "| event | what has happened |", "| --- | --- |"]
-    lines += [f"| `{event}` | {what} |" for event, what in life.EVENTS.items()]
-    lines += ["", "| state | event | action | next state |", "| --- | --- | --- | --- |"]
-    for (state, what), (after, action) in life.TABLE.items():
-        lines.append(f"| `{state}` | `{what}` | {action} | `{after}` |")
+    """The table of the life of a stream, as `docs/how-to/fleet.md` shows it."""
+    lines = ["", "| state | event | action | next state |", "| --- | --- | --- | --- |"]
+    for (state, event), (after, action) in life.TABLE.items():
+        lines.append(f"| `{state}` | {life.EVENTS[event]} | {action} | `{after}` |")
     return "\n".join([*lines, ""]) + "\n"
 
 

@@ -2,7 +2,7 @@
 
 A long sequence is cut into four parts of equal length, as if each was a camera: what was learned in the first frames of
 each of the first three is searched for in the last one. In the rendered scenes, an object moves before four backgrounds
-in four lights. The models are merged as in a fleet, in pairs; `one tree` has seen the features of all three cameras.
+in four lights. The models are merged as in a fleet; `one tree` has seen the features of all three cameras.
 
 `recall` is the share of frames with the object in which the reported box overlaps the true one by half. `wrong` is the
 share of frames in which another box is reported, and `stranger` the share in which a box is reported at a camera that
@@ -29,8 +29,7 @@ from sequences import rendered, scratch, sequences
 from table import Table, publish
 
 from catstream.applications.evaluation.datasets import Sequence, find_sequences
-from catstream.fleet.merge import joined, merge_in_pairs
-from catstream.run.learned import Learned
+from catstream.run.learned import Learned, merge
 from catstream.settings import Settings
 from catstream.video.rendered import cut_out_dahlia, load_photograph
 from catstream.video.writer import VideoWriter
@@ -67,11 +66,10 @@ def measured(task: tuple[Scene, int, int]) -> tuple[str, Row]:
     *cameras, last = scene.cameras
     settings = Settings()
     found = [features(camera.sequence, camera.start, learning, settings) for camera in cameras]
-    models = [model_of(one, settings).to_bytes() for one in found]
+    models = [model_of(one, settings) for one in found]
     counts = range(2, len(models) + 1)
-    searched = {"camera 1": Learned.from_bytes(models[0], "")}
-    merged = {f"cameras 1-{count}": merge_in_pairs(models[:count], joined) for count in counts}
-    searched |= {name: Learned.from_bytes(model, "") for name, model in merged.items()}
+    searched = {"camera 1": models[0]}
+    searched |= {f"cameras 1-{count}": merge(models[:count], force=True) for count in counts}
     searched["one tree"] = model_of([part for one in found for part in one], settings)
     return scene.name, {name: _searched(learned, last, scene.stranger, frames) for name, learned in searched.items()}
 

@@ -23,7 +23,8 @@ from sequences import rendered
 from table import Table, command, publish
 
 from catstream.client.registry import Registry, RegistryServer
-from catstream.fleet.life import Node, Seen, Wanted, event
+from catstream.fleet.life import Actor, Node, event, order
+from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.run.learned import merge
@@ -39,8 +40,6 @@ STATUS = StreamStatus(
     server="x" * 40,
     token=12,
     frame=1_234_567,
-    rate=25.0,
-    cores=0.4,
     models={"": 1200},
     stored_seconds=2.5,
 )
@@ -63,10 +62,9 @@ def head(sizes: tuple[int, ...]) -> Iterator[tuple]:
     """A turn of decisions, and the answer to one question for all streams, by the number of streams."""
     for count in sizes:
         nodes = [Node(f"node-{n}", str(n), cores=float(_ON_A_NODE)) for n in range(-(-count // _ON_A_NODE))]
-        wanted = [Wanted(f"digest-{n}") for n in range(count)]
-        order = wanted[0].order(nodes)
+        wanted = [StreamSpec(f"camera-{n:05}", "demo:1") for n in range(count)]
         seen = [
-            Seen("working", 0.0, 0.0, replace(order, digest=each.digest), str(n // _ON_A_NODE), "reports")
+            Actor("working", order=order(each, nodes), node=str(n // _ON_A_NODE), happened="reports")
             for n, each in enumerate(wanted)
         ]
         turn = least(lambda: [event(w, s, nodes, 1.0) for w, s in zip(wanted, seen, strict=True)])  # noqa: B023

@@ -14,6 +14,7 @@ from accuracy import starts_of
 
 from catstream.applications.evaluation.datasets import Sequence, Start
 from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
@@ -22,7 +23,6 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.names import UNNAMED
 from catstream.numerics.threads import one_thread
 from catstream.paper.scm import SparseCollaborativeModel
-from catstream.services.start import SPAWN
 from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 

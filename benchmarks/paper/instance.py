@@ -33,11 +33,11 @@ from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.finding.scan import Scan
+from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.features.score_map import non_maximum_suppression
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
-from catstream.services.start import SPAWN
 from catstream.tracker import Tracker
 from catstream.video import rendered
 from catstream.video.source import open_source

@@ -18,7 +18,7 @@ from multiprocessing import resource_tracker
 from typing import TypeVar
 
 from catstream.errors import ServiceError
-from catstream.services.loop import die_with
+from catstream.services.process import die_with
 
 _Result = TypeVar("_Result")
 

@@ -37,8 +37,9 @@ COMMANDS = {
     "settings": "List all settings with their defaults and descriptions.",
 }
 
-#: Module of the commands that share a module.
+#: Module of the commands that share a module, or whose module has another name.
 _MODULES = {
+    "fleet": "fleet_commands",
     **dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "operate"),
     **dict.fromkeys(("watch", "status"), "attach"),
     **dict.fromkeys(("find", "merge"), "models"),

@@ -1,14 +1,8 @@
 """The registry of a fleet: which streams there are, and where each of them runs.
 
-    from catstream.client.registry import Registry
-
-    with Registry("head.example.org:5690", keys="my-keys") as registry:
-        for stream in registry.streams().streams.values():
-            print(stream.name, stream.state, stream.node)
-
-The controller of the fleet serves the registry (`RegistryServer`), and knows the state of all streams. A client needs
-keys with the role "watch", or none if the fleet runs on this machine for this user alone. It gets the endpoint and the
-public key of a stream's pipeline, and connects with its own keys. No secret is transmitted.
+The controller of the fleet serves the registry, and knows the state of all streams. A client needs keys with the role
+"watch", or none on this machine. It gets the endpoint and the public key of a stream's pipeline, and connects with its
+own keys. No secret is transmitted.
 
 The address of a fleet is HOST:PORT of its registry, or the name of a fleet of this user on this machine; it is empty
 for the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet://STREAM` in the only fleet.
@@ -17,98 +11,67 @@ for the only one. The address of a stream is `fleet://FLEET/STREAM`, or `fleet:/
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from time import monotonic
-from typing import Self, TypeVar
 from uuid import uuid4
 
-from catstream.errors import ProtocolError, ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, FleetStatus, Listing, NodeStatus, Question, StreamStatus, Track
+import msgspec
+
+from catstream.errors import ServiceError, SilenceError
+from catstream.messages.kinds import End, Features, FleetStatus, Listing, Question, StreamStatus, Track
 from catstream.messages.names import UNNAMED
-from catstream.messages.schema import LONGEST_LIST
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint, Place, find, fleets, meeting_place, private_folder
 from catstream.wire.keys import Keys
 
-ANSWER_SECONDS = 5.0  #: limit for the answer of a registry, by default
-CONTROLLER_SECONDS = 0.5  #: without an answer, after which the endpoint of a fleet on this machine is read again
-QUIET_SECONDS = 1.0  #: without a message, after which the registry is asked where a stream runs; then repeated
-
-_log = logging.getLogger(__name__)
-
-Status = TypeVar("Status", StreamStatus, NodeStatus)
-
 #: Port at which the registry of a cluster listens by default.
 REGISTRY_PORT = 5690
 
+_ANSWER_SECONDS = 5.0  # limit for an answer, by default
+_QUIET_SECONDS = 1.0  # without a message of a stream, after which the registry is asked where it runs; then repeated
 _PREFIX = "fleet://"
-_LONGEST_TROUBLE = 1000  # characters
 
 
-class Registry:
+class Registry(AbstractContextManager["Registry"]):
     """Asks the controller of a fleet for its streams and nodes.
 
     Parameters
     ----------
-    fleet : str
-        Address of the fleet: HOST:PORT, the name of a fleet of this user, or empty for the only one.
-    keys : str
-        Folder of the keys of this client, if the fleet requires keys.
-    timeout : float
-        Seconds to wait for an answer.
-
-    Raises
-    ------
-    ServiceError
-        If this user has no such fleet, or the keys cannot be read; from each question, if the fleet rejects the keys.
-    SilenceError
-        From each question, if no answer arrives in time.
+    fleet : address of the fleet: HOST:PORT, the name of a fleet of this user, or empty for the only one
+    keys : folder of the keys of this client, if the fleet requires keys
+    timeout : seconds to wait for an answer; SilenceError if there is none
     """
 
-    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = ANSWER_SECONDS) -> None:
+    def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = _ANSWER_SECONDS) -> None:
         self.timeout = timeout
-        self._keys = Keys.load(keys) if keys else None
-        self._is_remote = ":" in fleet
-        self._name, self._endpoint = (fleet, self._remote(fleet)) if self._is_remote else self._local(fleet)
+        own = Keys.load(keys) if keys else None
+        self._name, self._endpoint = _remote(fleet, own) if ":" in fleet else _local(fleet, own)
         self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
         self._question = ""  # id of the last one that was sent by `request`
 
-    def streams(self) -> FleetStatus:
-        """The state of all streams and nodes."""
-        listing = self._ask(Question(uuid4().hex))
-        status = FleetStatus(listing.fleet, listing.time, dict(listing.streams), dict(listing.nodes))
-        while listing.more and (names := [*listing.streams, *listing.nodes]):
-            listing = self._ask(Question(uuid4().hex, after=max(names)))
-            status.streams.update(listing.streams)
-            status.nodes.update(listing.nodes)
-        return status
+    def streams(self, only: str = "") -> FleetStatus:
+        """The state of all streams and nodes, or that of one stream."""
+        answer = self._requester.ask(Question(uuid4().hex, only), self.timeout)
+        if answer is None:
+            raise SilenceError(
+                f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its "
+                "controller running there?"
+            )
+        return _status(answer)
 
     def stream(self, stream: str) -> StreamStatus:
-        """The state of one stream.
-
-        Raises
-        ------
-        ServiceError
-            If the fleet has no such stream.
-        """
-        listing = self._ask(Question(uuid4().hex, stream))
-        if stream not in listing.streams:
+        """The state of one stream; ServiceError if the fleet has no such stream."""
+        found = self.streams(stream)
+        if stream not in found.streams:
             names = ", ".join(self.streams().streams) or "none"
-            raise ServiceError(f"the fleet {listing.fleet} has no stream {stream!r}: its streams are {names}")
-        return listing.streams[stream]
+            raise ServiceError(f"the fleet {found.name} has no stream {stream!r}: its streams are {names}")
+        return found.streams[stream]
 
     def endpoint_of(self, status: StreamStatus) -> Endpoint | None:
-        """The endpoint of the pipeline of a stream in this state, with the keys to connect with; None if it has none.
-
-        Raises
-        ------
-        ServiceError
-            If its pipeline requires keys and there are none.
-        """
+        """The endpoint of the pipeline of a stream in this state, with the keys to connect; None if it has none."""
         if not status.endpoint:
             return None
         keys = self._endpoint.keys
@@ -123,12 +86,12 @@ class Registry:
     def request(self, stream: str) -> None:
         """Ask for one stream without waiting; `receive` returns the answer. A new request replaces the last one."""
         self._question = uuid4().hex
-        self._follow_controller()
         self._requester.send(Question(self._question, stream))
 
-    def receive(self) -> Listing | None:
+    def receive(self) -> FleetStatus | None:
         """The answer to `request` if it has arrived."""
-        return self._requester.receive(self._question, 0)
+        answer = self._requester.receive(self._question, 0)
+        return None if answer is None else _status(answer)
 
     def fileno(self) -> int:
         """Readable if an answer may have arrived."""
@@ -138,60 +101,43 @@ class Registry:
         """Disconnect."""
         self._requester.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, question: Question) -> Listing:
-        deadline = monotonic() + self.timeout
-        while (left := deadline - monotonic()) > 0:
-            self._follow_controller()
-            if (answer := self._requester.ask(question, min(left, CONTROLLER_SECONDS))) is not None:
-                return answer
-        raise SilenceError(
-            f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its controller "
-            "running there?"
+
+def _remote(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
+    """Address and endpoint of a registry."""
+    if keys is None and not fleet.startswith(("127.", "[::1]:", "localhost:")):
+        raise ServiceError(
+            f"the fleet at {fleet} requires authentication: make keys on its head (catstream keys allow FOLDER/keys "
+            "NAME --output DIR), and pass them (--keys DIR)"
         )
+    return fleet, Endpoint.parse(f"tcp://{fleet}", keys or "")
 
-    def _follow_controller(self) -> None:
-        """Connect again if the controller of a fleet on this machine was started again, at another endpoint."""
-        found = None if self._is_remote else fleets().get(self._name)
-        if found is not None and str(found) != str(self._endpoint):
-            self._requester.close()
-            self._endpoint = self._with_keys(found)
-            self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
 
-    def _remote(self, fleet: str) -> Endpoint:
-        if self._keys is None and not fleet.startswith(("127.", "[::1]:")):
-            raise ServiceError(
-                f"the fleet at {fleet} requires authentication: make keys on its head (catstream keys allow "
-                "FOLDER/keys NAME --output DIR), and pass them (--keys DIR)"
-            )
-        return Endpoint.parse(f"tcp://{fleet}", self._keys or "")
-
-    def _local(self, fleet: str) -> tuple[str, Endpoint]:
-        """Name and endpoint of a fleet of this user."""
-        known = fleets()
-        if not fleet and len(known) == 1:
-            fleet = next(iter(known))
-        if fleet in known:
-            return fleet, self._with_keys(known[fleet])
-        if fleet or not known:
-            which = f"no fleet {fleet!r} of yours" if fleet else "no fleet of yours"
-            listed = f"; there is {', '.join(sorted(known))}" if known else ""
-            raise ServiceError(
-                f"{which} is running: start it (catstream fleet up), wait if it starts or if a node has just died, or "
-                f"give HOST:PORT of one{listed}"
-            )
-        names = ", ".join(sorted(known))
+def _local(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
+    """Name and endpoint of a fleet of this user."""
+    known = fleets()
+    names = ", ".join(sorted(known))
+    if not fleet and len(known) > 1:
         raise ServiceError(
             f"{len(known)} fleets are running: say which (--fleet NAME, or fleet://NAME/STREAM): {names}"
         )
+    fleet = fleet or names
+    if fleet not in known:
+        raise ServiceError(
+            f"{f'no fleet {fleet!r} of yours' if fleet else 'no fleet of yours'} is running: start it (catstream fleet "
+            f"up), wait if it starts, or give HOST:PORT of one{f'; there is {names}' if names else ''}"
+        )
+    return fleet, known[fleet] if keys is None else replace(known[fleet], keys=keys)
 
-    def _with_keys(self, endpoint: Endpoint) -> Endpoint:
-        return endpoint if self._keys is None else replace(endpoint, keys=self._keys)
+
+def _status(answer: Listing) -> FleetStatus:
+    """What an answer says."""
+    try:
+        return msgspec.json.decode(answer.fleet, type=FleetStatus)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ServiceError(f"the registry has sent no state of a fleet ({error}): run the same catstream") from None
 
 
 class FollowedStream:
@@ -201,28 +147,10 @@ class FollowedStream:
     registry does not answer, the last answer holds. The end of a pipeline is the end of the stream only if the registry
     says so: a stream that moves is stopped on one node, and continues on another one.
 
-    Parameters
-    ----------
-    registry : Registry
-        The registry of the fleet; it is closed with this object.
-    stream : str
-        Name of the stream.
-
-    Attributes
-    ----------
-    place : Endpoint or None
-        The endpoint of its pipeline; if it runs nowhere now, of the last one; None if there was none.
-    status : StreamStatus
-        Its newest state.
-    end : End or None
-        The reason why the stream has ended; None while it continues.
-
-    Raises
-    ------
-    ServiceError
-        If the fleet has no such stream, or does not accept the keys.
-    SilenceError
-        If the controller does not answer at first.
+    registry  of the fleet; it is closed with this object
+    place     the endpoint of its pipeline; if it runs nowhere now, of the last one; None if there was none
+    status    its newest state
+    end       the reason why the stream has ended; None while it continues
     """
 
     def __init__(self, registry: Registry, stream: str) -> None:
@@ -237,14 +165,14 @@ class FollowedStream:
         except ServiceError:
             registry.close()
             raise
-        self._next_question = monotonic() + QUIET_SECONDS
+        self._next_question = monotonic() + _QUIET_SECONDS
 
     def take(self, message: object) -> bool:
         """Note a message from the pipeline; returns False if it is of a frame that the stream has repeated.
 
         The registry is not asked while there are any.
         """
-        self._next_question = monotonic() + QUIET_SECONDS
+        self._next_question = monotonic() + _QUIET_SECONDS
         if isinstance(message, Track | Features):
             name = message.object if isinstance(message, Track) else UNNAMED
             if message.frame <= self._frames.get(name, -1):
@@ -261,35 +189,23 @@ class FollowedStream:
         now = monotonic()
         if now >= self._next_question:
             self._registry.request(self._stream)
-            self._next_question = now + QUIET_SECONDS
-        if (listing := self._registry.receive()) is None:
+            self._next_question = now + _QUIET_SECONDS
+        if (answer := self._registry.receive()) is None:
             return False
-        if self._stream not in listing.streams:
-            self.end = End(0, f"the stream {self._stream} was removed from the fleet {listing.fleet}")
+        if self._stream not in answer.streams:
+            self.end = End(0, f"the stream {self._stream} was removed from the fleet {answer.name}")
             return False
-        return self._keep(listing.streams[self._stream])
+        return self._keep(answer.streams[self._stream])
 
     def ask(self, seconds: float) -> None:
-        """Ask the registry now, and wait for the answer; the last one holds if none arrives in time.
-
-        Raises
-        ------
-        ServiceError
-            If the fleet has no such stream any more.
-        """
+        """Ask the registry now, and wait for the answer; the last one holds if none arrives in time."""
         self._registry.timeout = seconds
         with contextlib.suppress(SilenceError):
             self._keep(self._registry.stream(self._stream))
 
     @property
     def endpoint(self) -> Endpoint:
-        """The endpoint of its pipeline, as the registry said it last.
-
-        Raises
-        ------
-        ServiceError
-            If it runs nowhere.
-        """
+        """The endpoint of its pipeline, as the registry said it last; ServiceError if it runs nowhere."""
         if self.place is None or not self.status.endpoint:
             raise ServiceError(f"the stream {self._stream} runs nowhere, {described(self.status)}")
         return self.place
@@ -309,7 +225,8 @@ class FollowedStream:
             (status.endpoint, status.server, status.token) != (before.endpoint, before.server, before.token)
         )
         if moved:
-            if (status.source, status.began) != (before.source, before.began):  # its frames count from 0 again
+            # A live stream uses the numbers of lost frames again, and another source counts from 0.
+            if status.live or status.source != before.source:
                 self._frames.clear()
             self.place, self._at_place, self._pipeline_end = self._registry.endpoint_of(status), status, None
         if status.state == "ended":
@@ -317,27 +234,11 @@ class FollowedStream:
         return moved
 
 
-class RegistryServer:
+class RegistryServer(AbstractContextManager["RegistryServer"]):
     """Answers the questions of clients about the streams and nodes of a fleet.
 
-    Parameters
-    ----------
-    listen : str
-        tcp://HOST:PORT, of which this port listens; empty for a Unix socket in a private folder.
-    keys : str
-        Folder of the fleet's keys, required if other machines can reach the host; empty for none.
-    status : callable
-        Returns the present state of the fleet; it is called once here, for the fleet's name, and then by `turn`.
-
-    Attributes
-    ----------
-    endpoint : Endpoint
-        The endpoint. While the server is open, other processes of this user find it by the fleet's name.
-
-    Raises
-    ------
-    ServiceError
-        If the address is not valid or in use, or the keys cannot be read.
+    It listens at tcp://HOST:PORT with the keys of a folder, or in a folder of Unix sockets; if that is empty, in a new
+    one. Other processes of this user find it by the fleet's name.
     """
 
     def __init__(self, listen: str, keys: str, status: Callable[[], FleetStatus]) -> None:
@@ -349,72 +250,32 @@ class RegistryServer:
             self._stack = stack.pop_all()
 
     def turn(self, seconds: float = 0.0) -> int:
-        """Answer all questions that have arrived, and return their number.
-
-        Parameters
-        ----------
-        seconds : time to wait for the first question
-        """
+        """Answer all questions that have arrived within some seconds, and return their number."""
         questions = self._responder.receive_all(seconds)
-        if questions:
-            status = self._status()
-            for question in questions:
-                try:
-                    self._responder.answer(_listing(question, status))
-                except ProtocolError as error:  # other questions may be about streams whose state is valid
-                    _log.error("A question was not answered: %s", error)
+        status = self._status() if questions else None
+        for question in questions:
+            found = status
+            if status is not None and (name := question.stream):
+                known = {name: status.streams[name]} if name in status.streams else {}
+                found = replace(status, streams=known, nodes={})
+            self._responder.answer(Listing(question.id, msgspec.json.encode(found)))
         return len(questions)
 
     def close(self) -> None:
         """Stop listening."""
         self._stack.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-def _listing(question: Question, status: FleetStatus) -> Listing:
-    """The answer to a question: the stream that it asks for, or as much as one message holds."""
-    if question.stream:
-        names, more = [question.stream], False
-    else:
-        left = sorted(name for name in status.streams.keys() | status.nodes.keys() if name > question.after)
-        names, more = left[:LONGEST_LIST], len(left) > LONGEST_LIST
-    streams = {name: _shortened(status.streams[name]) for name in names if name in status.streams}
-    nodes = {name: _shortened(status.nodes[name]) for name in names if name in status.nodes and not question.stream}
-    return Listing(question.id, status.name, status.time, streams, nodes, more)
-
-
-def _shortened(status: Status) -> Status:
-    """A status whose description of a problem is short enough for a message."""
-    if len(status.trouble) <= _LONGEST_TROUBLE:
-        return status
-    return replace(status, trouble=f"{status.trouble[:_LONGEST_TROUBLE]}...")
-
-
 def address_of(fleet: str, stream: str) -> str:
-    """The address of a stream of a fleet.
-
-    >>> address_of("head:5690", "cam-7"), address_of("", "cam-7")
-    ('fleet://head:5690/cam-7', 'fleet://cam-7')
-    """
-    return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}" if fleet else f"{_PREFIX}{stream}"
+    """The address of a stream of a fleet: fleet://head:5690/cam-7, or fleet://cam-7 in the only fleet."""
+    return f"{_PREFIX}{fleet.removeprefix(_PREFIX).rstrip('/')}/{stream}".replace("///", "//")
 
 
 def fleet_and_stream(endpoint: Place) -> tuple[str, str] | None:
-    """The fleet and the stream of an address, None if it is no address of a stream of a fleet.
-
-    Raises
-    ------
-    ServiceError
-        If the address has no name of a stream.
-
-    >>> fleet_and_stream("fleet://head:5690/cam-7"), fleet_and_stream("fleet://cam-7"), fleet_and_stream("run")
-    (('head:5690', 'cam-7'), ('', 'cam-7'), None)
-    """
+    """The fleet and the stream of an address, None if it is no address of a stream of a fleet."""
     if not (text := str(endpoint)).startswith(_PREFIX):
         return None
     fleet, _, stream = text.removeprefix(_PREFIX).rpartition("/")
@@ -426,13 +287,7 @@ def fleet_and_stream(endpoint: Place) -> tuple[str, str] | None:
 
 
 def follow(endpoint: Place, keys: str = "") -> FollowedStream | None:
-    """The stream of a fleet that has this address; None if it is no address of a stream.
-
-    Raises
-    ------
-    ServiceError, SilenceError
-        As `Registry` and `FollowedStream`.
-    """
+    """The stream of a fleet that has this address; None if it is no address of a stream."""
     if (address := fleet_and_stream(endpoint)) is None:
         return None
     fleet, stream = address
@@ -440,24 +295,12 @@ def follow(endpoint: Place, keys: str = "") -> FollowedStream | None:
 
 
 def described(status: StreamStatus) -> str:
-    """The state of a stream, for a message to the user.
-
-    >>> described(StreamStatus("cam-7", "unplaced", trouble="cam-7 needs a node with site=north"))
-    'its state is unplaced: cam-7 needs a node with site=north'
-    """
+    """The state of a stream, for a message to the user."""
     return f"its state is {status.state}{': ' if status.trouble else ''}{status.trouble}"
 
 
 def locate(endpoint: Place, keys: str = "") -> Endpoint:
-    """The endpoint of a running pipeline, as `find` returns it; for the address of a stream, that of its pipeline now.
-
-    Raises
-    ------
-    ServiceError
-        If there is none, or more than one; if the fleet has no such stream, or it does not run.
-    SilenceError
-        If the controller of the fleet does not answer.
-    """
+    """The endpoint of a running pipeline, as `find` returns it; for the address of a stream, that of its pipeline."""
     if (stream := follow(endpoint, keys)) is None:
         return find(endpoint, keys)
     with contextlib.closing(stream):

@@ -5,13 +5,11 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from catstream.compression.forest import Forest
-from catstream.errors import ProtocolError, ServiceError
-from catstream.messages.kinds import Position
+from catstream.errors import ProtocolError
 from catstream.settings import Settings
 
 _KEPT = 2
@@ -64,26 +62,15 @@ class CheckpointStore:
             _log.warning("%s", self._found_damaged)
         return forest or Forest(settings)
 
-    def position(self) -> Position:
-        """The position of the newest undamaged checkpoint, read without its trees; that of a new run if there is none.
+    def seq(self) -> int:
+        """Number of the newest message in the newest undamaged checkpoint, read without its trees; 0 if there is none.
 
         Raises
         ------
         ServiceError
             As `load`.
         """
-        return self._newest(Forest.position_in) or Position()
-
-    def go_back(self, seq: int) -> None:
-        """Remove the newest checkpoint if it is of a message after `seq`, and the one before it is not.
-
-        The stream then continues from the one before, or from its start if there is none.
-        """
-        with suppress(ProtocolError, ServiceError, OSError):  # as it is found when it is loaded
-            files = self._files()
-            *_, before, newest = 0, 0, *(Forest.position_in(file).seq for file in files)
-            if before <= seq < newest:
-                files[-1].unlink()
+        return self._newest(Forest.seq_in) or 0
 
     def _newest(self, read: Callable[[Path], Read]) -> Read | None:
         """The newest checkpoint that is not damaged, as `read` returns it; None if there is none."""

@@ -15,7 +15,7 @@ from catstream.box import Box
 from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpack_trees
 from catstream.errors import SettingsError
 from catstream.messages.heads import APPEARANCE, TREES, Tree
-from catstream.messages.kinds import DetectorState, ObjectFeatures, ObjectPosition, Sample, TrainingRows
+from catstream.messages.kinds import DetectorState, ObjectFeatures, Sample, TrainingRows
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
 from catstream.numerics.arrays import Bool, Float32
 from catstream.settings import Settings
@@ -123,11 +123,6 @@ class Compressor:
     def version(self) -> int:
         """Version of the last sample, 0 before the first."""
         return self.last_sample.version if self.last_sample else 0
-
-    @property
-    def position(self) -> ObjectPosition:
-        """The part of the stream's position for this object."""
-        return ObjectPosition(self.box, self.version, self.detector)
 
     @property
     def leaves(self) -> int:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
+from typing import Any
 
-from catstream.box import Box
+import msgspec
+import numpy as np
+
 from catstream.compression.compressor import Compressor
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
-from catstream.messages.kinds import Features, ObjectPosition, Position, Sample
+from catstream.messages.kinds import DetectorState, Features, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix
 from catstream.settings import Settings
 
-_KIND = "forest 2"  # and the version of what a checkpoint holds
+_KIND = "forest 3"  # and the version of what a checkpoint holds
+_MOST_STATES = 256  # messages whose detector states are kept: a detector that is restarted continues after one of them
 
 
 class Forest:
@@ -36,10 +41,7 @@ class Forest:
         self.seq = self.version = 0
         self.frame = -1
         self.compressors: dict[str, Compressor] = {}
-
-    def skip(self, frames: int) -> None:
-        """Count frames of a live source that were not tracked: the next message has a number after theirs."""
-        self.seq, self.frame = self.seq + frames, self.frame + frames
+        self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MOST_STATES)  # of the last messages
 
     def check_features(self, features: Features) -> None:
         """Raise ProtocolError if rows have another length than those before."""
@@ -92,7 +94,14 @@ class Forest:
             self._add(compressor.take(features.frame, part, self.version + 1), samples)
             after_each()
         self.seq, self.frame = features.seq, features.frame
+        states = {name: part.detector for name, part in features.objects.items() if part.detector is not None}
+        self._states.append((self.seq, states))
         return samples
+
+    def states_at(self, seq: int) -> dict[str, DetectorState]:
+        """The state of each object's detector after message `seq`, by name; after the nearest one that is kept."""
+        known = [states for number, states in self._states if number <= seq][-1:]
+        return (known or [states for _, states in self._states] or [{}])[0]
 
     def _add(self, sample: Sample | None, samples: list[Sample]) -> None:
         """Add a sample, if there is one, to those of a frame."""
@@ -101,10 +110,9 @@ class Forest:
             samples.append(sample)
 
     @property
-    def position(self) -> Position:
-        """Position at which the stream continues, once everything that was processed is stored."""
-        objects = {name: compressor.position for name, compressor in self.compressors.items()}
-        return Position(self.seq, max(self.frame, 0), objects)
+    def versions(self) -> dict[str, int]:
+        """Version of the newest sample of each object that has one, by name."""
+        return {name: compressor.version for name, compressor in self.compressors.items() if compressor.version}
 
     @property
     def last_samples(self) -> list[Sample]:
@@ -130,20 +138,12 @@ class Forest:
         storage.write(path, arrays, metadata | {"kind": _KIND})
 
     @staticmethod
-    def position_in(path: str | os.PathLike[str]) -> Position:
-        """The position in a file that `save` wrote, with the box of each object; no tree is made.
-
-        Raises
-        ------
-        ProtocolError, ServiceError
-            As `load`.
-        """
+    def seq_in(path: str | os.PathLike[str]) -> int:
+        """Number of the newest message in a file that `save` wrote; errors as from `load`."""
         metadata = storage.read_metadata(path)
         _check_kind(path, metadata)
         try:
-            boxes = {str(own["name"]): own["box"] for own in metadata["objects"]}
-            objects = {name: ObjectPosition(Box(*box) if box else None) for name, box in boxes.items()}
-            return Position(int(metadata["seq"]), max(int(metadata["frame"]), 0), objects)
+            return int(metadata["seq"])
         except (KeyError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
 
@@ -164,7 +164,7 @@ class Forest:
         _check_kind(path, metadata)
         try:
             self = cls.from_state(arrays, metadata, settings)
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError, msgspec.DecodeError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
         trees = [tree for compressor in self.compressors.values() for tree in compressor.trees.values()]
         if others := {tree.reduction for tree in trees} - {settings.coreset.reduction}:
@@ -187,6 +187,7 @@ class Forest:
             own, metadata = compressor.state()
             arrays |= {f"{i}.{key}": array for key, array in own.items()}
             objects.append(metadata | {"name": name})
+        arrays["states"] = np.frombuffer(_ENCODER.encode(list(self._states)), np.uint8)
         return arrays, {"seq": self.seq, "frame": self.frame, "version": self.version, "objects": objects}
 
     @classmethod
@@ -197,7 +198,17 @@ class Forest:
         for i, own in enumerate(metadata["objects"]):
             name = str(own["name"])
             self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)
+        self._states.extend(_DECODER.decode(arrays["states"].tobytes()))
         return self
+
+
+def _array(_: type, numbers: Any) -> Any:
+    """An array of a state, which is encoded as lists of numbers."""
+    return np.array(numbers)
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: array.tolist())
+_DECODER = msgspec.msgpack.Decoder(list[tuple[int, dict[str, DetectorState]]], dec_hook=_array)
 
 
 def _check_kind(path: str | os.PathLike[str], metadata: Metadata) -> None:

@@ -6,39 +6,78 @@
         fleet.up()
         print(fleet.status().streams["cam-7"].state)
 
-A fleet runs on a cluster of Ray that its users have started, and continues after the program. Without one, it runs on
-this machine as long as the program, or until `down`. Programs that only watch need neither Ray nor its token: see
-`catstream.subscribe`.
+A fleet runs on a cluster of Ray that its users have started (`ray start`, KubeRay), and continues after the program.
+Without one, `up` starts one node of Ray on the loopback interface, which ends with the program. Programs that only
+watch need neither Ray nor its token: see `catstream.subscribe`.
+
+A fleet on this machine has a folder, `~/.local/state/catstream/fleets/NAME`:
+
+    lock      locked by the process whose node of Ray it is
+    address   of that node, once it has started
+    token     of Ray, so that no other user of this machine can run code there
+    store/    states of the streams, if the file of the fleet names no other store
+    keys/     keys of the clients of a fleet on a cluster, on the machine of the registry
 """
 
 from __future__ import annotations
 
-import math
+import logging
 import os
+import secrets
 import socket
+import sys
+import tempfile
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+import warnings
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
 from catstream.client.registry import REGISTRY_PORT
-from catstream.errors import CatstreamError, FleetError, require_extra
-from catstream.fleet import cluster
-from catstream.fleet.cluster import NAMESPACE, actor_name
-from catstream.fleet.controller import Controller
-from catstream.fleet.desired import Desired
-from catstream.fleet.life import Node
-from catstream.fleet.local import LocalCluster
-from catstream.fleet.merge import Merged, merge_streams
+from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
+from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors, nodes
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.fleet.timing import ANSWER_SECONDS, DOWN_SECONDS, ENDED_SECONDS
 from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, check_name
-from catstream.messages.storage import lock
-from catstream.run.learned import Learned
+from catstream.messages.storage import is_locked, lock, write_atomically
+from catstream.run import state
+from catstream.run.job import Job
+from catstream.run.learned import Learned, merge
+from catstream.wire.endpoint import private_folder
+
+ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
+DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
+_START_SECONDS = 150.0  # limit for another process to start Ray on this machine
+_LEAVE_SECONDS = 10.0  # limit for the process whose node it is to notice that the fleet has ended
+_REACH_SECONDS = 3.0  # limit to connect to the head
+_LOOK_SECONDS = 0.2  # between two looks at any of these
+_STORE_BYTES = 80 << 20  # of Ray's object store: only models that are merged go through it
+
+#: Of a node that `up` starts. Ray listens on 127.0.0.1 alone only if it takes the machine for one without a cluster,
+#: and lowers the priority of its workers by default, so that streams starve beside other work.
+_VARIABLES = {
+    "RAY_AUTH_MODE": "token",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """A merged model, which is in the store.
+
+    model    the content of its file
+    streams  that it was merged from
+    skipped  streams that share frames with one of those
+    """
+
+    model: bytes
+    streams: tuple[str, ...]
+    skipped: tuple[str, ...]
 
 
 class Fleet:
@@ -69,109 +108,76 @@ class Fleet:
     """
 
     def __init__(
-        self,
-        spec: str | os.PathLike[str] | FleetSpec | None = None,
-        *,
-        name: str = "",
-        address: str = "",
+        self, spec: str | os.PathLike[str] | FleetSpec | None = None, *, name: str = "", address: str = ""
     ) -> None:
         require_extra("fleet")
         read = spec if isinstance(spec, FleetSpec) or spec is None else FleetSpec.load(Path(spec))
         self._spec = replace(read, name=name) if read is not None and name else read
-        self._origin = "" if isinstance(spec, FleetSpec) or spec is None else _origin(Path(spec))
-        self.name = name or (read.name if read is not None else "")
         self._address = address or os.environ.get("RAY_ADDRESS", "")
-        self._local = None if self._address else self._on_this_machine()
-        self.is_owner = False  # whether the cluster ends with this object
+        self.name = name or (read.name if read is not None else "")
+        if not self.name and not self._address:
+            self.name = _only([each.name for each in sorted(_home().glob("*")) if _is_up(each)], "this machine")
+        self._owned: ExitStack | None = None  # the node of Ray that `up` has started
         self._controller: Any = None
 
-    def up(
-        self,
-        *,
-        nodes: int | None = None,
-        cores: int | None = None,
-        detach: bool = False,
-        replace: bool = False,
-        wait: bool = False,
-    ) -> list[str]:
-        """Make the spec the desired state; what runs and is unchanged is not touched.
+    @property
+    def is_owner(self) -> bool:
+        """Whether the fleet ends with this object."""
+        return self._owned is not None
 
-        Parameters
-        ----------
-        nodes : int
-            Number of nodes to start, for a fleet on this machine that does not run yet; by default that of the spec.
-        cores : int
-            Processor cores of each of them; by default an equal share of this machine's, rounded up.
-        detach : bool
-            Whether a fleet on this machine runs on after `close`, until `down`. On a cluster it always does.
-        replace : bool
-            Whether streams of another file that run under this name may be replaced.
-        wait : bool
-            Whether streams for which there are not enough nodes may wait for nodes that join later.
+    def up(self) -> list[str]:
+        """Make the spec the desired state; returns what is done, a line for each stream.
 
-        Returns
-        -------
-        what is done, a line for each stream
-
-        Raises
-        ------
-        StoreError
-            If the store cannot be used. Nothing is started or changed then.
+        What runs and is unchanged is not touched. If the store cannot be used, nothing is started or changed.
         """
         if self._spec is None:
             raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
-        with self._starting():
-            spec = self._with_store(self._spec)
-            models = _models(spec.streams.values())
-            began = False
-            with ExitStack() as undone:
-                if self._local is not None and not self._local.running:
-                    self._local.start(nodes or spec.nodes, cores, detach=detach)
-                    undone.callback(self._local.stop)
-                    undone.callback(self.disconnect)
-                    began = True
-                self._connect()
-                if self.name not in cluster.fleets():
-                    undone.callback(self._kill_controller)
-                self._start_controller(spec)
-                lines = self._change(
-                    Desired.applied, spec, self._origin, replace_other=replace, models=models, may_wait=wait
+        spec = self._spec
+        if not spec.store:
+            if self._address:
+                raise FleetError(
+                    f'the fleet {self.name} needs a store that all nodes reach: store = "s3://BUCKET/PREFIX"'
                 )
-                undone.pop_all()
-            self.is_owner = self.is_owner or (began and not detach)
-            return lines
+            spec = replace(spec, store=str(self._folder / "store"))
+        Store(spec.store).check()
+        models = _models(spec.streams.values())
+        was_owner = self.is_owner
+        try:
+            if not self._address and not was_owner:
+                self._start_ray()
+            self._connect()
+            self._start_controller(spec)
+            lines: list[str] = self._ask("apply", spec, models)
+        except BaseException:
+            if not was_owner:  # a controller that another one has started runs on
+                self._end_ray()
+            raise
+        return lines
 
     def add(self, spec: StreamSpec) -> list[str]:
         """Add a stream, or change the one of the same name."""
-        lines = self._change(Desired.added, spec, models=_models([spec]))
-        return _about(lines, [spec.name])
+        return _about(self._ask("add", spec, _models([spec])), [spec.name])
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
         """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
-        lines = self._change(Desired.removed, names, may_wait=True)
+        lines = self._ask("remove", names)
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
                 store.stream(name).clear()  # its actor is superseded, if it still runs
         return _about(lines, names)
 
-    def move(self, name: str, node: str) -> str:
-        """Move a stream to a node, where it stays until the node dies or drains."""
-        there, streams = self._node(node), self.status().streams
-        if name in streams and streams[name].state == "ended":
-            raise FleetError(f"{name} has ended: it runs on no node")
-        self._change(Desired.moved, name, there, may_wait=True)
-        before = streams[name].node
-        return f"{name} stays on {node}" if before == node else f"{name} moves from {before or 'no node'} to {node}"
-
     def drain(self, node: str, *, undo: bool = False) -> str:
         """Move all streams from a node and place none there, for example before it is switched off.
 
         Streams wait if the other nodes have no room for them.
         """
-        there = self._node(node)
+        self._connect()
+        known = [each.name for each in nodes() if each.alive]
+        if node not in known:
+            raise FleetError(f"there is no node {node!r}, or it has died: there are {', '.join(known) or 'none'}")
         count = sum(each.node == node for each in self.status().streams.values())
-        self._change(Desired.drained, there, undo=undo, may_wait=True)
+        self._ask("drain", node, undo=undo)
         return f"{node} takes streams again" if undo else f"{node} is draining; streams that leave it: {count}"
 
     def status(self) -> FleetStatus:
@@ -179,75 +185,58 @@ class Fleet:
         answer: FleetStatus = self._ask("status")
         return answer
 
-    def logs(self, name: str, lines: int = 100) -> list[str]:
-        """The last lines that a stream logged on its node."""
-        answer: list[str] = self._ask("logs", name, lines)
-        return answer
-
     def merge(self, *names: str, object: str = UNNAMED) -> Merged:
         """Merge what streams have learned of an object; the streams that follow it then search for it by the result.
 
-        Parameters
-        ----------
-        names : str
-            The streams; by default all that have learned of the object.
-        object : str
-            Name of the object; "" also means the only object of each stream.
+        Without names, all streams that have learned of it are merged. "" is also the only object of each stream.
         """
+        import ray
+        from ray.exceptions import RayTaskError
+
         spec: FleetSpec = self._ask("spec")
         for name in names:
-            if name not in spec.streams:
-                raise FleetError(f"there is no stream {name!r}: the streams are {', '.join(spec.streams) or 'none'}")
-        return merge_streams(spec.store, names or spec.streams, check_name(object), named=bool(names))
+            spec.check_stream(name)
+        # A node has the credentials of the store. A task reserves a core by default, and the streams may have them all.
+        remote: Any = ray.remote
+        task = remote(num_cpus=0)(merge_streams)
+        try:
+            merged: Merged = ray.get(
+                task.remote(spec.store, names or tuple(spec.streams), check_name(object), named=bool(names))
+            )
+        except RayTaskError as error:
+            raise (error.cause if isinstance(error.cause, CatstreamError) else error) from None
+        return merged
 
     def down(self) -> list[str]:
         """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too.
 
-        Returns
-        -------
-        a line for each stream whose last state could not be stored
+        Returns a line for each stream whose last state could not be stored.
         """
-        if self._local is not None and not self._local.running:
-            raise FleetError(f"no fleet {self.name!r} of yours runs on this machine: see catstream fleet status")
-        self.is_owner = False
         deadline = time.monotonic() + DOWN_SECONDS
-        while self._ask("close") and time.monotonic() < deadline:
-            time.sleep(ENDED_SECONDS)
-        unstored: list[str] = self._ask("end")
+        while (left := self._ask("close")) and time.monotonic() < deadline:
+            time.sleep(_LOOK_SECONDS)
+        late = [f"{name}: it did not stop within {DOWN_SECONDS:g} s" for name in left]
+        if late and not self.is_owner:  # whose node ends with them
+            raise FleetError("\n".join([f"the fleet {self.name} is not down yet, run the command again", *late]))
+        unstored: list[str] = late + self._ask("end")
         self._kill_controller()
-        self.disconnect()
-        if self._local is not None:
-            self._local.stop()
+        self._end_ray()
+        deadline = time.monotonic() + _LEAVE_SECONDS
+        while not self._address and _is_up(self._folder) and time.monotonic() < deadline:
+            time.sleep(_LOOK_SECONDS)
         return unstored
 
     @property
     def is_running(self) -> bool:
-        """Whether the cluster of a fleet on this machine still runs.
-
-        Raises
-        ------
-        FleetError
-            If it has ended by itself, for example because its head died.
-        """
-        if self._local is None or self._local.running:
-            return True
-        self.is_owner = False
-        if death := self._local.death:
-            raise FleetError(
-                f"the fleet {self.name} has died with Ray; catstream fleet up continues from the last states: {death}"
-            )
-        return False
-
-    def disconnect(self) -> None:
-        """Disconnect from Ray until the next call of a method; the fleet runs on."""
-        self._controller = None
-        cluster.disconnect()
+        """Whether its controller runs."""
+        self._connect()
+        return actor_name(self.name, "controller") in named_actors()
 
     def close(self) -> None:
-        """Disconnect. A fleet on a cluster, or a detached one, continues; any other ends with this program."""
-        if self.is_owner:
+        """Disconnect. A fleet continues unless this object has started Ray for it: it is stopped then."""
+        if self.is_owner and self.is_running:
             self.down()
-        self.disconnect()
+        self._end_ray()
 
     def __enter__(self) -> Self:
         return self
@@ -255,27 +244,106 @@ class Fleet:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _with_store(self, spec: FleetSpec) -> FleetSpec:
-        """The spec with its store, which was checked, so that nothing is started for a store that cannot be used."""
-        if not spec.store:
-            if self._local is None:
-                raise FleetError(
-                    f'the fleet {self.name} needs a store that all nodes reach: store = "s3://BUCKET/PREFIX"'
+    @property
+    def _folder(self) -> Path:
+        """The folder of the fleet on this machine."""
+        return _home() / self.name
+
+    def _start_ray(self) -> None:
+        """Start a node of Ray on the loopback interface, unless another process has it or is starting it."""
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            file = stack.enter_context((self._folder / "lock").open("w"))
+            deadline = time.monotonic() + _START_SECONDS
+            while not lock(file.fileno()):
+                if (self._folder / "address").exists() or time.monotonic() > deadline:
+                    return
+                time.sleep(_LOOK_SECONDS)
+            (self._folder / "address").unlink(missing_ok=True)  # of one that was killed
+            if not (self._folder / "token").exists():
+                write_atomically(self._folder / "token", secrets.token_hex(32).encode(), mode=0o600)
+            files = stack.enter_context(private_folder())
+            stack.callback(_disconnect)
+            self._init(
+                _node_ip_address="127.0.0.1",
+                _temp_dir=str(files),
+                include_dashboard=False,
+                object_store_memory=_STORE_BYTES,
+            )
+            stack.callback((self._folder / "address").unlink, missing_ok=True)
+            write_atomically(self._folder / "address", _gcs_address().encode(), mode=0o600)
+            self._owned = stack.pop_all()
+
+    def _connect(self) -> None:
+        """Connect this process to the cluster, if it is not connected yet."""
+        if self._owned is not None:
+            return
+        address = self._address
+        if not address:
+            if not _is_up(self._folder):
+                raise FleetError(f"no fleet {self.name!r} of yours runs on this machine: start it (catstream fleet up)")
+            try:
+                address = (self._folder / "address").read_text()
+            except OSError:
+                raise FleetError(f"the fleet {self.name} is starting: try again once it runs") from None
+        host, _, port = address.rpartition(":")
+        try:
+            socket.create_connection((host, int(port)), _REACH_SECONDS).close()
+        except (OSError, ValueError) as error:
+            why = getattr(error, "strerror", None) or "no answer"
+            raise FleetError(
+                f"there is no cluster of Ray at {address!r} ({why}): expected HOST:PORT as `ray start --head` prints it"
+            ) from None
+        self._init(address)
+
+    def _init(self, address: str | None = None, **options: Any) -> None:
+        """Connect to a cluster, or start a node."""
+        if not self._address:
+            os.environ.update(_VARIABLES | {"RAY_AUTH_TOKEN_PATH": str(self._folder / "token")})
+        os.environ.setdefault(
+            "RAY_NUM_REDIS_GET_RETRIES", "2"
+        )  # of 41 s each if the head dies now; Ray's default is 20
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Ray, about its own future
+            import ray
+
+            if ray.is_initialized():
+                if (other := _gcs_address()) != address:
+                    raise FleetError(f"this process uses the cluster at {other}: it can use one cluster only")
+                return
+            try:
+                ray.init(
+                    address or "local", namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR, **options
                 )
-            spec = replace(spec, store=str(self._local.folder / "store"))
-        Store(spec.store).check()
-        return spec
+            except Exception as error:  # Ray has no type for a node that does not start
+                why = str(error).strip().partition("\n")[0]
+                if address is None:
+                    raise FleetError(f"Ray does not start on this machine: {why}") from None
+                raise FleetError(
+                    f"cannot connect to the cluster of Ray at {address}: {why}\nThis machine has to be a node of it "
+                    "(`ray start --address ...`), with the same versions of Python and Ray, and its token "
+                    "(RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH)"
+                ) from None
+
+    def _end_ray(self) -> None:
+        """Disconnect, and end the node that this object has started."""
+        self._controller, owned, self._owned = None, self._owned, None
+        if owned is not None:
+            owned.close()
+        else:
+            _disconnect()
 
     def _start_controller(self, spec: FleetSpec) -> None:
         """Start the controller, if it does not run, on the node whose address the registry has."""
         import ray
 
         options: dict[str, Any] = {}
-        listen = ""
-        if not cluster.is_local():
-            head = ray.get_runtime_context().gcs_address.rpartition(":")[0]
-            registry = spec.registry or f"{head}:{REGISTRY_PORT}"
-            listen, options["resources"] = f"tcp://{registry}", {f"node:{registry.rpartition(':')[0]}": 0.001}
+        if self._address:
+            registry = spec.registry or f"{_gcs_address().rpartition(':')[0]}:{REGISTRY_PORT}"
+            listen, keys = f"tcp://{registry}", spec.keys or str(_home() / spec.name / "keys")
+            options["resources"] = {f"node:{registry.rpartition(':')[0]}": 0.001}
+        else:
+            listen, keys = str(self._folder / "registry"), ""  # it stays if Ray starts the controller again
         self._controller = (
             ray.remote(Controller)
             .options(
@@ -289,7 +357,7 @@ class Fleet:
                 max_concurrency=8,
                 **options,
             )
-            .remote(spec.name, spec.store, listen, spec.keys or str(_home() / spec.name / "keys"))
+            .remote(spec.name, spec.store, listen, keys)
         )
         self._ask("ready")
 
@@ -299,39 +367,6 @@ class Fleet:
         with suppress(ValueError):  # it has gone
             ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
 
-    @contextmanager
-    def _starting(self) -> Iterator[None]:
-        """Wait while another process starts this fleet on this machine."""
-        if self._local is None:
-            yield
-            return
-        self._local.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with (self._local.folder / "starting").open("w") as file:
-            lock(file.fileno(), math.inf)
-            yield
-
-    def _on_this_machine(self) -> LocalCluster:
-        """The cluster of the fleet with the name, or of the only one that runs on this machine."""
-        if not self.name:
-            folders = sorted(_home().glob("*"))
-            self.name = _only([each.name for each in folders if LocalCluster(each).running], "this machine")
-        return LocalCluster(_home() / self.name)
-
-    def _connect(self) -> None:
-        if self._local is None:
-            cluster.connect(self._address)
-        elif address := self._local.address:
-            cluster.connect(address, self._local.variables)
-        elif self._local.running:
-            raise FleetError(f"the fleet {self.name} is starting: try again once catstream fleet status shows it")
-        else:
-            raise FleetError(f"the fleet {self.name} does not run: start it with catstream fleet up")
-
-    def _change(self, method: Callable[..., Desired], *arguments: object, **options: object) -> list[str]:
-        """Let the controller change the desired state by one of its methods."""
-        lines: list[str] = self._ask("change", method.__name__, *arguments, **options)
-        return lines
-
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
         """Call a method of the controller, and wait for its answer."""
         self._connect()
@@ -339,7 +374,8 @@ class Fleet:
         from ray.exceptions import GetTimeoutError, RayError, RayTaskError
 
         if self._controller is None:
-            self.name = self.name or _only(cluster.fleets(), f"the cluster at {self._address}")
+            fleets = [name.removesuffix("/controller") for name in named_actors() if name.endswith("/controller")]
+            self.name = self.name or _only(sorted(fleets), f"the cluster at {self._address}")
             try:
                 self._controller = ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE)
             except ValueError:
@@ -357,18 +393,87 @@ class Fleet:
             what = str(error).partition("\n")[0] or type(error).__name__
         raise FleetError(f"the controller of {self.name} did not do it ({what}): see its log in the folder of Ray")
 
-    def _node(self, name: str) -> Node:
-        """The living node of the cluster with a name."""
-        self._connect()
-        known = {node.name: node for node in cluster.nodes() if node.alive}
-        if name not in known:
-            raise FleetError(f"there is no node {name!r}, or it has died: there are {', '.join(known) or 'none'}")
-        return known[name]
+
+def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -> Merged:
+    """Merge what the newest states of streams in a store have learned of an object, and store the model if it is new.
+
+    Frames are counted once: of streams that share frames, as they continue from one model, one is merged. If the
+    streams are `named`, each has to know the object; otherwise those that do not are left out.
+    """
+    if not name and not named:
+        raise FleetError(
+            "objects without a name may be different ones: name the object (--object NAME), or the streams that show it"
+        )
+    store = Store(url)
+    learned = {stream: found for stream in streams if (found := _learned(store, stream, name, named=named)) is not None}
+    if not learned:
+        raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
+    rows = {stream: sum(tree.rows_seen for tree in each.trees.values()) for stream, each in learned.items()}
+    chosen = disjoint({stream: (set(each.origins), rows[stream]) for stream, each in learned.items()})
+    first, *others = (learned[stream] for stream in chosen)
+    # The name says that the object is the same, so its appearances are not compared.
+    model = (merge([first, *others], force=True) if others else first).to_bytes()
+    models = store.model(name)
+    if (before := models.newest()) is None or before.files["model"] != model:  # followers get each new model
+        models.put({"model": model}, {"streams": chosen})
+    return Merged(model, tuple(chosen), tuple(stream for stream in learned if stream not in chosen))
+
+
+def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
+    """The names of models that share no frames: those of the most streams of frames first, then of the most rows.
+
+    A part is the origins of the trees of a model, one for each stream of frames, and its rows.
+
+    >>> disjoint({"door": ({"a"}, 90), "yard": ({"b"}, 20), "both": ({"a", "c"}, 70)})
+    ['both', 'yard']
+    """
+    chosen: list[str] = []
+    for name in sorted(parts, key=lambda name: (-len(parts[name][0]), -parts[name][1], sorted(parts[name][0]))):
+        if all(parts[name][0].isdisjoint(parts[other][0]) for other in chosen):
+            chosen.append(name)
+    return chosen
+
+
+def _learned(store: Store, stream: str, name: str, *, named: bool) -> Learned | None:
+    """What the newest state of a stream in the store has learned of an object; None if that is nothing."""
+    try:
+        if (newest := store.stream(stream).newest()) is None:
+            raise FleetError("there is no state of it in the store yet")
+        with tempfile.TemporaryDirectory(prefix="catstream-merge-") as folder:
+            state.restore(Path(folder), newest.files)
+            return state.learned(Path(folder), Job.load(Path(folder)).settings, name)
+    except StoreError:
+        raise
+    except (ObjectError, ServiceError) as error:
+        if named:
+            raise FleetError(f"stream {stream}: {error}") from None
+        return None
+
+
+def _gcs_address() -> str:
+    """HOST:PORT of the head of the cluster that this process uses."""
+    import ray
+
+    address: str = ray.get_runtime_context().gcs_address
+    return address
+
+
+def _disconnect() -> None:
+    """Disconnect this process from the cluster, and end a node that it has started."""
+    if (ray := sys.modules.get("ray")) is not None:
+        ray.shutdown()
 
 
 def _home() -> Path:
     """The folder with one for each fleet of this user."""
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+
+
+def _is_up(folder: Path) -> bool:
+    """Whether a process has, or starts, the node of Ray of a fleet on this machine."""
+    with suppress(OSError), (folder / "lock").open() as file:
+        return is_locked(file.fileno())
+    return False
 
 
 def _only(fleets: Sequence[str], place: str) -> str:
@@ -382,11 +487,6 @@ def _only(fleets: Sequence[str], place: str) -> str:
 def _about(lines: Iterable[str], names: Collection[str]) -> list[str]:
     """The lines of a change about some streams."""
     return [line for line in lines if line.partition(":")[0] in names]
-
-
-def _origin(file: Path) -> str:
-    """Machine and path of a file."""
-    return f"{socket.gethostname()}:{file.resolve()}"
 
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:

@@ -1,22 +1,7 @@
-"""The desired state of a fleet: its streams, as a file in TOML describes them.
+"""The desired state of a fleet: its streams, as a file in TOML describes them, and the nodes that they leave.
 
-    name = "site"                      # the default is the name of the file
-    store = "state"                    # a folder, file:///..., or s3://bucket/prefix
-    every = 5.0                        # seconds between two states of a stream in the store
-    nodes = 3                          # nodes that are started if the fleet runs on this machine alone
-    registry = "10.0.0.1:5690"         # where clients ask for the streams of a cluster; the default is its head
-    keys = "keys"                      # folder of the clients' keys on that machine
-
-    [streams.cam-7]
-    source = "rtsp://camera/1"
-    box = [120, 80, 64, 48]            # or boxes = { anna = [...] }, model = "a.safetensors", models = { anna = "..." }
-    settings = { "coreset.size" = 128 }
-    cores = 0.5                        # that Ray reserves for it; the default is 1
-    labels = { site = "north" }        # labels that its node must have
-    follow = ["anna"]                  # objects whose merged model this stream searches for
-
-Relative paths count from the folder of the file. Every error is a `FleetError` that names the stream, or the line of
-a file that is not TOML.
+docs/how-to/fleet.md shows such a file. Relative paths count from its folder. Every error is a `FleetError` that names
+the stream, or the line of a file that is not TOML.
 """
 
 from __future__ import annotations
@@ -29,10 +14,10 @@ import reprlib
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -40,11 +25,9 @@ from msgspec import Meta
 from catstream.box import Box
 from catstream.errors import CatstreamError, FleetError
 from catstream.messages.names import UNNAMED, boxes_by_name, check_name, listed
-from catstream.run.job import Job
+from catstream.run.job import Job, changed_setting
 from catstream.settings import Settings, flat
 from catstream.video.source import is_live
-
-_T = TypeVar("_T")
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
@@ -55,7 +38,6 @@ _FLEET: dict[str, tuple[Any, str]] = {
     "name": (str, "a text"),
     "store": (str, "a text"),
     "every": (Annotated[float, Meta(gt=0, le=3600)], "a number of seconds above 0 and at most 3600"),
-    "nodes": (Annotated[int, Meta(ge=1, le=64)], "a whole number from 1 to 64"),
     "registry": (_HOST_AND_PORT, "HOST:PORT of a node, as in 10.0.0.1:5690"),
     "keys": (str, "a text"),
     "streams": (dict[str, Any], "tables [streams.NAME]"),
@@ -69,7 +51,7 @@ _STREAM: dict[str, tuple[Any, str]] = {
     "model": (str, "a text"),
     "models": (dict[str, str], 'a table of texts, for example { anna = "anna.safetensors" }'),
     "settings": (dict[str, Any], 'a table, for example { "coreset.size" = 128 }'),
-    "cores": (_CORES, "a number above 0 (catstream fleet status shows what it uses)"),
+    "cores": (_CORES, "a number above 0"),
     "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
     "follow": (str | list[Annotated[str, Meta(min_length=1)]], 'names of objects, for example ["anna"]'),
 }
@@ -91,16 +73,7 @@ class StreamSpec:
     labels    labels that its node must have
     follow    objects whose merged model it searches for
 
-    Raises
-    ------
-    FleetError
-        If a value is not valid.
-
-    Examples
-    --------
-    >>> cam = StreamSpec("cam-7", "rtsp://camera/1", boxes={"": Box(120, 80, 64, 48)})
-    >>> cam.digest == StreamSpec("cam-7", "rtsp://camera/1", boxes={"": Box(120, 80, 64, 48)}, cores=2.0).digest
-    True
+    It raises FleetError if a value is not valid.
     """
 
     name: str
@@ -172,34 +145,28 @@ class FleetSpec:
     name     name of the fleet, with the rules of a stream's name
     store    folder or URL of the states; "" for a folder that belongs to the fleet
     every    seconds between two states of a stream in the store
-    nodes    how many nodes are started for a fleet on one machine alone
     registry HOST:PORT where clients ask for the streams; "" for the head of the cluster, and the default port
     keys     folder of the clients' keys on that machine; "" for the one of the fleet's name
     streams  the streams by name
+    draining names of the nodes that streams leave; not in the file
     """
 
     name: str
     store: str = ""
     every: float = 5.0
-    nodes: int = 1
     registry: str = ""
     keys: str = ""
     streams: dict[str, StreamSpec] = field(default_factory=dict)
+    draining: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         check_fleet_name(self.name, "fleet")
         with _errors_in(f"the fleet {self.name}"):
-            _checked({each.name: getattr(self, each.name) for each in fields(self)}, _FLEET)
+            _checked({key: getattr(self, key) for key in _FLEET}, _FLEET)
 
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
-        """Read the file of a fleet.
-
-        Raises
-        ------
-        FleetError
-            If it cannot be read, has no streams, or has a key or value that is not valid.
-        """
+        """Read the file of a fleet; FleetError if it has no streams, or has a key or value that is not valid."""
         try:
             text = path.read_text(encoding="utf-8")
         except OSError as error:
@@ -223,6 +190,27 @@ class FleetSpec:
             streams = {name: StreamSpec.parse(name, table, folder) for name, table in values["streams"].items()}
             return cls(**values | {"streams": streams})
 
+    def check_follows(self, earlier: FleetSpec) -> None:
+        """Raise FleetError if this cannot take the place of an earlier spec of the fleet: its states stay in use."""
+        if self.store != earlier.store:
+            raise FleetError(
+                f"the fleet {self.name} keeps its state in {earlier.store!r}, and the file says {self.store!r}: end it "
+                "first (catstream fleet down), and copy the state"
+            )
+        for name in self.streams.keys() & earlier.streams.keys():
+            before, after = (Settings.from_values(each.streams[name].settings) for each in (earlier, self))
+            if changed := changed_setting(before, after):
+                raise FleetError(
+                    f"nothing was changed: {name} was started with {changed}: keep the setting, or first remove the "
+                    f"stream with what it has learned (catstream fleet remove {name} --forget)"
+                )
+
+    def check_stream(self, name: str) -> None:
+        """Raise FleetError if there is no such stream."""
+        if name not in self.streams:
+            known = ", ".join(self.streams) or "none"
+            raise FleetError(f"there is no stream {name!r} in the fleet {self.name}: there are {known}")
+
     def changes(self, new: FleetSpec, ended: Collection[str], *, are_running: bool) -> list[str]:
         """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
         same = "is unchanged" if are_running else "continues from its last state"
@@ -241,15 +229,15 @@ class FleetSpec:
         return lines + [f"{key} changes at the next start, after catstream fleet down" for key in later if are_running]
 
 
-def to_json(stored: object) -> bytes:
-    """A spec, or what contains one, as JSON. It contains the sources with their passwords."""
-    return msgspec.json.encode(stored, enc_hook=str)
+def to_json(spec: FleetSpec) -> bytes:
+    """A spec as JSON. It contains the sources with their passwords."""
+    return msgspec.json.encode(spec, enc_hook=str)
 
 
-def from_json(data: bytes, kind: type[_T]) -> _T:
+def from_json(data: bytes) -> FleetSpec:
     """Read what `to_json` wrote; raise FleetError if it is damaged."""
     try:
-        return msgspec.json.decode(data, type=kind, dec_hook=lambda part, value: part(value))
+        return msgspec.json.decode(data, type=FleetSpec, dec_hook=lambda part, value: part(value))
     except (msgspec.DecodeError, RecursionError, CatstreamError):
         raise FleetError("the stored streams of the fleet are damaged: apply the fleet file again") from None
 

@@ -8,7 +8,6 @@ Below each of these folders, only the newest holder decides what comes next:
 
     <token>/claim     the claim of a holder; the token is one higher than that of every earlier claim
     <token>/<n>       its states, every few seconds: n = 1, 2, 3 ...
-    <token>/removed   the stream was removed by the holder: nobody reads the states of lower tokens any more
 
     claim   create the claim of the highest token + 1; this fails if another process has it already: try the next one
     write   create the next state under the own token, then list the folder: if there is a claim with a higher token,
@@ -24,36 +23,211 @@ from, and are as good as any. What can fail besides:
     a write ends half way           The state is damaged, and is passed over.
 
 A holder removes all states but the newest two, and the older claims that have no state any more. Of a stream that was
-removed, a claim stays, so that a holder that comes back later finds that it was superseded. See
+removed, a state that says so stays, and hides what a holder writes that comes back later. See
 docs/decisions/0078-fencing-by-name.md.
 
-A state contains the source of its stream, which may contain a password: files are readable by their owner only, and a
-bucket has to be private.
+A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
+bucket has to be private. The credentials of S3 come from the environment, the machine's role, or ~/.aws; the address of
+another server from AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import re
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import timedelta
+from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import numpy as np
 
-from catstream.errors import FencedError, ProtocolError, StoreError
-from catstream.fleet.objects import Objects
+from catstream.errors import FencedError, FleetError, ProtocolError, StoreError, require_extra
 from catstream.fleet.spec import check_fleet_name
 from catstream.messages import storage
 from catstream.messages.names import UNNAMED, check_name
 
-_CLAIM, _REMOVED = "claim", "removed"
+STORE_SECONDS = 10.0  # limit of a request to a server
+_CONNECT_SECONDS = 3.0  # limit to connect to it
+
+_FOLDERS = ("streams", "models", "fleet")
+_CLAIM = "claim"
 _DIGITS = 8  # of a token and of the number of a state in their names
 _KEPT = 2  # newest states
 _ATTEMPTS = 20  # to claim, or to read the newest state, while other processes change the folder
 _LONGEST_HOLDER = 200
 _NO_NAME = "-"  # folder of the object without a name: no name begins with a dash
+_PROBE = "created-exclusively"
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+_CODE = re.compile(r"<Code>(\w{1,64})</Code>")  # in an answer of S3
+_NUMBER = re.compile(r"\(os error ([0-9]+)\)")  # in an error of obstore
+_ROLE = "/latest/"  # in the address at which a machine asks for the credentials of its role
+
+
+class Objects:
+    """The objects below a folder or a prefix of a bucket: created exclusively and never changed.
+
+    Every method raises StoreError if the store cannot be reached or is full; a call that creates an object may
+    nevertheless have created it. No message contains a credential.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url, self._folder = _parse(url)
+        require_extra("fleet")
+        if self._folder is None:
+            require_extra("s3")
+        self._checked = False
+
+    def __repr__(self) -> str:
+        return f"Objects({self._url!r})"
+
+    def make(self) -> None:
+        """Create the folder of the store, and check it. A bucket has to exist."""
+        if self._folder is not None:
+            with self._errors("", "created"):
+                self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._check()
+
+    def create(self, name: str, data: bytes) -> None:
+        """Create an object; FileExistsError if there is one of this name."""
+        if not self._checked:
+            self._check()
+        self._put(name, data)
+
+    def read(self, name: str) -> bytes:
+        """Return the content of an object; FileNotFoundError if there is none."""
+        with self._errors(name, "read"):
+            return bytes(self._store.get(name).bytes())
+
+    def names(self, folder: str) -> list[str]:
+        """Return the names of all objects below a folder, without the name of the folder."""
+        with self._errors(folder, "listed"):
+            return [each["path"][len(folder) + 1 :] for each in self._store.list(folder).collect()]
+
+    def remove(self, name: str) -> None:
+        """Remove an object, if it exists, and beside it in a folder the parts that killed processes left."""
+        with contextlib.suppress(FileNotFoundError), self._errors(name, "removed"):
+            if self._folder is not None:
+                for part in (self._folder / name).parent.glob("*#*"):  # as obstore names what it writes
+                    part.unlink()
+            self._store.delete(name)
+
+    @cached_property
+    def _store(self) -> Any:
+        """The folder, or the bucket, to which requests are sent once: the caller writes a newer state later."""
+        from obstore.store import LocalStore, from_url
+
+        if self._folder is not None:
+            if not self._folder.is_dir():
+                raise StoreError(f"the store {self._url} is not a folder on this machine: is its file system mounted?")
+            return LocalStore(self._folder, automatic_cleanup=True)
+        limits: Any = {"timeout": timedelta(seconds=STORE_SECONDS)}
+        limits |= {"connect_timeout": timedelta(seconds=_CONNECT_SECONDS)}
+        return from_url(
+            self._url,
+            client_options=limits | {"allow_http": True},  # at an address that begins with http
+            retry_config={"max_retries": 0},
+            credential_provider=_credentials(),
+            disable_bulk_delete=True,  # one object each time, and not all servers have it
+        )
+
+    def _put(self, name: str, data: bytes) -> None:
+        from obstore.exceptions import AlreadyExistsError
+
+        with self._errors(name, "written"):
+            try:
+                self._store.put(name, data, mode="create")
+            except AlreadyExistsError:  # also: another process creates it at this moment
+                raise FileExistsError(name) from None
+
+    def _check(self) -> None:
+        """Raise StoreError if the store is not there, or does not create objects exclusively."""
+        with self._errors(_PROBE, "written"):
+            if self._folder is not None and self._store:
+                for name in _FOLDERS:
+                    (self._folder / name).mkdir(mode=0o700, exist_ok=True)
+                self._checked = True
+        for _ in range(2):
+            if self._checked:
+                return
+            try:
+                self._put(_PROBE, b"")
+            except FileExistsError:
+                self._checked = True
+        if not self._checked:
+            raise StoreError(
+                f"the store {self._url} is on a server that ignores If-None-Match, so that two processes could write "
+                "the state of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
+            )
+
+    @contextlib.contextmanager
+    def _errors(self, name: str, what: str) -> Iterator[None]:
+        """In the block, every error becomes a StoreError, except that an object exists, or does not exist."""
+        try:
+            yield
+        except StoreError:
+            raise
+        except Exception as error:
+            is_about_one = isinstance(error, FileNotFoundError | FileExistsError) and what != "created"
+            if is_about_one and "NoSuchBucket" not in str(error):
+                raise type(error)(name) from None
+            place = f"{name} of the store" if name else "the store"
+            raise StoreError(f"{place} {self._url} cannot be {what}: {_trouble(error)}") from None
+
+
+def _credentials() -> Any:
+    """What reads ~/.aws: profiles, roles, sessions; None if there is nothing, or the environment has a key."""
+    variables = {"AWS_SHARED_CREDENTIALS_FILE": "~/.aws/credentials", "AWS_CONFIG_FILE": "~/.aws/config"}
+    files = [Path(os.environ.get(name, usual)).expanduser() for name, usual in variables.items()]
+    if "AWS_ACCESS_KEY_ID" in os.environ or not ("AWS_PROFILE" in os.environ or any(file.exists() for file in files)):
+        return None
+    from obstore.auth.boto3 import Boto3CredentialProvider  # half a second of imports
+
+    return Boto3CredentialProvider()
+
+
+def _parse(url: str) -> tuple[str, Path | None]:
+    """A URL as it is shown, and its folder. No error shows the URL: it may contain a password."""
+    parts = urlsplit(url)
+    if "://" not in url:
+        return str(Path(url).resolve()), Path(url).resolve()
+    if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
+        raise FleetError(
+            "the URL of the store contains a user, a password or a query: give credentials in the environment or in "
+            "~/.aws/credentials, and s3://bucket/prefix only"
+        )
+    if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
+        return _parse(parts.path)
+    if parts.scheme == "s3" and _BUCKET.fullmatch(parts.netloc):
+        return f"s3://{parts.netloc}/{parts.path.strip('/')}".rstrip("/"), None
+    raise FleetError("the URL of the store is not valid: expected a folder, file:///folder or s3://bucket/prefix")
+
+
+def _trouble(error: Exception) -> str:
+    """Describe an error and its remedy without the text of the error, which may contain a credential."""
+    text = str(error)
+    code = found[1] if (found := _CODE.search(text)) else ""
+    if code == "NoSuchBucket":
+        return "there is no such bucket: create it"
+    if code in ("PermanentRedirect", "AuthorizationHeaderMalformed") or "incorrectly configured region" in text:
+        return "the bucket is in another region: set AWS_REGION"
+    if code:
+        return f"the server answered {code}: check the bucket and its permissions"
+    if _ROLE in text or type(error).__module__.startswith("botocore") or isinstance(error, ValueError):
+        return "no credentials were found: set AWS_PROFILE, or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+    if "kind: Timeout" in text:
+        return f"no answer within {STORE_SECONDS:g} s: check the network and the server"
+    number = error.errno if isinstance(error, OSError) else int(found[1]) if (found := _NUMBER.search(text)) else None
+    if number is None:
+        return f"{type(error).__name__}: check the network and the server"
+    is_full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return f"{os.strerror(number)}: {'free some space there' if is_full else 'check the folder, or the server'}"
 
 
 class _Place(NamedTuple):
@@ -64,39 +238,31 @@ class _Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Listing:
+class Contents:
     """What is below the folder of a stream.
 
-    claims   tokens of the claims
-    states   places of the states
-    removed  highest token under which the stream was removed; 0 if it never was
+    claims  tokens of the claims
+    states  places of the states
     """
 
     claims: set[int]
     states: set[_Place]
-    removed: int
 
     @classmethod
-    def of(cls, names: Iterable[str]) -> Listing:
+    def of(cls, names: Iterable[str]) -> Contents:
         """The listing of these names, each without the folder; names of other things are passed over.
 
-        >>> Listing.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
-        Listing(claims={1}, states={_Place(token=1, number=7)}, removed=0)
+        >>> Contents.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
+        Contents(claims={1}, states={_Place(token=1, number=7)})
         """
-        claims, states, removed = set[int](), set[_Place](), 0
+        claims, states = set[int](), set[_Place]()
         for name in names:
             token, _, rest = name.partition("/")
             if token.isdecimal() and rest.isdecimal():
                 states.add(_Place(int(token), int(rest)))
             elif token.isdecimal() and rest == _CLAIM:
                 claims.add(int(token))
-            elif token.isdecimal() and rest == _REMOVED:
-                removed = max(removed, int(token))
-        return cls(claims, states, removed)
-
-    def newest(self, after: int = 0) -> list[_Place]:
-        """The places of the states that may be read, those of holders with a token above `after`, newest first."""
-        return sorted((place for place in self.states if place.token > max(after, self.removed)), reverse=True)
+        return cls(claims, states)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +280,7 @@ class Generation:
 
 
 class States:
-    """The states below a folder of the store.
-
-    Every method raises StoreError if the store cannot be reached or is full; the call may be repeated.
-    """
+    """The states below a folder of the store. Every method raises StoreError if the store fails; it may be repeated."""
 
     def __init__(self, objects: Objects, folder: str) -> None:
         self._objects = objects
@@ -127,8 +290,9 @@ class States:
         """Return the newest state of a holder with a token above `after`. If there is none, no state is read."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
-                states = (self._read(place) for place in self.listed().newest(after))
-                return next((state for state in states if state is not None), None)
+                places = sorted((place for place in self.listed().states if place.token > after), reverse=True)
+                state = next(filter(None, map(self._read, places)), None)
+                return None if state is None or state.facts.get("removed") else state
         raise self._busy("read")
 
     def claim(self, holder: str) -> Claim:
@@ -138,9 +302,7 @@ class States:
             token = max([0, *found.claims, *(place.token for place in found.states)]) + 1
             with contextlib.suppress(FileExistsError):  # another process claims at this moment
                 self._objects.create(self._name(token, _CLAIM), holder[:_LONGEST_HOLDER].encode())
-                with contextlib.suppress(StoreError):  # the next claim does it
-                    self._objects.tidy(self.folder)
-                return Claim(self, token, holder, self.newest(), found.removed)
+                return Claim(self, token, holder, self.newest())
         raise self._busy("claimed")
 
     def put(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
@@ -152,15 +314,14 @@ class States:
 
     def clear(self) -> None:
         """Remove all states. A process that still holds them is superseded: it can no longer write."""
-        if self.listed().newest():
-            token = self.claim(_this_process()).token
-            with contextlib.suppress(FileExistsError):
-                self._objects.create(self._name(token, _REMOVED), b"")
-            self.remove_up_to(token, self.listed(), kept=0)
+        if self.newest() is not None:
+            claim = self.claim(_this_process())
+            claim.write({}, {"removed": True})
+            self.remove_up_to(claim.token, self.listed(), kept=1)
 
-    def listed(self) -> Listing:
+    def listed(self) -> Contents:
         """What is below the folder now."""
-        return Listing.of(self._objects.names(self.folder))
+        return Contents.of(self._objects.names(self.folder))
 
     def holder(self, token: int) -> str:
         """The name of the holder with a token, for messages."""
@@ -173,21 +334,15 @@ class States:
         arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
         self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
 
-    def remove_up_to(self, token: int, found: Listing, kept: int) -> None:
-        """Remove the states up to a token but the newest ones, and the claims below it that have none any more.
-
-        Parameters
-        ----------
-        found : what is below the folder
-        """
+    def remove_up_to(self, token: int, found: Contents, kept: int) -> None:
+        """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
         before = sorted(place for place in found.states if place.token <= token)
         stay = before[len(before) - kept :]
         for place in before[: len(before) - kept]:
             self._objects.remove(self._name(*place))
         for old in sorted(found.claims - {place.token for place in stay}):
             if old < token:
-                for rest in (_REMOVED, _CLAIM):
-                    self._objects.remove(self._name(old, rest))
+                self._objects.remove(self._name(old, _CLAIM))
 
     def _name(self, token: int, rest: str | int) -> str:
         return f"{self.folder}/{token:0{_DIGITS}}/{rest if isinstance(rest, str) else f'{rest:0{_DIGITS}}'}"
@@ -210,11 +365,10 @@ class Claim:
 
     token    higher than that of every earlier claim
     state    the state to continue from; None if there is none
-    removed  token under which the stream was removed last; 0 if it never was
     """
 
-    def __init__(self, states: States, token: int, holder: str, state: Generation | None, removed: int) -> None:
-        self.token, self.state, self.removed = token, state, removed
+    def __init__(self, states: States, token: int, holder: str, state: Generation | None) -> None:
+        self.token, self.state = token, state
         self._states, self._holder = states, holder
         self._number = 0
         self._fenced: FencedError | None = None
@@ -223,35 +377,26 @@ class Claim:
         return f"Claim({self._states.folder!r}, token={self.token})"
 
     def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Write a state, and remove states that are no longer needed.
+        """Write a state, and remove those that are no longer needed.
 
-        Parameters
-        ----------
-        files : contents by name
-        facts : JSON about the state: frame, time ...
-
-        Raises
-        ------
-        FencedError
-            If another process has claimed the stream. Every later call raises it too.
-        StoreError
-            If the store cannot be reached or is full. The caller continues, and writes a newer state later.
+        Raises FencedError if another process has claimed the stream, and again in every later call; StoreError if the
+        store fails: the caller continues, and writes a newer state later.
         """
         if self._fenced is not None:
             raise self._fenced
         self._number += 1  # whatever becomes of this state, its number is not used again
         with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
             self._states.create(_Place(self.token, self._number), files, facts)
-        found = self._states.listed()
-        self._check(found.claims)
+        found = self.check()
         with contextlib.suppress(StoreError):  # they are removed after the next write
             self._states.remove_up_to(self.token, found, _KEPT)
 
-    def _check(self, claims: set[int]) -> None:
+    def check(self) -> Contents:
         """Raise FencedError if there is a claim with a higher token, or this one was removed."""
-        if self.token in claims and max(claims) == self.token:
-            return
-        newer = self._states.holder(max(claims, default=0))
+        found = self._states.listed()
+        if self.token in found.claims and max(found.claims) == self.token:
+            return found
+        newer = self._states.holder(max(found.claims, default=0))
         self._fenced = FencedError(
             f"{self._states.folder} was claimed by {newer} after {self._holder} (token {self.token}): "
             f"{self._holder} may not write it any more, and has to stop"
@@ -262,16 +407,8 @@ class Claim:
 class Store:
     """The store of a fleet: the states of its streams, its desired state, and its merged models.
 
-    Parameters
-    ----------
-    url : folder, file:///folder or s3://bucket/prefix; the folder has to exist, or is made by `check`
-
-    Raises
-    ------
-    FleetError
-        If the URL is not valid, or contains credentials.
-    MissingExtraError
-        If a package is not installed that it needs.
+    The URL is a folder, file:///folder or s3://bucket/prefix. The folder has to exist, or is made by `check`. It raises
+    FleetError if the URL is not valid, or contains credentials.
     """
 
     def __init__(self, url: str) -> None:
@@ -281,13 +418,7 @@ class Store:
         return repr(self._objects).replace("Objects", "Store")
 
     def check(self) -> None:
-        """Check that the store can be used; a folder is created, if it does not exist.
-
-        Raises
-        ------
-        StoreError
-            If it cannot.
-        """
+        """Create the folder, if it does not exist, and raise StoreError if the store cannot be used."""
         self._objects.make()
 
     @property

@@ -50,8 +50,8 @@ LARGEST_GIVEN_MODEL = 63 << 20
 #: Bytes at most of all saved models that objects begin with in one frame: one message contains them.
 LARGEST_GIVEN_MODELS = 200 << 20
 
-#: The state of a stream of a fleet: "waiting" is for a box, "unplaced" is without a node that fits.
-StreamState = Literal["starting", "running", "waiting", "paused", "moving", "stopping", "unplaced", "failed", "ended"]
+#: The state of a stream of a fleet: "waiting" is for a box.
+StreamState = Literal["starting", "running", "waiting", "paused", "moving", "stopping", "failed", "ended"]
 
 NodeState = Literal["alive", "draining", "dead"]
 
@@ -174,54 +174,24 @@ class Features:
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
-    """Acknowledges the messages of an acknowledged channel, receiver -> sender.
-
-    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops them
-    taken     all messages up to this one have been processed by the receiver
-    versions  version of the newest Sample of each object that has one, by name
-    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
-    """
-
-    seq: Integer
-    taken: Integer
-    versions: ByObject[Integer] = field(default_factory=dict)
-    unsaved: Integer = 0
-
-
-@dataclass(frozen=True, slots=True)
-class ObjectPosition:
-    """The part of `Position` for one object.
-
-    box       box in which it was last found
-    version   version of its newest Sample, 0 before the first
-    detector  its detector state of message `seq`, None if it had none
-    """
-
-    box: Box | None = None
-    version: Integer = 0
-    detector: DetectorState | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Position:
-    """The position at which a stream continues: the answer of a receiver to each new connection.
+    """How far the receiver of an acknowledged channel is, receiver -> sender.
 
-    seq      the last message that is stored, 0 in a new stream: the sender continues with the next one
-    frame    number of its frame
-    objects  the part of each object of that message, by name; empty in a new stream
-    unsaved  how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops its copies
+    taken     all messages up to this one have been processed
+    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    versions  version of the newest Sample of each object that has one, by name
+    again     whether the sender has to send all messages after `taken` again, as they may be lost
+    states    for a sender that was restarted: the state of each object's detector after the message that it asked for,
+              or after the nearest one that is known, by name
     """
 
     seq: Integer = 0
-    frame: Integer = 0
-    objects: ByObject[ObjectPosition] = field(default_factory=dict)
+    taken: Integer = 0
     unsaved: Integer = 0
-
-    @property
-    def versions(self) -> dict[str, int]:
-        """Version of the newest Sample of each object that has one, by name."""
-        return {name: each.version for name, each in self.objects.items() if each.version}
+    versions: ByObject[Integer] = field(default_factory=dict)
+    again: bool = False
+    states: ByObject[DetectorState] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -509,46 +479,33 @@ class StreamStatus:
     """The state of one stream of a fleet: where it runs, and how it is.
 
     name            name of the stream, unique in its fleet
-    state           "waiting" for a box, "unplaced" if it fits on no node, "moving" between two nodes, "stopping" if it
-                    is to run on none
+    state           "waiting" for a box, "moving" between two nodes, "stopping" if it is to run on none
     node            name of the node on which it runs, empty if it runs on none
     source          the video source without user and password
     endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
     server          public key of the sockets of its pipeline, empty if the pipeline has no keys
     token           fencing token of its pipeline: each pipeline that is started for the stream has a larger one
-    began           token of the pipeline that began the stream again, without the state of the one before it, so that
-                    frames count from 0 again; 0 if none did
+    live            whether the source is live: frames that were lost are not repeated, and their numbers are used again
     frame           number of the newest frame that was tracked
-    rate            tracked frames per second
-    skipped         frames of a live source that were not tracked, because the pipeline was too slow
-    cores           processor cores that it uses, as measured; 0 before the first measurement
+    skipped         frames of a live source that this pipeline did not track, because it was too slow
     models          version of the newest model of each object that has one, by name
-    restarts        how many times it was started again after a failure
-    lost_frames     frames of a live source from the last state in the store to the first frame after it, when the
-                    stream continued after failures and moves; their numbers are not used again
-    lost_seconds    duration of these frames
-    stored_seconds  seconds since its newest state in the store was written; None if there is none
+    stored_seconds  seconds since its state and that in the store were the same; None if there is none
     trouble         description of a problem, empty if there is none
     """
 
-    name: Text
+    name: str
     state: StreamState
-    node: Text = ""
-    source: Text = ""
-    endpoint: Text = ""
-    server: Text = ""
-    token: Integer = 0
-    began: Integer = 0
-    frame: Integer = 0
-    rate: Number = 0.0
-    skipped: Integer = 0
-    cores: Number = 0.0
-    models: ByObject[Integer] = field(default_factory=dict)
-    restarts: Integer = 0
-    lost_frames: Integer = 0
-    lost_seconds: Number = 0.0
-    stored_seconds: Number | None = None
-    trouble: Text = ""
+    node: str = ""
+    source: str = ""
+    endpoint: str = ""
+    server: str = ""
+    token: int = 0
+    live: bool = False
+    frame: int = 0
+    skipped: int = 0
+    models: dict[str, int] = field(default_factory=dict)
+    stored_seconds: float | None = None
+    trouble: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -559,25 +516,23 @@ class NodeStatus:
     state    "draining" if its streams are moved away and none is placed on it
     address  name or address of the machine
     cores    processor cores that streams may use
-    used     cores that the streams placed on it need
+    used     cores that are reserved for the streams on it
     labels   labels of the node, by name
-    streams  number of streams placed on it
-    trouble  description of a problem, empty if there is none
+    streams  number of streams on it
     """
 
-    name: Text
+    name: str
     state: NodeState
-    address: Text = ""
-    cores: Number = 0.0
-    used: Number = 0.0
-    labels: ByText[Text] = field(default_factory=dict)
-    streams: Integer = 0
-    trouble: Text = ""
+    address: str = ""
+    cores: float = 0.0
+    used: float = 0.0
+    labels: dict[str, str] = field(default_factory=dict)
+    streams: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class FleetStatus:
-    """The state of a fleet. It may have more streams than one message holds, and is transmitted as `Listing`s.
+    """The state of a fleet.
 
     name     name of the fleet
     time     seconds since the epoch (1970)
@@ -597,29 +552,19 @@ class Question:
 
     id      unique for each question
     stream  name of the one stream that it is about; empty for all streams and nodes
-    after   only streams and nodes whose names sort after this one are listed; empty for the first part
     """
 
     id: Text
     stream: Text = ""
-    after: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Listing:
     """The answer to a Question, controller of the fleet -> its sender.
 
-    id       id of the question
-    fleet    name of the fleet
-    time     seconds since the epoch (1970)
-    streams  state of the streams, by name
-    nodes    state of the nodes, by name
-    more     whether there are more: the next question has the last name of this listing as `after`
+    id      id of the question
+    fleet   the state of the fleet as JSON, of the stream that the question is about alone
     """
 
     id: Text
-    fleet: Text
-    time: Number
-    streams: ByText[StreamStatus] = field(default_factory=dict)
-    nodes: ByText[NodeStatus] = field(default_factory=dict)
-    more: bool = False
+    fleet: Annotated[bytes, Meta(max_length=15 << 20)]

@@ -18,7 +18,6 @@ import msgspec
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
-from catstream.messages.kinds import Position
 from catstream.messages.names import UNNAMED, check_count, check_name, listed
 from catstream.settings import Settings
 
@@ -68,15 +67,13 @@ class Job:
     size      width and height of a frame, None if that is not known yet
     started   seconds since 1970 at which the run first started
     results   files that `catstream track` writes
-    read      the last track that the program of the run has received, None while it runs and if it was killed
+    paused    whether the run starts paused, until the command `resume`
 
     The others hold for one start of the run, and are not in the copy that is kept:
 
     endpoint  where the processes meet; the setting of the same name if this is empty
     state     folder of the checkpoints and of the desired state; None if nothing is kept
     resume    whether the processes continue from that state
-    paused    whether the run starts paused
-    record    file that the compressor records all messages to
     run       id of this start of the run, which its messages carry; empty if the processes were started by hand
     owned     whether the process that started the run receives every track on the channel `results`
     since     value of `time.monotonic` from which the times of a live source count; None for its first frame
@@ -90,12 +87,10 @@ class Job:
     size: tuple[int, int] | None = None
     started: float = 0.0
     results: Results = Results()
-    read: Position | None = None
+    paused: bool = False
     endpoint: str = ""
     state: Path | None = None
     resume: bool = False
-    paused: bool = False
-    record: Path | None = None
     run: str = ""
     owned: bool = False
     since: float | None = None

@@ -1,8 +1,8 @@
 """The state of a pipeline on disk: what it needs to continue after a power cut.
 
     DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.run.job`
-    DIR/desired_state.json  what was commanded: see `catstream.services.desired`
-    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.services.model_files`
+    DIR/desired_state.json  what was commanded: see `catstream.services.decisions`
+    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.services.outputs`
     DIR/trees/              the compressor's checkpoints: see `catstream.compression.checkpoint_store`
 
 A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that
@@ -22,7 +22,6 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.errors import CatstreamError, ObjectError, ServiceError
 from catstream.messages import storage
-from catstream.messages.kinds import Position
 from catstream.messages.names import UNNAMED, listed
 from catstream.run.job import Job
 from catstream.run.learned import Learned
@@ -48,9 +47,9 @@ def began(folder: Path) -> bool:
     return Job.is_in(folder) or (folder / TREES).exists()
 
 
-def position(folder: Path) -> Position:
-    """The position of the newest valid checkpoint: where the run is resumed."""
-    return CheckpointStore(folder / TREES).position()
+def last_seq(folder: Path) -> int:
+    """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
+    return CheckpointStore(folder / TREES).seq()
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
@@ -110,27 +109,6 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
             raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 
 
-def skip(folder: Path, settings: Settings, seq: int, frames: int) -> int:
-    """Count frames of a live source as lost: the numbers continue after them.
-
-    Parameters
-    ----------
-    seq : number of the last message that is known; that of the newest checkpoint counts if it is higher
-    frames : how many were lost after that message
-
-    Returns
-    -------
-    how many there are after the newest checkpoint
-    """
-    store = CheckpointStore(folder / TREES)
-    forest = store.load(settings)
-    lost = max(seq, forest.seq) + frames - forest.seq
-    forest.skip(lost)
-    if not store.save(forest):
-        raise ServiceError(f"cannot keep the state in {str(folder)!r}: {store.trouble}")
-    return lost
-
-
 @contextlib.contextmanager
 def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
     """Lock a folder for this process alone; the folder is made if it does not exist.
@@ -158,12 +136,8 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def begun(folder: Path, resumed: Job | None, job: Job, start: Position) -> Iterator[None]:
-    """Lock the state folder, and store the job there if it is new or has changed.
-
-    If the newest checkpoint is ahead of the start, as after Ctrl-C, the one before is used: it has the state of the
-    detectors after the same frame as the trees.
-    """
+def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
+    """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
         if resumed is None and began(folder):
             raise ServiceError(
@@ -171,7 +145,6 @@ def begun(folder: Path, resumed: Job | None, job: Job, start: Position) -> Itera
             )
         if job != resumed:
             job.save(folder)
-        CheckpointStore(folder / TREES).go_back(start.seq)
         yield
 
 

@@ -7,9 +7,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from catstream.box import Box
 from catstream.errors import VideoError
-from catstream.messages.kinds import ObjectPosition, Position
 from catstream.messages.storage import writing
 from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
 from catstream.sinks.track_log import is_log, read_frames, whole_frames
@@ -59,17 +57,11 @@ class RunFiles:
                     raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
                 check_file(Path(place), may_exist=overwrite or continued, source=source, made=self.output)
 
-    def position(self) -> Position | None:
-        """Return the position of the last frame that the log holds whole; None if there is to be no log."""
+    def position(self) -> int | None:
+        """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log."""
         if not self._logs():
             return None
-        frames = 0
-        boxes: dict[str, Box | None] = {}
-        objects: list[str] = []
-        for frame, _ in whole_frames(self._logs()[0]):
-            frames, objects = frame.number + 1, [track.object for track in frame.tracks]
-            boxes |= {track.object: track.box for track in frame.tracks if track.box is not None}
-        return Position(frames, max(frames - 1, 0), {name: ObjectPosition(boxes.get(name)) for name in objects})
+        return max((frame.number + 1 for frame, _ in whole_frames(self._logs()[0])), default=0)
 
     def make_folder(self) -> None:
         """Make the folder of the results, in which other files of the run may be, too."""

@@ -325,5 +325,5 @@ class FleetDashboard(Parts):
 
 def _shown(status: StreamStatus | NodeStatus) -> dict[str, Any]:
     """Return what the page shows of a stream or a node: neither the address nor a key of a pipeline."""
-    hidden = ("name", "endpoint", "server", "token", "began")
+    hidden = ("name", "endpoint", "server", "token")
     return {field.name: getattr(status, field.name) for field in fields(status) if field.name not in hidden}

@@ -1,14 +1,15 @@
-"""Acknowledged channels (`features`, `results`): every message arrives once and in order, whichever side is restarted.
+"""The acknowledged channel (`features`): every message arrives once and in order, whichever side is restarted.
 
 The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N;
 `catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to sockets and to the
-clock.
+clock. A frame without content asks for the position; one of digits also for the states after that message.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from time import monotonic
 from typing import Protocol, TypeVar
@@ -16,13 +17,14 @@ from typing import Protocol, TypeVar
 import zmq
 
 from catstream.errors import ServiceError
-from catstream.messages.kinds import End, Position, Stored
+from catstream.messages.kinds import DetectorState, End, Position
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.go_back_n import HELLO, PATIENCE_SECONDS, Deliver, ReceiveWindow, Reject, Reply, SendWindow
+from catstream.wire.go_back_n import PATIENCE_SECONDS, ReceiveWindow, SendWindow
 from catstream.wire.socket import LINGER_SECONDS, ChannelSocket, Event
 
-_REPLIES: tuple[type[Stored | Position], ...] = (Stored, Position)
+_LONGEST_QUESTION = 20  # digits
+_MOST_ASKING = 64  # senders that may wait for an answer at a time; any other asks again
 
 
 class _Numbered(Protocol):
@@ -38,26 +40,25 @@ class Sender(ChannelSocket[Message]):
 
     Parameters
     ----------
-    window : messages that may be sent and not acknowledged; fewer if they are large
+    size : messages that may be sent and not acknowledged; fewer if they are large
 
     Attributes
     ----------
     window : the messages that were sent, acknowledged and stored
     """
 
-    def __init__(self, channel: Channel[Message], endpoint: Endpoint, window: int) -> None:
-        super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=window + 1)
-        self.window = SendWindow(channel.name, window, monotonic())
+    def __init__(self, channel: Channel[Message], endpoint: Endpoint, size: int) -> None:
+        super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=size + 1)
+        self.window = SendWindow(channel.name, size, monotonic())
         self._send_frame = partial(self._socket.send, flags=zmq.NOBLOCK, copy=False)
         self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the receiver is connected
         self._connect()
 
-    def ask_position(self) -> Position | None:
-        """Ask once for the receiver's position; None if it does not answer in time."""
-        self._say_hello()
+    def ask_position(self, after: int) -> Position | None:
+        """Ask once for the position, and the states after message `after`; None if no answer arrived in time."""
+        self._ask(b"%d" % after)
         if self._wait(PATIENCE_SECONDS):
-            answer = self._decode(self._socket.recv(), *_REPLIES)
-            return answer if isinstance(answer, Position) else None
+            return self._decode(self._socket.recv(), Position)
         return None
 
     def send(self, message: Message) -> None:
@@ -85,59 +86,49 @@ class Sender(ChannelSocket[Message]):
 
         Raises
         ------
-        ProtocolError
-            If the receiver holds another stream.
-        StreamRewoundError
-            If the receiver has lost messages that it had acknowledged.
+        ProtocolError, StreamRewoundError
+            As `SendWindow.receive`.
         """
         while self._wait(seconds):
-            self._process(self._socket.recv())
+            position = self._decode(self._socket.recv(), Position)
+            if position is not None and not self.window.receive(position, monotonic()):
+                self._reject("acknowledgement", "an acknowledgement was dropped: it is older than the last one")
             seconds = 0.0
         if self.window.must_ask(monotonic()):
-            self._say_hello()
+            self._ask(b"")
         self._transmit()
 
     def _disconnected(self) -> None:
         super()._disconnected()
         self.window.disconnected()
 
-    def _process(self, data: bytes) -> None:
-        answer = self._decode(data, *_REPLIES)
-        if answer is not None and (rejected := self.window.receive(answer, monotonic())) is not None:
-            self._reject(rejected.reason, rejected.text)
-
     def _transmit(self) -> None:
         with contextlib.suppress(zmq.Again):  # tried again at the next poll
             self.window.transmit(self._send_frame)
 
-    def _say_hello(self) -> None:
-        self.window.position_requested(monotonic())
+    def _ask(self, question: bytes) -> None:
+        self.window.asked(monotonic())
         with contextlib.suppress(zmq.Again):  # no receiver is connected yet: it is asked again
-            self._socket.send(HELLO, zmq.NOBLOCK)
+            self._socket.send(question, zmq.NOBLOCK)
 
 
 class Receiver(ChannelSocket[Message]):
     """The receiving side of an acknowledged channel; it binds.
 
-    Receiving stores nothing. If a new sender asks for the position while more was received than is stored,
-    `window.position_requested` becomes true; the owner then stores what it has, and calls `answer`. In a loop:
-
-        message = receiver.receive(0.1)
-        ...                                     # process the message
-        if receiver.window.position_requested:
-            receiver.answer(store())
-        elif message is not None:
-            receiver.acknowledge(position)
+    Each message that `receive` returns is processed, and then acknowledged. Senders that were restarted wait for
+    `answer`: what they have not sent themselves should be stored by then, as they cannot repeat it without the source.
 
     Parameters
     ----------
-    position : where the stream continues; the next message received is the one after `position.seq`
-    window : as the sender's
+    position : where the stream continues; the next message received is the one after `position.taken`
+    size : as the sender's
     check : raises ProtocolError if a message does not belong to this stream; it then does not count as received
+    states : returns the states of the detectors after a message, for a sender that was restarted
 
     Attributes
     ----------
     window : the messages that were received and stored
+    asking : the senders that were restarted and wait for `answer`, and the message whose states they ask for
     """
 
     def __init__(
@@ -145,11 +136,14 @@ class Receiver(ChannelSocket[Message]):
         channel: Channel[Message],
         endpoint: Endpoint,
         position: Position,
-        window: int,
+        size: int,
         check: Callable[[Message], None] | None = None,
+        states: Callable[[int], dict[str, DetectorState]] = lambda _: {},
     ) -> None:
-        super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=window + 1)
-        self.window, self._check = ReceiveWindow(position, window), check
+        super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=size + 1)
+        self.window, self._check, self._states = ReceiveWindow(position, size), check, states
+        self.asking: dict[bytes, int] = {}
+        self._size = size
         self._bind()
 
     def receive(self, seconds: float) -> Message | None:
@@ -159,24 +153,34 @@ class Receiver(ChannelSocket[Message]):
         peer, data = self._receive_from_peer()
         if data is None:
             return None
-        if not data:
-            self._reply(self.window.hello(peer))
+        if len(data) <= _LONGEST_QUESTION and (not data or bytes(data).isdigit()):
+            if not data:
+                self._reply(peer, self.window.asked(peer))
+            elif len(self.asking) < _MOST_ASKING:
+                self.asking[peer] = int(bytes(data))
             return None
         message = self._decode(data, *self.channel.messages, check=self._check)
         if message is None:
             return None
-        ends = isinstance(message, End)
-        actions = self.window.receive(peer, message.seq, monotonic(), last=ends, size=len(data))
-        self._reply(actions)
-        return message if Deliver() in actions else None
+        last = isinstance(message, End)
+        delivered, reply = self.window.receive(peer, message.seq, monotonic(), last=last, size=len(data))
+        if reply is not None:
+            self._reply(peer, reply)
+        if not delivered and message.seq > self.window.taken + self._size + 1:  # more than a sender may have in flight
+            self._reject("sequence", f"message {message.seq} came after {self.window.taken}")
+        return message if delivered else None
 
     def acknowledge(self, position: Position) -> None:
         """Acknowledge all that was received; it is stored up to `position.seq`, except the last `position.unsaved`."""
-        self._reply(self.window.acknowledge(position))
+        self.window.acknowledge(position)
+        if self.window.peer is not None:
+            self._reply(self.window.peer, self.window.position)
 
-    def answer(self, position: Position) -> None:
-        """Send the position, up to which all is stored, to the senders that asked for it."""
-        self._reply(self.window.answer(position))
+    def answer(self) -> None:
+        """Answer the senders that were restarted."""
+        for peer, after in self.asking.items():
+            self._reply(peer, replace(self.window.asked(peer), states=self._states(after)))
+        self.asking.clear()
 
     def close(self) -> None:
         """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""
@@ -188,11 +192,6 @@ class Receiver(ChannelSocket[Message]):
         super()._disconnected()
         self.window.disconnected()
 
-    def _reply(self, actions: Sequence[Deliver | Reply | Reject]) -> None:
-        for action in actions:
-            match action:
-                case Reply(peer, answer):
-                    with contextlib.suppress(zmq.Again):  # a sender that does not read asks again
-                        self._socket.send_multipart([peer, self._encode(answer)], zmq.NOBLOCK)
-                case Reject(reason, text):
-                    self._reject(reason, text)
+    def _reply(self, peer: bytes, position: Position) -> None:
+        with contextlib.suppress(zmq.Again):  # a sender that does not read asks again
+            self._socket.send_multipart([peer, self._encode(position)], zmq.NOBLOCK)

@@ -6,7 +6,7 @@
     models     as samples
     tracks     every message, one for each object and frame, to any number of subscribers; a slow one misses some, and
                sees by `seq` how many
-    results    the tracks again, one message a frame, acknowledged, for the process that started the pipeline, its owner
+    results    the tracks again, one message a frame, for the program that started the pipeline, its owner
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
     control    commands and their answers; a command without an answer is sent again, and carried out once
@@ -17,9 +17,9 @@ The controller of a fleet has an endpoint of its own, with one channel:
 
     registry   questions about the streams of the fleet, and their answers
 
-The receiver of an acknowledged channel binds its address, and so does the sender of any other; the rest connect,
-in any order. `catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`),
-a peer that connects needs the role in the table.
+The one receiver of a channel binds its address; if there are many, its sender does. The rest connect, in any order.
+`catstream.wire.endpoint` says what the addresses are. If the pipeline has keys (`catstream.wire.keys`), a peer that
+connects needs the role in the table.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Channel(Generic[Message]):
 
     @property
     def acknowledged(self) -> bool:
-        """Whether each message is repeated until its one receiver has answered it."""
+        """Whether one process receives every message."""
         return self.receiver is not None
 
     @property

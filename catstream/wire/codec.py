@@ -31,7 +31,7 @@ import msgspec
 import numpy as np
 
 from catstream.errors import ProtocolError
-from catstream.messages.kinds import Position, Stored
+from catstream.messages.kinds import Position
 from catstream.messages.schema import Integer, Text, check_message
 from catstream.wire.channels import CHANNELS, REGISTRY
 
@@ -40,12 +40,10 @@ Message = TypeVar("Message")
 #: Version of the envelope and of the meaning of the fields.
 VERSION = 4
 
-#: Kinds of message, by their name on the wire: those of the channels, and the replies on acknowledged channels.
+#: Kinds of message, by their name on the wire: those of the channels, and the reply on an acknowledged one.
 KINDS: dict[str, type] = {
-    kind.__name__.lower(): kind
-    for kinds in (*(channel.messages for channel in (*CHANNELS.values(), REGISTRY)), (Position, Stored))
-    for kind in kinds
-}
+    kind.__name__.lower(): kind for channel in (*CHANNELS.values(), REGISTRY) for kind in channel.messages
+} | {"position": Position}
 
 #: What is wrong with bytes: msgspec raises no other error for them.
 _ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import arena
 import chaos
+import numpy as np
 import pytest
 import sequences
 import table
@@ -15,6 +16,7 @@ from catstream.settings import Settings
 pytestmark = pytest.mark.system
 
 
+@pytest.mark.parametrize("lockstep", [True, False])
 @pytest.mark.parametrize(
     "faults",
     [
@@ -23,8 +25,8 @@ pytestmark = pytest.mark.system
     ],
     ids=", ".join,
 )
-def test_in_lockstep_all_is_as_without_faults_bit_for_bit(video, calm, faults):
-    assert_same(video, calm, faults)
+def test_no_frame_and_no_row_is_lost_or_comes_twice(video, calm, faults, lockstep):
+    assert_kept(video, calm, faults, lockstep)
 
 
 def test_a_disk_that_is_full_for_a_while_costs_nothing(video, calm, tmp_path):
@@ -33,25 +35,33 @@ def test_a_disk_that_is_full_for_a_while_costs_nothing(video, calm, tmp_path):
             pass
     except OSError as error:
         pytest.skip(f"{error}: needs root")
-    assert_same(video, calm, [chaos.FULL])
+    assert_kept(video, calm, [chaos.FULL])
 
 
-def assert_same(video, calm, faults):
-    """One run through the faults stores what it sent, and learns what the tracker learned."""
+def assert_kept(video, calm, faults, lockstep=True):
+    """One run through the faults has one track a frame, and each message in the trees once; the object is followed."""
     path, boxes = video
-    run = chaos.endure(path, {chaos.FIRST: boxes[0]}, Settings(run={"lockstep": True}), faults)
-    assert (run.totals["sent"], run.totals["stored"]) == (len(boxes), len(boxes))
-    assert chaos.identical(run, calm)
+    run = chaos.endure(path, {chaos.FIRST: boxes[0]}, Settings(run={"lockstep": lockstep}), faults)
+    kept(run, len(boxes))
+    truth = np.array(boxes)
+    with_faults, without = (score(chaos.found(tracks, chaos.FIRST), truth).success for tracks in (run.tracks, calm[0]))
+    assert with_faults > without - 0.05
 
 
-def test_three_objects_that_begin_and_are_forgotten_between_faults_are_as_without_faults_bit_for_bit(video):
+def kept(run, frames):
+    numbers = [{track.frame for track in tracks.values()} for tracks in run.tracks]
+    assert numbers == [{frame} for frame in range(frames)]
+    assert run.totals["sent"] == run.totals["stored"] == run.learned.seq == frames
+
+
+def test_three_objects_that_begin_and_are_forgotten_between_faults_lose_no_frame_and_no_row(video):
     path, truth = video
     boxes = sequences.objects(path, truth[0], 3)
     faults = ["kill -9 all three", "link cut", "kill -9 compressor", "kill -9 detector", "kill -9 trainer"]
     run = chaos.endure(path, boxes, Settings(run={"lockstep": True}), faults)
-    assert (run.totals["sent"], run.totals["stored"]) == (len(truth), len(truth))
+    kept(run, len(truth))
     assert {change.box is None for change in run.changes} == {True, False}, "an object is forgotten, and one begins"
-    assert chaos.identical(run, chaos.undisturbed(path, boxes, run.changes))
+    assert all(chaos.FIRST in tracks for tracks in run.tracks)
 
 
 @pytest.mark.slow

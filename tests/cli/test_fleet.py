@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from catstream.cli.fleet import _down
+from catstream.cli.fleet_commands import _down
 from catstream.fleet import fleet
 
 

@@ -190,7 +190,7 @@ def test_a_saved_forest_continues_bit_for_bit(settings, messages, names, count, 
     loaded = Forest.load(tmp_path / "state", settings)
     assert list(loaded.compressors) == (names if count else [])
     assert loaded.counters() == forest.counters()
-    assert_equal(dataclasses.asdict(loaded.position), dataclasses.asdict(forest.position))
+    assert loaded.versions == forest.versions
     for message in itertools.islice(stream, 40):
         for sample, again in zip(forest.take(message), loaded.take(message), strict=True):
             assert_same(sample, again)
@@ -215,8 +215,21 @@ def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, 
     forest = Forest(settings)
     forest.take(changed(next(messages), detector=detector))
     forest.save(tmp_path / "state")
-    loaded = Forest.load(tmp_path / "state", settings).compressors[""].detector
-    assert_equal(dataclasses.asdict(loaded), dataclasses.asdict(detector))
+    loaded = Forest.load(tmp_path / "state", settings)
+    for state in (loaded.compressors[""].detector, loaded.states_at(1)[""]):
+        assert_equal(dataclasses.asdict(state), dataclasses.asdict(detector))
+
+
+def test_the_detector_states_after_the_last_256_messages_are_known_across_a_checkpoint(settings, tmp_path):
+    states = {seq: DetectorState(seq, "lost", *[Window(1.0, 2.0, 3.0, 4.0)] * 3) for seq in range(1, 301)}
+    forest = Forest(settings)
+    assert forest.states_at(5) == {}
+    for seq, state in states.items():
+        forest.take(Features(seq, seq - 1, 0.0, {"anna": ObjectFeatures(None, detector=state)}))
+    forest.save(tmp_path / "state")
+    for each in (forest, Forest.load(tmp_path / "state", settings)):
+        known = [each.states_at(seq)["anna"].first_frame for seq in (1, 45, 46, 300, 1 << 62)]
+        assert known == [45, 45, 46, 300, 300], "or the nearest one"
 
 
 @pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
@@ -226,7 +239,7 @@ def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path)
     take(forest, messages, 37)
     arrays, metadata = forest.state()
     metadata["objects"][0]["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
-    storage.write(path, arrays, metadata | {"kind": "forest 2"})
+    storage.write(path, arrays, metadata | {"kind": "forest 3"})
     with pytest.raises(ProtocolError, match="use an older copy"):
         Forest.load(path, settings)
 
@@ -235,7 +248,7 @@ def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path)
 def test_a_file_of_another_kind_or_version_is_rejected_with_one_line(settings, kind, tmp_path):
     arrays, metadata = Forest(settings).state()
     storage.write(tmp_path / "000000000001.safetensors", arrays, metadata | ({"kind": kind} if kind else {}))
-    with pytest.raises(ServiceError, match=rf"is of kind {kind!r}, this catstream reads 'forest 2'") as error:
+    with pytest.raises(ServiceError, match=rf"is of kind {kind!r}, this catstream reads 'forest 3'") as error:
         CheckpointStore(tmp_path).load(settings)
     assert "\n" not in str(error.value)
 
@@ -280,7 +293,7 @@ def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, m
     kept = forest.compressors["ben"]
     forest.take(merged(2, ben=next(messages)))
     assert forest.compressors == {"ben": kept}
-    assert forest.position.objects.keys() == forest.object_counters().keys() == {"ben"}
+    assert forest.object_counters().keys() == {"ben"}
     forest.take(merged(3, ben=next(messages), anna=next(messages)))
     assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
 

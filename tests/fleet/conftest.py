@@ -1,11 +1,13 @@
-"""The fleet on a real cluster of Ray that the tests of a process share: Ray uses one cluster in a process."""
+"""A fleet on a real cluster of two nodes that the tests of a process share: Ray uses one cluster in a process."""
 
 from __future__ import annotations
 
+import secrets
+import socket
+
 import pytest
 
-from catstream.fleet.fleet import Fleet
-from catstream.fleet.local import LocalCluster
+from catstream.fleet.fleet import _VARIABLES, Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.video.live_demo import first_box
 
@@ -32,11 +34,32 @@ def streams(demo_video):
 
 
 @pytest.fixture(scope="session")
-def site(home, streams, tmp_path_factory):
+def cluster(home):
+    """A cluster of the nodes north and south, as `ray start` would start them, but on the loopback interface."""
+    home.mkdir(parents=True, exist_ok=True)
+    (home / "cluster-token").touch(mode=0o600)
+    (home / "cluster-token").write_text(secrets.token_hex(32))
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in _VARIABLES.items():
+            patch.setenv(name, value)
+        patch.setenv("RAY_AUTH_TOKEN_PATH", str(home / "cluster-token"))
+        from ray.cluster_utils import Cluster
+
+        options = {"num_cpus": 1, "object_store_memory": 80 << 20}
+        cluster = Cluster(True, head_node_args=options | {"node_name": "north", "include_dashboard": False})
+        cluster.south = cluster.add_node(**options, node_name="south", labels={"site": "south"})
+        yield cluster
+        cluster.shutdown()
+
+
+@pytest.fixture(scope="session")
+def site(cluster, streams, tmp_path_factory):
     """A fleet of two streams on two nodes, and its spec."""
-    spec = FleetSpec("site", str(tmp_path_factory.mktemp("store") / "new"), every=0.5, nodes=2, streams=streams)
-    with Fleet(spec) as site:
-        site.up(cores=1)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        registry = f"127.0.0.1:{probe.getsockname()[1]}"
+    store = str(tmp_path_factory.mktemp("store") / "new")
+    spec = FleetSpec("site", store, every=0.5, registry=registry, streams=streams)
+    with Fleet(spec, address=cluster.address) as site:
+        site.up()
         yield site, spec
-    assert not LocalCluster(home / "site").running
-    assert sorted(path.name for path in (home / "site").iterdir()) == ["log", "pid", "starting", "token"]
+        assert site.down() == []

@@ -62,9 +62,6 @@ class Memory:
     def remove(self, name):
         self.objects.pop(name, None)
 
-    def tidy(self, folder):
-        pass
-
     def land(self, index):
         """Store an object whose writer has long given up."""
         name, data = self.late.pop(index)
@@ -122,8 +119,6 @@ class Process:
             raise StoreError(fault)
 
     def __getattr__(self, name):
-        if name == "tidy":
-            return self.memory.tidy
         if name not in CALLS:
             raise AttributeError(name)
 

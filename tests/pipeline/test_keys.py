@@ -60,9 +60,7 @@ def received(subscription):
         return next(subscription)
 
 
-@pytest.mark.parametrize(
-    "place", ["0.0.0.0:0", "192.0.2.1:5700", "example.org:5700"]
-)
+@pytest.mark.parametrize("place", ["0.0.0.0:0", "192.0.2.1:5700", "example.org:5700"])
 def test_a_pipeline_that_other_machines_can_reach_does_not_start_without_keys(video, place):
     path, boxes = video
     settings = Settings(run={"endpoint": f"tcp://{place}"})

@@ -1,4 +1,4 @@
-"""A pipeline in a program: with `with` and without, more than once, and in an event loop."""
+"""A pipeline in a program: with `with` and without, more than once, in threads, and in an event loop."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import asyncio
 import copy
 import gc
 import json
+import os
 import pickle
+import signal
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -14,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
+from catstream.client.control import control
+from catstream.client.subscription import subscribe
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
-from catstream.services import run_reader
-from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
 from catstream.video.live_demo import first_box
 
@@ -38,19 +40,6 @@ def test_it_is_iterated_without_with_and_leaves_no_process(pipeline):
     assert not pipeline.pids
     with pytest.raises(ServiceError, match="a pipeline runs once"):
         next(iter(pipeline))
-
-
-def test_a_detector_that_has_ended_with_the_stream_is_no_failure(pipeline, monkeypatch, until):
-    check = Supervisor.check_children
-
-    def check_late(supervisor, **facts):
-        if pipeline.totals:  # the end was received: the detector may end before it is looked at
-            until(lambda: supervisor.finished)
-        check(supervisor, **facts)
-
-    monkeypatch.setattr(Supervisor, "check_children", check_late)
-    monkeypatch.setattr(run_reader, "TURN_SECONDS", 0)
-    assert [track.frame for track in pipeline] == list(range(20))
 
 
 def test_a_loop_that_is_left_ends_the_run(pipeline, alive):
@@ -86,7 +75,7 @@ def test_a_program_may_change_its_folder_during_a_run(video, tmp_path, monkeypat
     begin.mkdir()
     later.mkdir()
     monkeypatch.chdir(begin)
-    files = {"state": "state", "record": "run.mcap", "save_model": "m.safetensors"}
+    files = {"state": "state", "save_model": "m.safetensors"}
     with Pipeline(path, boxes[0], SETTINGS, part=PART, **files) as pipeline:
         monkeypatch.chdir(later)
         assert len(list(pipeline)) == 20
@@ -142,75 +131,50 @@ def test_a_pipeline_that_is_never_closed_ends_also_if_a_warning_is_an_error(vide
     assert not any(map(alive, pids))
 
 
-@pytest.mark.parametrize("enter", [True, False])
-def test_an_event_loop_continues_while_it_waits_for_tracks(pipeline, enter):
-    async def follow():
-        return [track.frame async for track in pipeline]
-
+def test_an_event_loop_continues_while_a_thread_waits_for_tracks(pipeline):
     async def run():
-        turns = asyncio.create_task(count())
-        if enter:
-            async with pipeline:
-                frames = await follow()
-        else:
-            frames = await follow()
-        turns.cancel()
-        return frames
-
-    ticks = 0
-
-    async def count():
-        nonlocal ticks
-        while True:
-            await asyncio.sleep(0)
+        ticks, tracks = 0, asyncio.create_task(asyncio.to_thread(list, pipeline))
+        while not tracks.done():
+            await asyncio.sleep(0.001)
             ticks += 1
+        return ticks, [track.frame for track in await tracks]
 
-    assert asyncio.run(run()) == list(range(20))
+    ticks, frames = asyncio.run(run())
+    assert frames == list(range(20))
     assert ticks > 20
     assert not pipeline.pids
 
 
-def test_a_task_that_is_cancelled_ends_the_run_in_order(video, alive):
-    pids = []
-
-    async def follow():
-        async with Pipeline(video[0], settings=SETTINGS) as waiting:  # without a box no track comes
-            pids.extend(waiting.pids.values())
-            begun.set()
-            async for _ in waiting:
-                raise AssertionError
-
-    async def run():
-        task = asyncio.create_task(follow())
-        await begun.wait()
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-
-    begun = asyncio.Event()
-    asyncio.run(run())
-    assert len(pids) == 3
-    assert not any(map(alive, pids))
-
-
-@pytest.mark.parametrize("task", [False, True], ids=["thread", "task"])
-def test_a_loop_ends_with_an_error_if_another_thread_or_task_closes_the_pipeline(video, until, task):
-    def follow():
-        if task:
-            asyncio.run(follow_in_a_task())
-        else:
-            list(waiting)
-
-    async def follow_in_a_task():
-        async for _ in waiting:
-            raise AssertionError
-
+def test_a_loop_ends_with_an_error_if_another_thread_closes_the_pipeline(video, until):
     with ThreadPoolExecutor() as pool, Pipeline(video[0], settings=SETTINGS) as waiting:  # without a box no track comes
-        loop = pool.submit(follow)
-        until(lambda: waiting.health)  # the loop has received it
+        loop = pool.submit(list, waiting)
+        until(lambda: waiting.health)
         waiting.close()
-        with pytest.raises(ServiceError, match="the pipeline was closed, perhaps by another thread or task"):
+        with pytest.raises(ServiceError, match="the pipeline was closed, perhaps by another thread"):
             loop.result()
+
+
+def test_a_process_that_dies_is_restarted_however_long_the_loop_takes(pipeline, until):
+    with pipeline:
+        first = next(iter(pipeline))
+        killed = pipeline.pids["detector"]
+        os.kill(killed, signal.SIGKILL)
+        until(lambda: pipeline.pids.get("detector", killed) != killed)  # the loop asks for no track
+        assert [first.frame, *(track.frame for track in pipeline)] == list(range(20))
+        assert pipeline.restarts == 1
+
+
+def test_a_run_that_starts_paused_waits_with_its_first_frame(video):
+    path, boxes = video
+    with (
+        Pipeline(path, boxes[0], SETTINGS, part=PART, paused=True) as pipeline,
+        subscribe(pipeline.endpoint, "tracks", timeout=60) as tracks,
+        control(pipeline.endpoint, timeout=60) as steering,
+    ):
+        assert pipeline.holding == "paused"
+        assert steering.resume().reason == "resumed before the first frame"
+        assert [track.frame for track in pipeline] == list(range(20))
+        assert [track.frame for track in tracks] == list(range(20))
 
 
 def prints_well_and_is_ready_for_json(track):

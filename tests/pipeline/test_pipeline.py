@@ -13,12 +13,9 @@ import psutil
 import pytest
 
 from catstream.errors import BoxError, ServiceError, VideoError
-from catstream.features.kernels import COMPILING
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
-from catstream.sinks.recording.file import Recording
-from catstream.sinks.recording.learning import learn
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
@@ -29,13 +26,12 @@ SETTINGS = Settings(run={"unstored_frames": 16})
 
 @pytest.fixture(scope="module")
 def run(video):
-    """Tracks of a whole run, its pipeline afterwards, and the processes that it had: name -> id, command."""
+    """Tracks of a whole run, its pipeline afterwards, and the processes that it had."""
     path, boxes = video
     with Pipeline(path, boxes[0], SETTINGS) as pipeline:
         tracks = iter(pipeline)
         first = [next(tracks) for _ in range(10)]
-        found = {name: psutil.Process(pid) for name, pid in pipeline.pids.items()}
-        processes = {name: (each.pid, each.cmdline()) for name, each in found.items()}
+        processes = pipeline.pids
         return [*first, *tracks], pipeline, processes
 
 
@@ -86,9 +82,7 @@ def test_a_health_report_after_the_last_track_counts_too(video, until):
 def test_three_processes_run_while_it_is_open_and_none_afterwards(run, alive):
     _, pipeline, processes = run
     assert set(processes) == set(NAMES)
-    for name, (pid, command) in processes.items():
-        assert " ".join(command).strip() == f"catstream {name}", "no address: it may contain a password"
-        assert not alive(pid)
+    assert not any(map(alive, processes.values()))
     assert not pipeline.pids
 
 
@@ -146,20 +140,6 @@ def test_a_restarted_trainer_continues_to_learn(video):
                 os.kill(pipeline.pids["trainer"], signal.SIGKILL)
     assert pipeline.restarts == 1
     assert versions[-1] > versions[8]
-
-
-def test_the_detector_is_never_further_ahead_of_learning_than_it_may_be(video, tmp_path):
-    path, boxes = video
-    lag = 5
-    with Pipeline(path, boxes[0], Settings(run={"lag_frames": lag}), record=tmp_path / "run.mcap") as pipeline:
-        tracks = list(pipeline)
-    learned = {}  # version of the model that results from the rows up to each frame of this run
-    recording = Recording(tmp_path / "run.mcap")
-    learn(recording, recording.settings, keep=lambda model: learned.update({model.frame: model.version}))
-    due = [max((version for frame, version in learned.items() if frame < i), default=0) for i in range(len(tracks))]
-    assert due[-1] > 2
-    late = [i for i in range(lag, len(tracks)) if tracks[i].model_version < due[i - lag]]
-    assert not late
 
 
 FORKS = """
@@ -221,11 +201,3 @@ def test_a_run_starts_with_more_objects_than_by_default_if_the_setting_allows_th
 def test_a_path_is_a_source(video):
     with Pipeline(Path(video[0]), video[1][0], part=slice(0, 3)) as pipeline:
         assert len(list(pipeline)) == 3
-
-
-def test_a_first_start_that_compiles_is_logged(video, tmp_path, monkeypatch, caplog):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    path, truth = video
-    with Pipeline(path, truth[0], part=slice(0, 5)) as pipeline:
-        assert len(list(pipeline)) == 5
-    assert caplog.messages == [COMPILING]

@@ -11,7 +11,7 @@ import pytest
 from catstream.box import Box
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
-from catstream.services.previews import Previews
+from catstream.services.outputs import Previews
 from catstream.video.rendered import render
 
 
@@ -52,7 +52,7 @@ def test_a_picture_shows_the_frame(previews, looks):
 
 
 def test_none_is_made_while_nobody_looks(previews, monkeypatch):
-    monkeypatch.setattr("catstream.services.previews.jpeg", None)  # to call it is an error
+    monkeypatch.setattr("catstream.services.outputs.jpeg", None)  # to call it is an error
     for frame in range(5):
         previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
 

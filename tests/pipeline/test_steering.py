@@ -15,14 +15,11 @@ import zmq
 from catstream.client.control import control
 from catstream.client.subscription import subscribe
 from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError
-from catstream.messages.kinds import Model
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
-from catstream.services.desired import DesiredState
+from catstream.services.decisions import DesiredState
 from catstream.settings import Settings
-from catstream.sinks.recording.file import Recording
-from catstream.sinks.recording.learning import learn
 from catstream.video.source import open_source
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
@@ -164,7 +161,6 @@ def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
         steering.set_box(boxes[0])
         killed = pipeline.pids["detector"]
         os.kill(killed, signal.SIGKILL)
-        # Supervised while its tracks are taken: of which there is one.
         resumed = pool.submit(lambda: (told(pipeline, lambda counters: counters["paused"]), steering.resume()))
         tracks = list(pipeline)
         assert resumed.result()[0]["sent"] <= 1
@@ -219,19 +215,16 @@ def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_vide
     assert versions[-1] > version
 
 
-def test_in_lockstep_a_run_from_a_saved_model_is_repeatable_even_if_the_detector_dies(video, saved):
-    settings = Settings(run={"lockstep": True})
-    runs = []
-    for dies in (False, True):
-        tracks = []
-        with Pipeline(video[0], settings=settings, model=saved, part=slice(10, 32)) as pipeline:
-            for track in pipeline:
-                tracks.append(track)
-                if dies and track.frame == 8:
-                    os.kill(pipeline.pids["detector"], signal.SIGKILL)
-        assert pipeline.restarts == dies
-        runs.append(tracks)
-    assert runs[0] == runs[1]
+def test_a_run_from_a_saved_model_goes_on_if_the_detector_dies(video, saved):
+    tracks = []
+    with Pipeline(video[0], settings={"run.lockstep": True}, model=saved, part=slice(10, 32)) as pipeline:
+        for track in pipeline:
+            tracks.append(track)
+            if track.frame == 8:
+                os.kill(pipeline.pids["detector"], signal.SIGKILL)
+    assert pipeline.restarts == 1
+    assert [track.frame for track in tracks] == list(range(22))
+    assert tracks[-1].box.overlap(video[1][31]) > 0.5
 
 
 def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, rng, tmp_path):
@@ -304,42 +297,37 @@ def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_
 
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor", "trainer")], ids=str)
-def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoever_dies(
-    video, saved, victims, tmp_path
-):
+def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoever_dies(video, saved, victims):
     path, settings = video[0], Settings(run={"lockstep": True})
-    tracks, first = [], set()
+    tracks = []
     with (
-        Pipeline(path, {"ben": PATCH}, settings, record=tmp_path / "run.mcap") as pipeline,
+        Pipeline(path, {"ben": PATCH}, settings) as pipeline,
         control(pipeline.endpoint, timeout=SECONDS) as steering,
         ThreadPoolExecutor(1) as pool,
     ):
-        tracks.append(next(iter(pipeline)))  # an answer before the first frame has the number of that frame
-        for _ in range(2):  # the second one takes the place of the first
-            first.add(taken(pipeline, tracks, pool.submit(steering.search, saved, "anna")).frame + 1)
-            for victim in victims:
-                os.kill(pipeline.pids[victim], signal.SIGKILL)
+        tracks.append(next(iter(pipeline)))
+        assert taken(pipeline, tracks, pool.submit(steering.search, saved, "anna")).done
+        for victim in victims:
+            os.kill(pipeline.pids[victim], signal.SIGKILL)
         tracks += pipeline
-        assert pipeline.restarts >= 2 * len(victims)
-    recording = Recording(tmp_path / "run.mcap")
-    parts = [(features.frame, features.objects.get("anna")) for features in recording.features()]
-    began = {frame for frame, part in parts if part is not None and part.begins}
-    assert victims or began == first  # a detector that dies before the next frame may begin one frame later
+        assert pipeline.restarts >= len(victims)
+    assert [track.frame for track in tracks if track.object == "ben"] == list(range(len(video[1])))
+    assert pipeline.totals["stored"] == len(video[1])
+    assert tracks[-1].object == "anna"
+    if victims:  # after a restart the search may begin too late in this short video for three sightings
+        return
     expected, learned, tracker = [], Learned.load(saved), MultiTracker()
+    began = next(track.began for track in tracks if track.object == "anna")
     with open_source(path) as source:
         for frame in source:
             if expected:
-                tracker.update(
-                    frame.image, time=frame.time, search={"anna": learned} if frame.number in began else None
-                )
+                search = {"anna": learned} if frame.number == began else None
+                tracker.update(frame.image, time=frame.time, search=search)
             else:
                 tracker.init(frame.image, {"ben": PATCH}, frame.time)
             expected += tracker.tracks.values()
     assert tracks == expected
-    assert tracks[-1].object == "anna"
-    if not victims:  # after a restart the search may begin too late in this short video for three sightings
-        assert tracks[-1].box.overlap(video[1][-1]) > 0.5
-    assert learn(recording, recording.settings).identical == recording.counts[Model]
+    assert tracks[-1].box.overlap(video[1][-1]) > 0.5
 
 
 def test_an_object_that_is_searched_for_is_found_after_a_resume_without_the_file(video, saved, tmp_path):

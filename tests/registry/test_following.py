@@ -16,7 +16,7 @@ from catstream.box import Box
 from catstream.client.registry import FollowedStream
 from catstream.client.subscription import wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, Listing, StreamStatus, Track
+from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -93,9 +93,12 @@ def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, m
             assert tracks.missed == 6
 
 
-def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_once_there_is_one_again(stream, managing):
+def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_once_there_is_one_again(
+    stream, managing, folder
+):
+    place = str(folder / "registry")  # the same for each controller of a fleet
     with ExitStack() as controller:
-        controller.enter_context(managing(stream.status))
+        controller.enter_context(managing(stream.status, place))
         first = stream.runs()
         with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=60) as tracks:
             watched = stream.watched(tracks)
@@ -103,7 +106,7 @@ def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_on
             controller.close()
             stream.send(first, track(2), STOPPED)
             second = stream.runs()
-            with managing(stream.status):
+            with managing(stream.status, place):
                 stream.send(second, track(3))
                 del stream.status.streams["cam-7"]
                 assert watched.result(60) == [track(1), track(2), track(3)]
@@ -111,9 +114,9 @@ def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_on
 
 
 def test_a_subscription_waits_for_a_stream_that_runs_nowhere_yet(stream, managing):
-    stream.update(state="unplaced", trouble="cam-7 needs a node with site=north")
+    stream.update(state="failed", trouble="there is no camera")
     with managing(stream.status), catstream.subscribe("fleet://cam-7", "tracks", timeout=0.1) as tracks:
-        with pytest.raises(SilenceError, match=r"its state is unplaced: cam-7 needs a node with site=north$"):
+        with pytest.raises(SilenceError, match=r"its state is failed: there is no camera$"):
             next(tracks)
         tracks.timeout = 60
         watched = stream.watched(tracks)
@@ -122,14 +125,16 @@ def test_a_subscription_waits_for_a_stream_that_runs_nowhere_yet(stream, managin
         assert watched.result(60) == [track(1)]
 
 
-def test_the_frames_of_a_stream_that_began_anew_are_all_returned(stream, managing):
+@pytest.mark.parametrize("change", [{"source": "run.mp4"}, {"live": True}])
+def test_all_frames_of_another_source_and_of_a_live_stream_are_returned_after_a_move(stream, managing, change):
+    """A live stream uses the numbers of the frames that it lost again."""
     with managing(stream.status):
         first = stream.runs()
         with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1), track(2))
             first.close()
-            stream.send(stream.runs(source="run.mp4"), track(1), track(2), STOPPED)
+            stream.send(stream.runs(**change), track(1), track(2), STOPPED)
             stream.update(state="ended")
             assert [each.seq for each in watched.result(60)] == [1, 2, 1, 2]
 
@@ -229,7 +234,7 @@ class _Script:
         pass
 
     def receive(self):
-        return None if self.answer is None else Listing("question", "site", 1.7e9, {"cam-7": self.answer})
+        return None if self.answer is None else FleetStatus("site", 1.7e9, {"cam-7": self.answer})
 
 
 STEPS = st.lists(st.sampled_from(["move", "stop", "down", "end of the pipeline"]), max_size=20)
@@ -252,6 +257,6 @@ def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_controll
         assert (followed.end, str(followed.place)) == (None, f"run-{token}")
     registry.answer = _Script._status(token, last) if last == "ended" else None
     if last == "removed":
-        registry.receive = lambda: Listing("question", "site", 1.7e9)
+        registry.receive = lambda: FleetStatus("site", 1.7e9)
     assert not followed.update()
     assert followed.end is not None

@@ -35,7 +35,6 @@ jobs = st.builds(
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
     results=st.builds(Results, paths, st.booleans(), st.lists(st.text(min_size=1)).map(tuple), files),
     state=paths,
-    record=paths,
     since=st.none() | st.floats(0, 1e9),
     resume=st.booleans(),
 )

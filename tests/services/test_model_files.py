@@ -12,10 +12,9 @@ from catstream.box import Box
 from catstream.messages.kinds import Command
 from catstream.multi import MultiTracker
 from catstream.run.job import Job
-from catstream.services.core import Commanded
-from catstream.services.detector import DetectorLoop
-from catstream.services.loop import Process
-from catstream.services.model_files import ModelFiles
+from catstream.services.detector_process import DetectorLoop
+from catstream.services.outputs import ModelFiles
+from catstream.services.process import Process
 from catstream.settings import Settings
 from catstream.video.rendered import render
 
@@ -33,7 +32,7 @@ def learned():
 
 def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_path):
     files = ModelFiles(tmp_path / "models")
-    name = files.add(learned).name
+    name = files.add(learned).model
     files.store()
     (file,) = (tmp_path / "models").iterdir()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -42,7 +41,7 @@ def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_p
 
 def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, caplog):
     files = ModelFiles(tmp_path)
-    name = files.add(learned).name
+    name = files.add(learned).model
     files.store()
     (tmp_path / f"{name}.safetensors").write_bytes(b"torn")
     assert ModelFiles(tmp_path).get(name) is None
@@ -54,7 +53,7 @@ def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, ca
 
 def test_without_a_folder_models_are_kept_in_memory(learned):
     files = ModelFiles(None)
-    name = files.add(learned).name
+    name = files.add(learned).model
     files.store()
     files.keep_only({name})
     assert files.get(name) is learned
@@ -69,7 +68,7 @@ def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp
     job = Job("walk.mp4", {"ben": Box(1, 2, 30, 40)}, settings=settings, endpoint=str(folder), state=state)
     with closing(Process("detector", job)) as process, ExitStack() as stack:
         loop = DetectorLoop(process, stack)
-        request = loop._request(Command("1", "search", object="anna", model=learned.to_bytes()))
-        loop.tell(Commanded(request))
-        assert list(loop.state.desired.objects) == ["ben"]
-        assert loop._models_of_job.get(request.saved.name) is None
+        loop._conclude(answer := loop._carried_out(Command("1", "search", object="anna", model=learned.to_bytes())))
+        assert not answer.done
+        assert list(loop.desired.objects) == ["ben"]
+        assert not loop._model_files._models

@@ -13,7 +13,7 @@ from catstream.features.layout import row_length
 from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import DetectorState, ObjectFeatures, SavedModel, TrainingRows
 from catstream.run.learned import Learned
-from catstream.services.saved_models import SavedModels
+from catstream.services.compressor_process import SavedModels
 from catstream.settings import Settings
 from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.newest import Subscriber

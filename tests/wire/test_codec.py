@@ -24,8 +24,8 @@ from catstream.messages.kinds import (
     Features,
     Health,
     ObjectFeatures,
+    Position,
     Preview,
-    Stored,
     Track,
     TrainingRows,
 )
@@ -215,11 +215,11 @@ REJECTED = {
     ),
     "another object in the envelope": msgpack.packb([VERSION, "track", "ann", "", fields_of("track")]),
     "an object in the envelope, and none in the fields": msgpack.packb(
-        [VERSION, "stored", "anna", "", fields_of("stored")]
+        [VERSION, "position", "anna", "", fields_of("position")]
     ),
     "lists in lists, as object": b"\x95\x04\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
     "a number as object": msgpack.packb([VERSION, "track", 1, "", fields_of("track") | {"object": 1}]),
-    "more objects than a map may have": packed("stored", versions={f"o{i}": 1 for i in range(257)}),
+    "more objects than a map may have": packed("position", versions={f"o{i}": 1 for i in range(257)}),
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
     "a picture above its limit": packed("preview", jpeg=b"\xff\xd8\xff" + bytes(1 << 19)),
@@ -270,7 +270,7 @@ def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
         dataclasses.replace(EXAMPLES["track"], score=float("nan")),
         dataclasses.replace(EXAMPLES["track"], seq=-1),
         dataclasses.replace(EXAMPLES["track"], object="an na"),
-        Stored(5, 7, {"an/na": 2}),
+        Position(5, 7, 0, {"an/na": 2}),
         Health("detector", 0.0, trouble="x" * (LONGEST_TEXT + 1)),
     ],
     ids=["dtype", "shape", "NaN", "negative", "name", "name in a map", "a text that is too long"],

@@ -20,7 +20,7 @@ from catstream.wire.endpoint import Endpoint
 
 rows = TrainingRows.labelled(np.ones((10, 100_000), np.float32), 1)
 with Sender(FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
-    features.ask_position()
+    features.ask_position(0)
     features.window.resume(0, Position())
     for seq in range(1, 33):
         features.send(Features(seq, seq - 1, 0.0, {"anna": ObjectFeatures(None, {"appearance": rows})}))

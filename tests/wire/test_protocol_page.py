@@ -25,8 +25,7 @@ from catstream.messages.kinds import (
     Motion,
     NodeStatus,
     ObjectFeatures,
-    ObjectPosition,
-    Stored,
+    Position,
     StreamStatus,
     Summary,
     Track,
@@ -40,7 +39,7 @@ from catstream.wire.newest import Publisher
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
-PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, ObjectPosition, StreamStatus, Summary, TrainingRows]
+PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, StreamStatus, Summary, TrainingRows]
 MESSAGES = [*codec.KINDS.values(), *PARTS]
 PLAIN = {int: "integer", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
@@ -87,7 +86,9 @@ def kind_of(field):
         return "array of integers"
     if field.type is bytes:
         return f"bytes, at most {limits.max_length}"
-    return PLAIN[field.type] + (f", at least {limits.ge}" if field.type is int and limits.ge else "")
+    return PLAIN[field.type] + (
+        f", at least {limits.ge}" if field.type is int and limits is not None and limits.ge else ""
+    )
 
 
 def names_of(named):
@@ -147,7 +148,7 @@ def test_the_limits_are_those_of_the_codec():
 
 def test_the_example_in_bytes_agrees_with_the_encoded_message():
     example = re.search(r"^```\n((?:[0-9a-f]{2}[ \n])+)```", PAGE, re.MULTILINE)[1]
-    assert bytes.fromhex(example) == codec.encode(Stored(5, 7, {"anna": 2}))
+    assert bytes.fromhex(example) == codec.encode(Position(5, 7, 0, {"anna": 2}))
     assert f"`{codec.opening(End).hex(' ')}` for `end`" in PAGE
     assert f"`{codec.opening(Track, 'anna').hex(' ')}` for" in PAGE
 

@@ -24,7 +24,7 @@ from catstream.messages.kinds import End
 from catstream.messages.names import UNNAMED
 from catstream.numerics.arrays import Float64
 from catstream.pipeline import Pipeline
-from catstream.services.loop import die_with
+from catstream.services.process import die_with
 from catstream.settings import Settings
 from catstream.video import rendered
 from catstream.video.frames import jpeg

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from catstream.messages.kinds import End
-from catstream.services.loop import Process
-from catstream.services.timing import CLOSE_SECONDS, MESSAGE_SECONDS, TRAIN_SECONDS
+from catstream.services.process import MESSAGE_SECONDS, Process
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
 
 _NONE = {"version": 0.0, "trained": 0.0}
-
-
-def prepare() -> None:
-    """Everything that training needs is imported already."""
 
 
 def main(process: Process) -> None:
@@ -24,12 +19,12 @@ def main(process: Process) -> None:
         while not process.stop_requested:
             message = samples.receive(MESSAGE_SECONDS)  # of the object that has waited longest
             if isinstance(message, End):
-                process.source_failed = message.failed
+                process.source_failed, process.has_ended = message.failed, True
                 process.beat(lambda: _totals(trained), lambda: trained, now=True)
                 break
             # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
             if message is not None and message.version != trained.get(message.object, _NONE)["version"]:
-                process.watchdog.allow(TRAIN_SECONDS)
+                process.watchdog.allow()
                 models.send(trainer.train(message))
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}
@@ -37,7 +32,7 @@ def main(process: Process) -> None:
                     del trained[next(iter(trained))]
             models.serve_late_joiners()
             process.beat(lambda: _totals(trained), lambda: trained)
-        process.watchdog.allow(CLOSE_SECONDS)
+        process.watchdog.allow()
 
 
 def _totals(trained: dict[str, dict[str, float]]) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import mmap
 import os
 import signal
 import time
@@ -16,9 +17,6 @@ from secrets import token_hex
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.messages.kinds import Health
 from catstream.run.job import Job
-from catstream.services.process_title import set_process_title
-from catstream.services.timing import HEALTH_SECONDS, STUCK_SECONDS
-from catstream.services.watchdog import Watchdog
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
@@ -30,12 +28,85 @@ PERMANENT_FAILURE = 2
 #: Exit code after the source failed, for example a damaged file: the process is not restarted either.
 SOURCE_FAILED = 3
 
-#: Name of the compressor's subscription to the tracks if it records: the detector waits for it before the first frame.
-RECORDER = "recorder"
+#: Exit code after a signal has ended a process of a supervisor before the end of the stream: it is restarted.
+STOPPED_EARLY = 4
 
-_QUICK_SIZE = 128  # coreset size up to which one turn of compressor and trainer is short on any machine
+TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
+MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
+HEALTH_SECONDS = 1.0  #: between two health reports of a process
+RUNNING_SECONDS = 10.0  #: without a turn of its loop, after which a process counts as stuck
+LONG_SECONDS = 120.0  #: the same for a start, and for a step that takes long and was announced
+
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 _log = logging.getLogger(__name__)
+
+
+class Watchdog:
+    """Four numbers in memory that a process shares with its supervisor.
+
+    No messages are involved, which could be late or lost: a supervisor that was suspended reads the newest count at
+    once, and the count stops with the loop of the process, even if other threads continue.
+
+    Parameters
+    ----------
+    handle : inherited file descriptor of the memory; None to make a new one
+
+    Attributes
+    ----------
+    limit : seconds that a turn of the loop may take
+    """
+
+    def __init__(self, handle: int | None = None) -> None:
+        self.limit = RUNNING_SECONDS
+        self.handle = os.memfd_create("watchdog") if handle is None else handle
+        os.truncate(self.handle, 32)
+        self._cells = memoryview(mmap.mmap(self.handle, 32)).cast("d")
+        self.allow()
+
+    @property
+    def turns(self) -> float:
+        """Number of turns of the loop so far."""
+        return self._cells[0]
+
+    @property
+    def patience(self) -> float:
+        """Seconds that the present turn may take."""
+        return self._cells[1]
+
+    def beat(self) -> None:
+        """Count a turn of the loop."""
+        self._cells[1] = self.limit
+        self._cells[0] += 1
+
+    def allow(self, seconds: float = LONG_SECONDS) -> None:
+        """Announce that the present turn takes long."""
+        self._cells[1] = seconds
+        self._cells[0] += 1
+
+    @property
+    def after(self) -> int:
+        """Number of the last frame that the owner of the run had when the process was started."""
+        return int(self._cells[2])
+
+    @after.setter
+    def after(self, seq: int) -> None:
+        self._cells[2] = self._cells[3] = seq
+
+    @property
+    def read(self) -> float:
+        """Number of the last frame that the owner of the run has read, infinite once it has received the end.
+
+        A detector is not too far ahead of it.
+        """
+        return self._cells[3]
+
+    @read.setter
+    def read(self, seq: float) -> None:
+        self._cells[3] = seq
+
+    def close(self) -> None:
+        """Close the file descriptor; the memory stays as long as the object."""
+        os.close(self.handle)
 
 
 class Process:
@@ -47,6 +118,7 @@ class Process:
     settings, endpoint : settings and endpoint of the job
     trouble, source : description of a current problem, and the source; both are published with the health
     source_failed : whether the stream ended because the source failed
+    has_ended : whether the process has sent or received the end of the stream
     watchdog : counts the turns of the loop
     """
 
@@ -56,10 +128,8 @@ class Process:
         # Of processes that were started by hand, only the detector knows that a run begins.
         self.endpoint = replace(place, run=job.run or (token_hex(8) if name == "detector" else ""))
         self.trouble = self.source = ""
-        self.source_failed = False
-        # One turn of the compressor or the trainer takes a time that grows with the coreset size.
-        factor = 1.0 if name == "detector" else max(1.0, (job.settings.coreset.size / _QUICK_SIZE) ** 2)
-        self.watchdog = Watchdog(watchdog, STUCK_SECONDS * factor)
+        self.source_failed = self.has_ended = False
+        self.watchdog = Watchdog(watchdog)
         self._stop_moment = float("inf")  # at which a signal asked the process to end
         self._health = Publisher(HEALTH, self.endpoint, sender=name)
         self._reported = 0.0
@@ -109,8 +179,8 @@ def run(
 ) -> int:
     """Run the detector, the compressor or the trainer; return its exit code.
 
-    The code is 0 at the end of the stream or after SIGTERM, `SOURCE_FAILED` if the source failed, and
-    `PERMANENT_FAILURE` for an error that would occur again.
+    The code is 0 at the end of the stream, or after SIGTERM if the process was started by hand; otherwise one of the
+    constants above.
 
     Parameters
     ----------
@@ -121,10 +191,8 @@ def run(
     """
     if parent is not None:
         die_with(parent)
-    set_process_title(name)
-    log_as(name)
-    service = import_module(f"catstream.services.{name}")
-    service.prepare()
+    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)  # the supervisor selects by it
+    service = import_module(f"catstream.services.{name}_process")
     try:
         job = Job.load(job) if isinstance(job, Path) else job
         job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
@@ -139,12 +207,9 @@ def run(
     except CatstreamError as error:
         _log.error("%s", error)
         return PERMANENT_FAILURE
-    return SOURCE_FAILED if process.source_failed else 0
-
-
-def log_as(name: str) -> None:
-    """Begin each line of the log with the name of the process; the supervisor selects the lines by it."""
-    logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)
+    if process.source_failed:
+        return SOURCE_FAILED
+    return 0 if process.has_ended or parent is None else STOPPED_EARLY
 
 
 def die_with(parent: int) -> None:

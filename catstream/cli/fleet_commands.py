@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console, Group, RenderableType
@@ -22,27 +22,21 @@ from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import check_file, screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
-from catstream.errors import FleetError, SilenceError
-from catstream.fleet.timing import SHOW_SECONDS, UP_SECONDS
+from catstream.errors import FleetError
 from catstream.messages import storage
-from catstream.messages.kinds import FleetStatus
+from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.messages.names import UNNAMED, split_name
 from catstream.services.options import PATH, with_json, with_keys, with_overwrite
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
 
-_STARTED = ("running", "waiting", "paused", "ended", "failed", "unplaced")
+UP_SECONDS = 120.0  # limit for the streams to start, after which `up` waits no longer
+_SHOW_SECONDS = 0.5  # between two pictures of the status
+_STARTED = ("running", "waiting", "paused", "ended", "failed")
 
 
-class _InOrder(click.Group):
-    """Lists the commands in the order in which they are defined."""
-
-    def list_commands(self, _: click.Context) -> list[str]:
-        return list(self.commands)
-
-
-@click.group(cls=_InOrder)
+@click.group()
 def fleet() -> None:
     """Run many streams on one machine or on many, and change them while they run.
 
@@ -56,7 +50,6 @@ def fleet() -> None:
       catstream fleet up fleet.toml --address 10.0.0.1:6379   # after `ray start`
       catstream fleet status
       catstream watch tracks --endpoint fleet://cam-1
-      catstream fleet move cam-1 node-2
       catstream fleet down
     """
 
@@ -85,49 +78,29 @@ def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
 
 @fleet.command(short_help="Start the streams of a file, or apply its changes.")
 @click.argument("file", type=PATH)
-@click.option("--nodes", type=click.IntRange(1, 64), help="Nodes to start on this machine; default: as the file says.")
-@click.option("--cores", type=click.IntRange(1), help="Cores of each of them; default: equal shares.")
-@click.option("--detach", is_flag=True, help="Return once the streams run; `catstream fleet down` ends them.")
-@click.option("--replace", is_flag=True, help="Replace the streams of another file that run under this name.")
-@click.option("--wait", is_flag=True, help="Let streams that do not fit wait for nodes that join later.")
 @with_fleet
-def up(running: Fleet, replace: bool, **options: Any) -> None:
+def up(running: Fleet) -> None:
     """Start the streams of FILE, or apply its changes to a fleet that runs.
 
     On a cluster of Ray (--address), or if the fleet runs already, the command
     returns once the streams run. Otherwise it starts Ray on this machine, and
-    ends it and the streams on Ctrl-C; with --detach they run on. The next `up`
-    continues from the last states. A stream that runs and is unchanged is not
-    touched. If a stream can run on no node, nothing is changed. The name of the
+    ends it and the streams on Ctrl-C. The next `up` continues from the last
+    states. A stream that runs and is unchanged is not touched. The name of the
     fleet is the one in FILE, or the name of FILE; --name replaces it.
 
     \b
     EXAMPLES
       catstream fleet up examples/fleet.toml
-      catstream fleet up examples/fleet.toml --detach
       catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
-    console = screen()
-    try:
-        lines = _up(running, replace=replace, **options)
-    except FleetError as error:
-        if "(--replace)" not in str(error) or not sys.stdin.isatty():
-            raise
-        click.confirm(f"{str(error).partition(': give')[0]}. Replace them?", abort=True)
-        lines = _up(running, replace=True, **options)
+    with Console(stderr=True).status("starting the fleet"):
+        lines = running.up()
     for line in lines:
         click.echo(line)
     with suppress(KeyboardInterrupt):
-        _watch(console, running)
-        if running.is_owner:
-            _watch_until_its_end(console, running)
-    if running.is_owner:
+        _watch(screen(), running)
+    if running.is_owner and running.is_running:
         _down(running)
-
-
-def _up(fleet: Fleet, **options: Any) -> list[str]:
-    with Console(stderr=True).status("starting the fleet"):
-        return fleet.up(**options)
 
 
 def _down(fleet: Fleet) -> None:
@@ -141,38 +114,29 @@ def _down(fleet: Fleet) -> None:
 
 
 def _watch(console: Console, fleet: Fleet) -> None:
-    """Show the streams until all have started."""
+    """Show the streams until all have started; of a fleet that this program has started, until its end."""
     deadline = time.monotonic() + UP_SECONDS
     status = fleet.status()
     try:
         with Live(console=console, transient=True) as live:
-            while not all(each.state in _STARTED for each in status.streams.values()) and time.monotonic() < deadline:
+            while fleet.is_owner or time.monotonic() < deadline:
+                if not fleet.is_owner and all(map(_has_started, status.streams.values())):
+                    break
                 live.update(Group(*_tables(status)))
-                time.sleep(SHOW_SECONDS)
-                status = fleet.status()
+                time.sleep(_SHOW_SECONDS)
+                try:
+                    status = fleet.status()
+                except FleetError:
+                    if fleet.is_running:
+                        raise
+                    click.echo(f"the fleet {fleet.name} was ended from elsewhere")
+                    return
     finally:
-        if not fleet.is_owner:
-            _show(console, status)
+        console.print(*_tables(status), sep="\n")
 
 
-def _watch_until_its_end(console: Console, fleet: Fleet) -> None:
-    """Show the streams of a fleet that this program has started, until Ctrl-C, or until another one ends it.
-
-    The registry is asked, without Ray, which prints lines of its own if its head is gone.
-    """
-    fleet.disconnect()
-    status = FleetStatus(fleet.name, 0.0)
-    try:
-        with Registry(fleet.name, timeout=UP_SECONDS) as registry, Live(console=console, transient=True) as live:
-            registry.timeout = SHOW_SECONDS
-            while fleet.is_running:
-                with suppress(SilenceError):  # Ray starts the controller again
-                    status = registry.streams()
-                live.update(Group(*_tables(status)))
-                time.sleep(SHOW_SECONDS)
-    finally:
-        _show(console, status)
-    click.echo(f"the fleet {fleet.name} was ended from elsewhere")
+def _has_started(stream: StreamStatus) -> bool:
+    return stream.state in _STARTED or bool(stream.trouble)
 
 
 @fleet.command()
@@ -183,7 +147,7 @@ def status(fleet: str, keys: str, as_json: bool) -> None:
     """Show all streams and nodes of a fleet.
 
     The exit code is 1 if something is wrong with a stream: each line below the
-    table says what, for example that it has failed or skips frames.
+    table says what, for example that its source cannot be opened.
 
     \b
     EXAMPLES
@@ -195,7 +159,7 @@ def status(fleet: str, keys: str, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(dataclasses.asdict(found)))
     else:
-        _show(screen(), found)
+        screen().print(*_tables(found), sep="\n")
     if any(each.trouble for each in found.streams.values()):
         sys.exit(1)
 
@@ -227,10 +191,6 @@ def add(
     """Add a stream, or change the one of that name.
 
     To keep the change, put it into the file of the fleet too.
-
-    \b
-    EXAMPLE
-      catstream fleet add cam-7 --source rtsp://10.0.0.7/1 --box 120,80,64,48 --label site=north
     """
     from catstream.fleet.spec import StreamSpec
 
@@ -252,31 +212,9 @@ def add(
 @click.option("--forget", is_flag=True, help="Remove what they have learned, too.")
 @with_fleet
 def remove(running: Fleet, names: tuple[str, ...], forget: bool) -> None:
-    """Remove streams; what they have learned stays in the store.
-
-    \b
-    EXAMPLE
-      catstream fleet remove cam-7
-    """
+    """Remove streams; what they have learned stays in the store."""
     for line in running.remove(*names, forget=forget):
         click.echo(line)
-
-
-@fleet.command(short_help="Move a stream to a node.")
-@click.argument("name")
-@click.argument("node")
-@with_fleet
-def move(running: Fleet, name: str, node: str) -> None:
-    """Move the stream NAME to a NODE, where it stays until the node dies or drains.
-
-    The stream stores its state, ends, and continues on the other node; a live
-    stream loses the frames of about three seconds.
-
-    \b
-    EXAMPLE
-      catstream fleet move cam-7 node-2
-    """
-    click.echo(running.move(name, node))
 
 
 @fleet.command(short_help="Move all streams from a node.")
@@ -287,22 +225,8 @@ def drain(running: Fleet, node: str, undo: bool) -> None:
     """Move all streams from a NODE and place none there, before it is switched off.
 
     Streams wait if the other nodes have no room for them.
-
-    \b
-    EXAMPLE
-      catstream fleet drain node-2
     """
     click.echo(running.drain(node, undo=undo))
-
-
-@fleet.command(short_help="Print what a stream has logged.")
-@click.argument("name")
-@click.option("--lines", default=100, show_default=True, type=click.IntRange(min=1), help="How many of the last lines.")
-@with_fleet
-def logs(running: Fleet, name: str, lines: int) -> None:
-    """Print what the stream NAME has logged on its node since it started there."""
-    for line in running.logs(name, lines) or [f"{name} has logged nothing since it started there"]:
-        click.echo(line)
 
 
 @fleet.command(short_help="Merge what several streams have learned of an object.")
@@ -325,8 +249,7 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
     seconds old. Frames that several states contain are counted once.
 
     \b
-    EXAMPLES
-      catstream fleet merge --object anna
+    EXAMPLE
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
     if output is not None:
@@ -354,10 +277,6 @@ def down(running: Fleet) -> None:
     _down(running)
 
 
-def _show(console: Console, status: FleetStatus) -> None:
-    console.print(*_tables(status), sep="\n")
-
-
 def _tables(status: FleetStatus) -> list[RenderableType]:
     """The streams, what is wrong with them, a line for each, and the nodes."""
     troubles = [Text(f"{each.name}: {each.trouble}") for each in status.streams.values() if each.trouble]
@@ -366,31 +285,19 @@ def _tables(status: FleetStatus) -> list[RenderableType]:
 
 def _streams(status: FleetStatus) -> Table:
     """A row for each stream, those with trouble first."""
-    numbers = ("frames/s", "skipped", "lost", "cores", "model", "restarts")
+    numbers = ("frame", "skipped", "model")
     shown = table("stream", "node", "state", *numbers, right=numbers)
     for each in sorted(status.streams.values(), key=lambda each: (not each.trouble, each.name)):
-        model = max(each.models.values(), default=0)
-        restarts = str(each.restarts) if each.restarts else "-"
-        shown.add_row(
-            each.name,
-            each.node or "-",
-            each.state,
-            f"{each.rate:.1f}" if each.rate else "-",
-            str(each.skipped or "-"),
-            str(each.lost_frames or "-"),
-            f"{each.cores:.1f}" if each.cores else "-",
-            str(model or "-"),
-            restarts,
-        )
+        figures = (each.frame, each.skipped, max(each.models.values(), default=0))
+        shown.add_row(each.name, each.node or "-", each.state, *(str(figure or "-") for figure in figures))
     return shown
 
 
 def _nodes(status: FleetStatus) -> Table:
-    numbers = ("\nreserved", "\nof cores", "\nstreams")
+    numbers = ("\nstreams", "\ncores")
     shown = table("\nnode", "\nstate", "\naddress", *numbers, "\nlabels", right=numbers)
     for each in status.nodes.values():
         labels = ", ".join(f"{key}={value}" for key, value in each.labels.items())
-        shown.add_row(
-            each.name, each.state, each.address, f"{each.used:.2g}", f"{each.cores:.3g}", str(each.streams), labels
-        )
+        cores = f"{each.used:.3g} of {each.cores:.3g}"
+        shown.add_row(each.name, each.state, each.address, str(each.streams), cores, labels)
     return shown

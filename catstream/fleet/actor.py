@@ -1,0 +1,316 @@
+"""A stream of a fleet: one pipeline on this node, its state in the store, and what the controller asks for.
+
+A `Stream` has nothing of Ray in it; `catstream.fleet.controller` makes an actor of it. Its pipeline runs in a thread of
+its own, and is started again after a failure. Its state is stored by another thread, which also looks for merged models
+in the store, so that a slow store does not stop the tracks.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from hashlib import sha256
+
+from catstream.client.control import control
+from catstream.errors import CatstreamError, CommandRejectedError, FencedError, FleetError, ServiceError, StoreError
+from catstream.fleet.spec import StreamSpec
+from catstream.fleet.store import Claim, Generation, Store
+from catstream.messages.kinds import StreamState, StreamStatus, Track
+from catstream.messages.storage import Metadata
+from catstream.pipeline import Pipeline
+from catstream.run.learned import Learned
+from catstream.run.state import files, restore
+from catstream.video.frames import without_password
+from catstream.video.source import is_live
+from catstream.wire.channels import CHANNELS
+from catstream.wire.endpoint import private_folder
+from catstream.wire.keys import Client, ensure, public_key, synchronise
+
+#: Ports that streams listen on, below those that the kernel gives to connections: each has a block of them.
+PORTS = range(21000, 32000, 1 + max(channel.port + len(channel.senders) for channel in CHANNELS.values()))
+
+FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled each time
+LONGEST_PAUSE_SECONDS = 60.0  # the most of these
+_FORGOTTEN_SECONDS = 60.0  # of running, after which earlier failures do not count
+_TRACKS_SECONDS = 0.1  # longest wait for a frame
+_STORING_SHARE = 0.1  # of the time, at most, in which states are stored
+_LATE = 3.0  # a state that is older than so many intervals is a trouble
+
+#: What a pipeline reports if no frames are tracked, as the state of a stream.
+_HOLDING: dict[str, StreamState] = {"waiting": "waiting", "paused": "paused"}
+
+_log = logging.getLogger(__name__)
+
+
+def given_model(stream: str, name: str) -> str:
+    """The name in the store of a saved model that the spec of a stream gives for an object."""
+    return f"given.{sha256(f'{stream}/{name}'.encode()).hexdigest()[:32]}"
+
+
+class Stream:
+    """Runs the pipeline of one stream until it ends or is stopped, and stores its state again and again.
+
+    node     id of its node
+    address  IP address at which other machines reach its sockets; empty if all clients are on this machine
+    clients  the clients that may connect, by name, if there is an address
+    every    seconds between two states in the store
+    """
+
+    def __init__(
+        self, spec: StreamSpec, node: str, address: str, clients: dict[str, Client], store: str, every: float
+    ) -> None:
+        self._spec, self._address, self._clients = spec, address, clients
+        self._url, self._every = store, every
+        self._store: Store
+        source = without_password(spec.source)
+        self._status = StreamStatus(spec.name, "starting", node, source, live=is_live(spec.source))
+        self._stop, self._lock = threading.Event(), threading.Lock()
+        self._stored_at = 0.0  # seconds since 1970 at which the state was that in the store
+        self._began_at = 0.0  # the same, of the start of the pipeline
+        self._failure = self._store_trouble = self._pipeline_trouble = ""
+        self._superseded = self._has_tracked = False
+        self._files: set[tuple[str, int]] = set()  # of the state that was stored last, with their times
+        self._follow: tuple[str, ...] = spec.follow
+        self._present: set[str] = set()  # objects that the last frame shows
+        self._stack = ExitStack()
+        self._folder = self._stack.enter_context(private_folder())
+        self._keys = self._folder / "keys"
+        self._thread = threading.Thread(target=self._run, name=f"stream {spec.name}", daemon=True)
+        self._thread.start()
+
+    def report(
+        self, clients: dict[str, Client] | None = None, follow: Iterable[str] | None = None
+    ) -> tuple[StreamStatus, bool]:
+        """The state of the stream now, and whether it ended because another process has claimed it.
+
+        From now on, only these clients may connect, and it searches for these objects by their newest merged models.
+        """
+        with self._lock:
+            if clients is not None and clients != self._clients:
+                self._clients = clients
+                if self._address and self._keys.exists():
+                    synchronise(self._keys, clients)
+            self._follow = self._follow if follow is None else tuple(follow)
+            age = time.time() - self._stored_at if self._stored_at else 0.0
+            is_late = min(age, time.time() - self._began_at) > _LATE * self._every and not self._store_trouble
+            late = f"its state was stored {age:.0f} s ago" if is_late and self._status.state == "running" else ""
+            troubles = filter(None, (self._failure, self._store_trouble, late, self._pipeline_trouble))
+            stored = age if self._stored_at else None
+            return replace(self._status, stored_seconds=stored, trouble="; ".join(troubles)), self._superseded
+
+    def stop(self) -> str:
+        """End the pipeline, and store its last state; returns why it could not be stored, or nothing."""
+        self._stop.set()
+        self._thread.join()
+        self._stack.close()
+        return self._store_trouble
+
+    def _run(self) -> None:
+        """Run the pipeline, again after each failure, until the stream ends, is stopped, or is superseded."""
+        pause = FIRST_PAUSE_SECONDS
+        while not self._stop.is_set():
+            began = time.monotonic()
+            try:
+                self._run_once()
+                return
+            except StoreError as error:  # the claim: nothing has begun
+                self._store_trouble = str(error)
+            except Exception as error:  # the controller has to see it
+                _log.warning("%s failed", self._spec.name, exc_info=not isinstance(error, CatstreamError))
+                with self._lock:
+                    is_known = isinstance(error, CatstreamError)
+                    self._failure = str(error) if is_known else f"{type(error).__name__}: {error}"
+                    self._pipeline_trouble = ""
+                    self._status = replace(self._status, state="failed", endpoint="")
+            pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
+            self._stop.wait(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
+
+    def _run_once(self) -> None:
+        """Claim the stream, and run the pipeline from the state in the store, or from the start."""
+        self._store = Store(self._url)
+        claim = self._store.stream(self._spec.name).claim(f"{self._status.node} process {os.getpid()}")
+        self._store_trouble = ""
+        shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
+        self._has_tracked, self._files = False, set()
+        facts: Metadata = claim.state.facts if claim.state is not None else {}
+        if claim.state is not None and facts["ended"]:
+            if facts["digest"] == self._spec.digest:
+                with self._lock:
+                    self._stored_at = float(facts["time"])
+                    self._status = replace(self._status, state="ended", frame=int(facts["frame"]))
+                return
+            claim.state, facts = None, {}  # it was changed since: it begins again
+        with ExitStack() as stack:
+            pipeline = stack.enter_context(self._made(claim, stack))
+            with self._lock:
+                self._failure = ""
+                self._began_at, self._stored_at = time.time(), float(facts.get("time", 0.0))
+                server = public_key(self._keys) if self._address else ""
+                self._status = replace(
+                    self._status, state="starting", endpoint=pipeline.endpoint, server=server, token=claim.token
+                )
+            self._change_objects(pipeline, facts)
+            over = threading.Event()
+            storing = threading.Thread(target=self._keep_storing, args=(claim, pipeline, over), name="store")
+            storing.daemon = True  # a store that hangs must not keep the process
+            storing.start()
+            stack.callback(storing.join)
+            stack.callback(over.set)
+            ended = self._take_all(pipeline)
+        self._write_last(claim, ended=ended)
+
+    def _take_all(self, pipeline: Pipeline) -> bool:
+        """Take the tracks until the source ends, or the stream is to stop; returns whether the source has ended."""
+        for tracks in pipeline.by_frame(_TRACKS_SECONDS):
+            self._take(pipeline, tracks)
+            if self._stop.is_set():
+                return False
+        return True
+
+    def _write_last(self, claim: Claim, *, ended: bool) -> None:
+        """Store the last state. A stream has ended once that is done, so it is tried again until it is."""
+        while not self._superseded:
+            self._write(claim, is_last=True, ended=ended)
+            if not self._store_trouble:
+                with self._lock:
+                    self._status = replace(self._status, state="ended" if ended else self._status.state)
+                return
+            if not ended or self._stop.wait(self._every):
+                return
+
+    def _made(self, claim: Claim, stack: ExitStack) -> Pipeline:
+        """The pipeline, which continues from the state of the claim if there is one."""
+        settings = self._spec.settings | self._sockets(stack)
+        state = self._folder / "state"
+        if claim.state is None:
+            return Pipeline(self._spec.source, self._spec.boxes or None, settings, state=state)
+        restore(state, claim.state.files)
+        return Pipeline(self._spec.source, settings=settings, resume=state)
+
+    def _sockets(self, stack: ExitStack) -> dict[str, object]:
+        """The settings of the sockets: those of a private folder, or ports of this node with keys made here."""
+        if not self._address:
+            return {"run.endpoint": "", "run.keys": ""}
+        with self._lock:
+            ensure(self._keys)
+            synchronise(self._keys, self._clients)
+        return {
+            "run.endpoint": f"tcp://{self._address}:{free_ports(self._address, stack)}",
+            "run.keys": str(self._keys),
+        }
+
+    def _change_objects(self, pipeline: Pipeline, facts: Metadata) -> None:
+        """Begin the objects that the spec has now and had not when the state was made, and forget the others."""
+        before = set(facts["objects"]) if facts else set(self._spec.boxes)
+        now = self._spec.boxes.keys() | self._spec.models.keys()
+        begin, forget = sorted(self._spec.boxes.keys() - before), sorted(before - now)
+        if begin or forget:  # a peer that connects for nothing counts as rejected
+            with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
+                for name in begin:
+                    controlled.set_box(self._spec.boxes[name], name)
+                for name in forget:
+                    with suppress(CommandRejectedError):  # it was forgotten already
+                        controlled.forget(name)
+        for name in sorted(self._spec.models.keys() - before):
+            if (model := self._store.model(given_model(self._spec.name, name)).newest()) is None:
+                raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
+            self._search(pipeline, model, name)
+
+    def _search(self, pipeline: Pipeline, model: Generation, name: str) -> None:
+        """Search for an object by a saved model in the store."""
+        learned = Learned.from_bytes(model.files["model"], f"the model of {name!r} in the store")
+        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
+            controlled.search(learned, name)
+
+    def _search_merged(self, pipeline: Pipeline, known: dict[str, int]) -> None:
+        """Search for each followed object that is not present by a merged model that is newer than the known one."""
+        for name in self._follow:
+            if name in self._present:
+                continue
+            if (model := self._store.model(name).newest(known.get(name, 0))) is not None:
+                known[name] = model.token
+                self._search(pipeline, model, name)
+
+    def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
+        """Take the tracks of a frame; an empty mapping means that none has arrived for a while."""
+        troubles = [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
+        if pipeline.lost_seconds:
+            troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
+        with self._lock:
+            status = self._status
+            if tracks:
+                self._has_tracked = True
+                self._present = {name for name, track in tracks.items() if track.box is not None}
+                models = {name: track.model_version for name, track in tracks.items()}
+                status = replace(status, frame=next(iter(tracks.values())).frame, models=models)
+            state = _HOLDING.get(pipeline.holding, "running" if self._has_tracked else "starting")
+            skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
+            self._status = replace(status, state=state, skipped=skipped)
+            self._pipeline_trouble = "; ".join(troubles)
+
+    def _keep_storing(self, claim: Claim, pipeline: Pipeline, over: threading.Event) -> None:
+        """Store the state every few seconds until the pipeline is over, or another process has claimed the stream."""
+        known: dict[str, int] = {}  # token of the merged model of each object that was searched for
+        pause = self._every
+        while not over.wait(pause) and not self._superseded:
+            began = time.monotonic()
+            self._write(claim)
+            pause = max(self._every, (time.monotonic() - began) / _STORING_SHARE)
+            try:
+                self._search_merged(pipeline, known)
+            except CatstreamError as error:
+                _log.warning("%s does not search by a merged model: %s", self._spec.name, error)
+
+    def _write(self, claim: Claim, *, is_last: bool = False, ended: bool = False) -> None:
+        """Store the newest checkpoint, if it has changed. A failure is a trouble; a newer claim ends the stream."""
+        state, trouble, now = self._folder / "state", "", time.time()
+        facts: Metadata = {
+            "time": now,
+            "frame": self._status.frame,
+            "objects": sorted(self._spec.boxes.keys() | self._spec.models.keys()),
+            "digest": self._spec.digest,
+            "ended": ended,
+        }
+        try:
+            found = {(str(path), path.stat().st_mtime_ns) for path in state.rglob("*.*") if path.is_file()}
+            if found == self._files and not is_last:
+                claim.check()
+                self._stored_at = now
+            elif content := files(state):
+                claim.write(content, facts)
+                self._files, self._stored_at = found, now
+            else:  # no checkpoint yet
+                claim.check()
+        except FencedError as error:
+            _log.warning("%s: %s", self._spec.name, error)
+            self._superseded = True
+            self._stop.set()
+        except FileNotFoundError:
+            pass  # a newer checkpoint has just taken its place: the next turn stores it
+        except (ServiceError, OSError) as error:
+            trouble = f"its state cannot be stored: {error}"
+        with self._lock:
+            self._store_trouble = trouble
+
+
+def free_ports(address: str, stack: ExitStack) -> int:
+    """The first of some ports of this node that are free, and that no other stream takes while the stack is open."""
+    while True:
+        first = random.choice(PORTS)
+        with ExitStack() as tried, suppress(OSError):
+            reserved = tried.enter_context(socket.socket(socket.AF_UNIX))
+            reserved.bind(f"\0catstream-ports-{first}")  # the kernel frees it if this process dies
+            with ExitStack() as probes:
+                for port in range(first, first + PORTS.step):
+                    probes.enter_context(socket.socket()).bind((address, port))
+            stack.enter_context(tried.pop_all())
+            return first

@@ -1,0 +1,61 @@
+"""The channel `results`: the tracks of each frame, for the program that owns the run.
+
+A PUSH socket connects to the PULL socket of the owner. Nothing is acknowledged: the owner has started the detector, and
+a detector that it starts again goes on after the last frame that the owner has. It drops what it has by `seq`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+import zmq
+
+from catstream.messages.kinds import End, Tracks
+from catstream.wire.channels import RESULTS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.socket import ChannelSocket
+
+
+class ResultsSender(ChannelSocket[Tracks | End]):
+    """The detector's side; `size` messages are queued at most on either side."""
+
+    def __init__(self, endpoint: Endpoint, size: int) -> None:
+        super().__init__(zmq.PUSH, RESULTS, endpoint, high_water_mark=size)
+        self._connect()
+
+    def send(self, message: Tracks | End, seconds: float) -> bool:
+        """Send a message; returns False if there was no room for it within so many seconds."""
+        data = self._encode(message)
+        if self._socket.poll(round(seconds * 1000), zmq.POLLOUT):
+            with contextlib.suppress(zmq.Again):
+                self._socket.send(data, zmq.NOBLOCK)
+                return True
+        return False
+
+
+class ResultsReceiver(ChannelSocket[Tracks | End]):
+    """The owner's side: each frame once, in order.
+
+    Parameters
+    ----------
+    last : number of the last message that the owner has
+
+    Attributes
+    ----------
+    last : number of the last message that was received
+    """
+
+    def __init__(self, endpoint: Endpoint, size: int, last: int) -> None:
+        super().__init__(zmq.PULL, RESULTS, endpoint, high_water_mark=size)
+        self.last = last
+        self._bind()
+
+    def receive(self, seconds: float) -> Tracks | End | None:
+        """The next message that is new, None if none arrived in time."""
+        if not self._wait(seconds):
+            return None
+        message = self._decode(self._socket.recv(), *self.channel.messages)
+        if message is None or (message.seq <= self.last and isinstance(message, Tracks)):
+            return None
+        self.last = max(message.seq, self.last)
+        return message

@@ -1,0 +1,142 @@
+"""What a command changes, and what it is answered: pure functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from catstream.detection.objects import Detectors
+from catstream.errors import ObjectError
+from catstream.messages.kinds import Answer, Command
+from catstream.messages.names import UNNAMED, check_count, check_name, listed
+from catstream.run.learned import check_sizes
+from catstream.services.decisions import DesiredObject, DesiredState
+
+#: The reason of a stream's end, if a command stopped it.
+STOPPED = "it was stopped by a command"
+
+#: A desired state, and the answer to the command that has led to it.
+Changed = tuple[DesiredState, Answer]
+
+
+def carried_out(
+    command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None = None
+) -> Changed:
+    """The desired state after a command that needs no frame, and the answer.
+
+    Parameters
+    ----------
+    detectors : the objects that are tracked now; they are not changed
+    model : the object that a saved model begins, for the command `search`
+
+    Raises
+    ------
+    ObjectError, SettingsError
+        If the command cannot be carried out.
+    """
+    return _VERBS[command.verb](command, desired, detectors, model)
+
+
+def answer(
+    command: Command, detectors: Detectors, done: bool, reason: str, name: str | None = None, frame: int | None = None
+) -> Answer:
+    """The answer to a command for the object `name`, by default that of the command."""
+    name = command.object if name is None else name
+    frame = max(detectors.seq - 1, 0) if frame is None else frame
+    known = detectors.detectors.get(name)
+    box, version = (known.box, known.model.version) if known is not None else (None, 0)
+    return Answer(command.id, done, reason, frame, box, version, name)
+
+
+def object_of(command: Command, desired: DesiredState) -> str:
+    """The name of the object that a command is for: without a name, the object that has none, or the only one."""
+    names = desired.objects
+    if command.object or not names or UNNAMED in names:
+        return check_name(command.object)
+    if len(names) > 1:
+        raise ObjectError(f"which object? This run has {listed(names)}: give a name")
+    return next(iter(names))
+
+
+def check_room(name: str, desired: DesiredState, most: int) -> None:
+    """Raise ObjectError if there is no room for an object of this name."""
+    if name not in desired.objects:
+        check_count(len(desired.objects) + 1, most)
+
+
+def is_kept(command: Command, name: str, desired: DesiredState, detectors: Detectors) -> bool:
+    """Whether a box is for the same object; one without a model has nothing that could be kept."""
+    known, each = detectors.detectors.get(name), desired.objects.get(name)
+    return command.keep and bool(known and known.model.version and each and each.begins <= detectors.seq)
+
+
+def _pause(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
+    return replace(desired, paused=True), answer(command, detectors, True, f"paused {_after(detectors)}")
+
+
+def _resume(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
+    desired = replace(desired, paused=False)
+    effect = "waiting for a box" if desired.holds else f"resumed {_after(detectors)}"
+    return desired, answer(command, detectors, True, effect)
+
+
+def _stop(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
+    return replace(desired, stopped=True), answer(command, detectors, True, f"the stream ends {_after(detectors)}")
+
+
+def _search(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Changed:
+    """Begin an object in the next frame: it is searched for by a saved model."""
+    name, seq = object_of(command, desired), detectors.seq
+    check_room(name, desired, detectors.settings.run.objects_most)
+    if model is None:
+        raise ObjectError("a search needs a saved model: give the file of one")
+    desired = desired.begun(name, replace(model, begins=seq + 1))
+    check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
+    effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
+    return desired, answer(command, detectors, True, effect, name)
+
+
+def _forget(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
+    """Stop tracking an object from the next frame on; everything learned of it is dropped."""
+    name = _tracked(command, desired)
+    desired = desired.without(name)
+    waits = "" if desired.objects else ": no object is left, so the run waits for a box"
+    effect = f"{listed([name])} is no longer tracked {_after(detectors)}{waits}"
+    return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
+
+
+def _save(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
+    """Answer with the version of the model; the client writes the file."""
+    name = _tracked(command, desired)
+    known = detectors.detectors.get(name)
+    if known is None or known.state is None or not known.model.version:
+        why = "nothing was learned of the object yet: try again once there is a model (catstream status)"
+    elif known.state.is_sought:
+        why = "the object of the saved model was not found yet: try again once it was"
+    else:
+        return desired, answer(command, detectors, True, f"model {known.model.version} {_after(detectors)}", name)
+    return desired, answer(command, detectors, False, why, name)
+
+
+_VERBS: dict[str, Callable[[Command, DesiredState, Detectors, DesiredObject | None], Changed]] = {
+    "pause": _pause,
+    "resume": _resume,
+    "stop": _stop,
+    "search": _search,
+    "forget": _forget,
+    "save": _save,
+}
+
+
+def _tracked(command: Command, desired: DesiredState) -> str:
+    """The name of the object that a command is for; ObjectError if there is no such object."""
+    name, names = object_of(command, desired), desired.objects
+    if not names:
+        raise ObjectError("no object is tracked yet: give one a box first (set-box), or a saved model (search)")
+    if name not in names:
+        raise ObjectError(f"there is no object {name!r}: the objects are {listed(names)}")
+    return name
+
+
+def _after(detectors: Detectors) -> str:
+    return f"after frame {detectors.seq - 1}" if detectors.seq else "before the first frame"

@@ -1,0 +1,208 @@
+"""A stream of a fleet without Ray: its pipeline, its state in the store, and its end."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import pytest
+
+from catstream.box import Box
+from catstream.client.control import control
+from catstream.errors import StoreError
+from catstream.fleet import actor as module
+from catstream.fleet.actor import PORTS, Stream, free_ports
+from catstream.fleet.spec import StreamSpec
+from catstream.fleet.store import Claim, Store
+from catstream.video.live_demo import first_box
+
+FRAMES = 60
+LIVE = "demo:1"
+
+
+@pytest.fixture
+def store(tmp_path):
+    (tmp_path / "store").mkdir()
+    return (tmp_path / "store").as_uri()
+
+
+@pytest.fixture
+def spec(demo_video):
+    path, truth = demo_video(FRAMES)
+    return StreamSpec("cam-7", str(path), {"": Box(*truth[0])}, settings={"run.lockstep": True})
+
+
+@pytest.fixture
+def long_spec(demo_video):
+    """A stream that runs for seconds after the store fails."""
+    path, truth = demo_video(400)
+    return StreamSpec("cam-7", str(path), {"": Box(*truth[0])}, settings={"run.lockstep": True})
+
+
+@contextmanager
+def started(spec, store, node="n1", every=0.2, address=""):
+    stream = Stream(spec, node, address, {}, store, every)
+    try:
+        yield stream
+    finally:
+        stream.stop()
+
+
+def test_a_stream_runs_to_its_end_and_its_state_is_stored(spec, store, until):
+    with started(spec, store) as stream:
+        until(lambda: stream.report()[0].state == "ended")
+    status = stream.report()[0]
+    assert (status.node, status.frame, status.trouble) == ("n1", FRAMES - 1, "")
+    state = Store(store).stream("cam-7").newest()
+    assert (state.facts["ended"], state.facts["frame"]) == (True, FRAMES - 1)
+
+
+def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
+    with started(spec, store) as first:
+        until(lambda: first.report()[0].frame >= 10)
+    before = Store(store).stream("cam-7").newest()
+    with started(spec, store, "n2") as second:
+        until(lambda: second.report()[0].state == "ended")
+    assert 10 <= before.facts["frame"] < FRAMES - 1
+    assert not before.facts["ended"]
+    assert second.report()[0].token > first.report()[0].token
+    assert Store(store).stream("cam-7").newest().facts["frame"] == FRAMES - 1
+
+
+def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(long_spec, store, until):
+    with started(long_spec, store) as old:
+        until(lambda: Store(store).stream("cam-7").newest() is not None)
+        claim = Store(store).stream("cam-7").claim("another node")
+        until(lambda: old.report()[1])
+    assert Store(store).stream("cam-7").newest().token < claim.token
+    claim.write({"state": b"newer"}, {"ended": False})
+    assert Store(store).stream("cam-7").newest().files == {"state": b"newer"}
+
+
+def test_a_stream_that_has_ended_is_not_run_again(spec, store, until):
+    for _ in range(3):
+        with started(spec, store) as stream:
+            until(lambda: stream.report()[0].state == "ended")
+    status = stream.report()[0]
+    assert (status.endpoint, status.token) == ("", 0)
+    assert status.stored_seconds is not None
+
+
+def test_a_stream_that_has_ended_and_was_changed_begins_anew(spec, store, until):
+    for each in (spec, replace(spec, settings=spec.settings | {"coreset.size": 32})):
+        with started(each, store) as stream:
+            until(lambda: stream.report()[0].state == "ended")
+    assert (stream.report()[0].frame, stream.report()[0].token) == (FRAMES - 1, 2)
+
+
+@pytest.mark.parametrize("address", ["", "127.0.0.1"], ids=["one machine", "with keys"])
+def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, until, tmp_path, monkeypatch, address):
+    monkeypatch.setattr(module, "FIRST_PAUSE_SECONDS", 0.1)
+    path = tmp_path / "late.mp4"
+    with started(replace(spec, source=str(path)), store, address=address) as stream:
+        until(lambda: stream.report()[0].state == "failed")
+        assert "late.mp4" in stream.report()[0].trouble
+        path.symlink_to(spec.source)
+        until(lambda: stream.report()[0].state == "ended")
+    status, is_superseded = stream.report()
+    assert (status.token > 1, status.trouble, is_superseded) == (True, "", False)
+
+
+def test_a_store_that_the_node_cannot_use_is_named(spec, until):
+    with started(spec, "s3://Not_a_bucket") as stream:
+        until(lambda: stream.report()[0].state == "failed")
+        assert "the URL of the store is not valid" in stream.report()[0].trouble
+
+
+def test_followed_objects_are_searched_for_by_the_newest_merged_model_once_they_are_absent(
+    long_spec, store, until, monkeypatch
+):
+    """However many models are merged meanwhile, each is searched for once, and without a thread of its own."""
+    searched = []
+    monkeypatch.setattr(Stream, "_search", lambda _, __, model, name: searched.append((name, model.files["model"])))
+    threads = threading.active_count()
+    with started(replace(long_spec, follow=("anna",)), store, every=0.05) as stream:
+        until(lambda: stream.report()[0].frame >= 3)
+        for number in range(20):
+            Store(store).model("anna").put({"model": b"model %d" % number}, {})
+        until(lambda: searched and searched[-1] == ("anna", b"model 19"))
+        assert threading.active_count() < threads + 20
+        found = len(searched)
+        stream.report(follow=())
+        until(lambda: not stream._follow)
+        Store(store).model("anna").put({"model": b"not followed"}, {})
+    assert [name for name, _ in searched] == ["anna"] * len(searched)
+    assert searched[found:] == []
+
+
+def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until, monkeypatch):
+    written, checked = [], []
+    monkeypatch.setattr(Claim, "write", lambda *given, write=Claim.write: written.append(given) or write(*given))
+    monkeypatch.setattr(Claim, "check", lambda claim, check=Claim.check: checked.append(claim) or check(claim))
+
+    def uploads():
+        before, end = len(written), len(checked) + 20
+        until(lambda: len(checked) > end)
+        return len(written) - before
+
+    with started(StreamSpec("gate", LIVE, {"": first_box(LIVE)}), store, every=0.1) as stream:
+        until(lambda: stream.report()[0].frame > 5)
+        with control(stream.report()[0].endpoint) as controlled:
+            controlled.pause()
+        until(lambda: stream.report()[0].state == "paused")
+        until(lambda: not uploads())  # the last checkpoint may follow
+        assert (uploads(), stream.report()[0].trouble) == (0, "")
+        Store(store).stream("gate").claim("another node")
+        until(lambda: stream.report()[1])
+
+
+def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):
+    spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)})
+    with started(spec, store) as first:
+        until(lambda: (found := Store(store).stream("gate").newest()) is not None and found.facts["frame"] > 60)
+        with started(spec, store, "n2", every=60.0) as second:  # as if the first node had died
+            until(lambda: first.report()[1])
+            status = until(lambda: (found := second.report()[0]).state == "running" and found)
+    assert status.frame > 5
+    assert (status.live, max(status.models.values()) > 0) == (True, True)
+    assert status.stored_seconds is not None, "that of the state that it continued from"
+
+
+def test_no_two_streams_of_a_node_listen_on_the_same_ports(monkeypatch):
+    monkeypatch.setattr(module, "PORTS", PORTS[-8:])
+    with ExitStack() as stack:
+        assert sorted(free_ports("127.0.0.1", stack) for _ in range(8)) == list(PORTS[-8:])
+
+
+def test_a_stream_goes_on_while_the_store_takes_nothing(long_spec, store, until, monkeypatch):
+    def fails(*_):
+        raise StoreError("the store cannot be reached")
+
+    with started(long_spec, store) as stream:
+        until(lambda: stream.report()[0].frame >= 3)
+        with monkeypatch.context() as patch:
+            patch.setattr(Claim, "write", fails)
+            until(lambda: "cannot be stored: the store cannot be reached" in stream.report()[0].trouble)
+            frame = stream.report()[0].frame
+            until(lambda: stream.report()[0].frame > frame)
+        until(lambda: stream.report()[0].trouble == "")
+        monkeypatch.setattr(Claim, "write", fails)
+        assert stream.stop() == "its state cannot be stored: the store cannot be reached"
+
+
+def test_a_stream_has_ended_only_once_its_last_state_is_stored(spec, store, until, monkeypatch):
+    written, write = [], Claim.write
+
+    def fails_at_first(claim, files, facts):
+        if facts["ended"]:
+            written.append(stream.report()[0].state)
+        if len(written) == 1:
+            raise StoreError("the store cannot be reached")
+        write(claim, files, facts)
+
+    monkeypatch.setattr(Claim, "write", fails_at_first)
+    with started(spec, store) as stream:
+        until(lambda: stream.report()[0].state == "ended")
+    assert written == ["running", "running"]
+    assert Store(store).stream("cam-7").newest().facts["ended"]
