@@ -57,7 +57,7 @@ IMPORTERS = {
     "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
-    "av": ["catstream/video", "catstream/applications/loadtest/broadcast.py"],
+    "av": ["catstream/video", "catstream/applications/loadtest/camera.py"],
     "zmq": [
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",

@@ -25,9 +25,10 @@ from mypy import api as mypy
 import catstream
 from catstream.cli import COMMANDS, load_command
 from catstream.fleet import life
+from catstream.run.job import Results
 from catstream.settings import PRESETS, describe
 from catstream.sinks.destinations import EXPORTS, SINKS
-from catstream.sinks.run_files import places_of
+from catstream.sinks.track_log import places_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -155,7 +156,7 @@ def test_the_page_of_the_command_line_shows_every_command_and_option():
 
 def test_every_destination_and_format_of_tracks_is_explained():
     shown = page("docs/how-to/sinks.md")
-    for name in places_of("NAME", Path(), video=True):
+    for name in places_of("NAME", Results(Path(), video=True)):
         assert f"`{name}`" in shown
         assert f"`{name}`" in page("docs/tutorial.md")
     for key in [*(f"FILE{key}" if key[0] == "." else key for key in SINKS), *EXPORTS]:

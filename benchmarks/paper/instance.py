@@ -32,7 +32,7 @@ from sequences import sequences
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.finding.scan import Scan
+from catstream.applications.finding.find import Scan
 from catstream.applications.workers import SPAWN
 from catstream.box import Box
 from catstream.features.score_map import non_maximum_suppression

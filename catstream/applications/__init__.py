@@ -1,1 +1,1 @@
-"""Applications of the tracker: evaluation, finding, summaries and load tests, and the HTML of their reports."""
+"""Applications of the tracker: evaluation, finding and load tests, and the HTML of their reports."""

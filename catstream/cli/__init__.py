@@ -1,4 +1,4 @@
-"""The command line: one module for each command. It has argument parsing and output, no algorithms."""
+"""The command line: argument parsing and output, no algorithms. Commands that belong together share a module."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ COMMANDS = {
 #: Module of the commands that share a module, or whose module has another name.
 _MODULES = {
     "fleet": "fleet_commands",
-    **dict.fromkeys(("set-box", "search", "forget", "pause", "resume", "save", "stop"), "operate"),
-    **dict.fromkeys(("watch", "status"), "attach"),
+    **dict.fromkeys(("watch", "status", "set-box", "search", "forget", "pause", "resume", "save", "stop"), "attach"),
     **dict.fromkeys(("find", "merge"), "models"),
-    **dict.fromkeys(("evaluate", "loadtest"), "measure"),
+    **dict.fromkeys(("evaluate", "loadtest", "demo"), "measure"),
+    **dict.fromkeys(("sink", "export"), "write"),
     **dict.fromkeys(("keys", "settings"), "configure"),
 }
 

@@ -32,6 +32,7 @@ def keys() -> None:
       catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=tcp://0.0.0.0:5700 --set run.keys=keys
       catstream keys allow keys phone --output phone-keys
       catstream watch tracks --endpoint tcp://10.0.0.1:5700 --keys phone-keys
+      catstream keys list keys
       catstream keys revoke keys phone
     """
 
@@ -44,10 +45,6 @@ def new(folder: Path) -> None:
     DIR gets the key pair of the listening sockets, the key pair of the
     pipeline's own processes, and the list of clients. Only you can read its
     files, and no file is overwritten.
-
-    \b
-    EXAMPLE
-      catstream keys new keys
     """
     create(folder)
     click.echo(f"made {folder}: start the pipeline with --set run.keys={folder}")
@@ -85,12 +82,7 @@ def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str
 @keys.command(name="list")
 @_folder
 def list_(folder: Path) -> None:
-    """List the clients that may connect.
-
-    \b
-    EXAMPLE
-      catstream keys list keys
-    """
+    """List the clients that may connect."""
     for name, client in clients(folder).items():
         rank = ROLES.index(client.role)
         channels = (channel.name for channel in CHANNELS.values() if ROLES.index(channel.role) <= rank)
@@ -105,10 +97,6 @@ def revoke_(folder: Path, name: str) -> None:
 
     Running pipelines need no restart. Open connections stay open until they
     end; restart the pipeline to close them now.
-
-    \b
-    EXAMPLE
-      catstream keys revoke keys phone
     """
     revoke(folder, name)
     click.echo(f"{name} can no longer connect; open connections stay open until they end")

@@ -1,4 +1,4 @@
-"""`catstream evaluate` and `loadtest`: measure the accuracy of trackers, and the latency of pipelines under load."""
+"""`catstream evaluate`, `loadtest` and `demo`: the accuracy of trackers, the latency under load, and a first video."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.applications.evaluation.accuracy import Row
-    from catstream.applications.loadtest.load_test import Result
-    from catstream.applications.loadtest.plan import Limit
+    from catstream.applications.loadtest.load_test import Limit, Result
 
 _FAILED = 1  # exit code if a limit was not met or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
@@ -99,33 +98,26 @@ def evaluate(
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
-        from catstream.applications.evaluation.accuracy import describe_flips, mean_of, rows_of, to_json, write_report
-        from catstream.applications.evaluation.datasets import (
-            choose_starts,
-            find_sequences,
-            read_attributes,
-            with_attributes,
-        )
-        from catstream.applications.evaluation.onepass import evaluate as run_all
+        from catstream.applications.evaluation import accuracy, datasets, onepass
 
     if (starts is not None) + shifts + (jitter is not None) > 1:
         raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
     if attributes is not None and output is None and json_file is None:
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
-    sequences = [sequence for path in paths for sequence in find_sequences(path)]
-    seen = {} if attributes is None else read_attributes(attributes)
+    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path)]
+    seen = {} if attributes is None else datasets.read_attributes(attributes)
 
     errors: list[CatstreamError] = []
     try:
         columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
         with line_of(messages(), *columns) as progress:
             task = progress.add_task("starting", total=None)
-            runs = run_all(
+            runs = onepass.evaluate(
                 sequences,
                 names,
                 settings,
-                starts=choose_starts(starts, jitter, shifts=shifts),
+                starts=datasets.choose_starts(starts, jitter, shifts=shifts),
                 peer_models=peer_models,
                 jobs=jobs,
                 output=output,
@@ -140,15 +132,15 @@ def evaluate(
         complain(error)
     if not runs:
         raise CatstreamError("all runs have failed: see above")
-    rows = rows_of(runs)
-    screen().print(_table(rows, mean_of(rows)))
-    for line in describe_flips(rows):
+    rows = accuracy.rows_of(runs)
+    screen().print(_table(rows, accuracy.mean_of(rows)))
+    for line in accuracy.describe_flips(rows):
         click.echo(line)
     if json_file is not None or output is not None:
-        shared = with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
-        write_json(json_file, to_json(rows, settings, shared))
+        shared = datasets.with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
+        write_json(json_file, accuracy.to_json(rows, settings, shared))
         if output is not None:
-            click.echo(f"report: {write_report(output / 'report.html', runs, settings, shared)}")
+            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared)}")
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
@@ -231,8 +223,7 @@ def loadtest(
     # Imported here so that --help and the other commands start faster.
     from catstream.applications.loadtest.latency import percentiles
     from catstream.applications.loadtest.load_report import milliseconds, to_json, write_report
-    from catstream.applications.loadtest.load_test import run_load_test
-    from catstream.applications.loadtest.plan import Limit, Plan, violations
+    from catstream.applications.loadtest.load_test import Limit, Plan, run_load_test, violations
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)
@@ -293,3 +284,61 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
     for limit in limits:
         if limit.is_met(result):  # the others are an error
             click.echo(f"{click.style('met', 'green')}: {limit.describe(result)}")
+
+
+@click.command()
+@click.option("--output", type=PATH, default=Path("demo"), show_default=True, help="Folder.")
+@click.option("--frames", type=click.IntRange(min=2), default=600, show_default=True, help="Length of the video.")
+@click.option("--render-only", is_flag=True, help="Only write the video and its ground truth.")
+@click.option("--live", metavar="demo:SEED", help="Only print the box of the first frame of this live source.")
+def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None:
+    """Render a video with ground truth, track its object, and print the accuracy.
+
+    A dahlia moves over a lake: it rotates and changes its size, the brightness
+    changes, a similar flower crosses it, a pagoda occludes it, and it leaves the
+    picture and returns.
+
+    The source demo:SEED is a part of the video as a live source, which needs no
+    camera and never ends. SEED is a number. --live prints the box of its first
+    frame.
+
+    \b
+    Writes
+      OUTPUT/demo.mp4, groundtruth_rect.txt   the video and its ground truth: a sequence for `catstream evaluate`
+      OUTPUT/tracks/                          the results of `catstream track`, with the annotated video
+
+    \b
+    EXAMPLES
+      catstream demo
+      catstream demo --live demo:1
+      catstream track demo:1 --box "$(catstream demo --live demo:1)" --view
+    """
+    if live is not None:
+        from catstream.video.live_demo import first_box
+
+        click.echo(first_box(live))
+        return
+    import numpy as np
+
+    from catstream.applications.evaluation.scores import score
+    from catstream.cli.track import track
+    from catstream.sinks.track_log import read_frames
+    from catstream.video.rendered import write
+
+    with line_of(messages()) as bar:
+        task = bar.add_task("rendering", total=frames)
+        video, boxes = write(output, frames, done=lambda count: bar.update(task, completed=count))
+    click.echo(f"video: {video}")
+    if render_only:
+        return
+    tracks = output / "tracks"
+    arguments = [str(video), "--box", str(boxes[0]), "--output", str(tracks), "--video", "--overwrite"]
+    track.main(arguments, prog_name="catstream track", standalone_mode=False)
+    truth = np.array([box or (np.nan,) * 4 for box in boxes])
+    tracked = [frame.tracks[0].box for frame, _ in read_frames(tracks / "demo.ndjson")]
+    found = np.array([box or (np.nan,) * 4 for box in tracked])
+    absent, nothing = np.isnan(truth).any(axis=1), np.isnan(found).any(axis=1)
+    click.echo(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
+    if absent.any():
+        click.echo(f"absence reported: {(absent & nothing).sum()} of {absent.sum()} frames")
+    click.echo(f"annotated video: {tracks / 'demo.mp4'}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +12,17 @@ from typing import Any
 
 import click
 from rich.console import Console
+from rich.progress import Progress, ProgressColumn, Task
+from rich.table import Column
+from rich.text import Text
 
 from catstream.box import Box
-from catstream.cli.common import INTERRUPTS, RunProgress, messages, stopped
-from catstream.cli.export import with_table
+from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.view import PORT, Address, AddressType, with_token
+from catstream.cli.write import with_table
 from catstream.errors import require_extra
-from catstream.messages.names import UNNAMED, doubtful, listed
+from catstream.messages.kinds import Track
+from catstream.messages.names import UNNAMED, counted, doubtful, listed
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results
 from catstream.services.options import (
@@ -32,81 +36,10 @@ from catstream.services.options import (
     with_reading,
 )
 from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file
-from catstream.sinks.run_files import RunFiles, places_of
+from catstream.sinks.track_log import RunFiles, places_of
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Request:
-    """The options of the command.
-
-    given   the settings that were given
-    boxes   the objects in the first frame, by name
-    models  the saved models of objects that are searched for, by name
-    saved   the files for what is learned of each object, by name
-    view    address of the web page; None for none
-    """
-
-    source: str | None
-    boxes: dict[str, Box]
-    models: dict[str, Path]
-    given: dict[str, object]
-    part: slice
-    output: Path | None
-    video: bool
-    write: tuple[str, ...]
-    overwrite: bool
-    saved: dict[str, Path]
-    view: Address | None
-    token: str | None
-    lockstep: bool
-    paused: bool
-    state: Path | None
-    resume: Path | None
-
-    @property
-    def folder(self) -> Path | None:
-        """The folder of the checkpoints, None if there are none."""
-        return self.state or self.resume
-
-    def check(self) -> None:
-        """Raise UsageError if the options contradict each other."""
-        if self.state and self.resume:
-            raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
-        if not self.resume and not self.source:
-            raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
-        if self.resume and self.overwrite:
-            raise click.UsageError(
-                "--resume continues the existing results, and --overwrite replaces them: give one of them"
-            )
-        if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
-            raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
-
-    def pipeline(self) -> Pipeline:
-        """The pipeline of the run, not started; a resumed run continues the results of its earlier part."""
-        return Pipeline(
-            self.source,
-            self.boxes or None,
-            self.given | ({"run.lockstep": True} if self.lockstep else {}),
-            model=self.models or None,
-            part=self.part,
-            state=self.state,
-            resume=self.resume,
-            paused=self.paused,
-            results=Results(  # absolute, to resume from any folder
-                output=self.output and self.output.absolute(),
-                video=self.video,
-                write=tuple(str(Path(it).absolute()) if is_file(it) else it for it in self.write if it != STDOUT),
-                models={name: file.absolute() for name, file in self.saved.items()},
-            ),
-        )
-
-    def files(self, pipeline: Pipeline) -> RunFiles:
-        """Everything that the tracks are written to, including the standard output if requested."""
-        results, settings = pipeline.results, pipeline.settings.run
-        places = [*places_of(pipeline.name, results.output, results.video), *results.write]
-        places += [STDOUT] if STDOUT in self.write else []
-        origin = Origin(pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys)
-        return RunFiles(origin, results.output, [*dict.fromkeys(places)])
+_SHORTEST_SECONDS = 1.0  # of a run whose rate is told
+_REFRESH_SECONDS = 0.1  # between two updates of the progress
 
 
 @click.command()
@@ -180,131 +113,280 @@ def track(**options: Any) -> None:
     \b
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --output out --video
-      catstream track frames/ --box 120,80,64,48 --output out --set coreset.size=128
       catstream track walk.mp4 --box 120,80,64,48 --write - | jq .box
       catstream track walk.mp4 --box anna=120,80,64,48 --box ben=300,90,60,150 --video --output out
       catstream track walk.mp4 --box 120,80,64,48 --save-model walker.safetensors
-      catstream track walk.mp4 --box 120,80,64,48 --output out --lockstep
       catstream track walk.mp4 --box 90,75,60,45 --start 500 --end 900 --stride 2
-      catstream track walk.mp4 --box 120,80,64,48 --write walk.mcap
       catstream track walk.mp4 --box 120,80,64,48 --paused --set run.endpoint=run
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
-      catstream track 0 --view 0.0.0.0:8000
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
     """
-    request = _Request(**options)
-    request.check()
-    pipeline = request.pipeline()
-    if request.view is not None:
-        require_extra("view")
-    files = request.files(pipeline)
-    _check_files(request, pipeline, files)
-    console = messages()
-    for line in _doubts(request, pipeline):
-        console.print(line)
-    if request.resume is not None:
-        pipeline = pipeline.starting_after(files.position())
-    _Run(request, pipeline, files, console).execute()
+    _Run(**options).execute()
 
 
-def _check_files(request: _Request, pipeline: Pipeline, files: RunFiles) -> None:
-    """Raise an error before the run if one of its files could not be written."""
-    if pipeline.results.video and files.output is None:
-        raise click.UsageError("--video requires --output, the folder for the video")
-    earlier = pipeline.earlier_results
-    continued = [*places_of(pipeline.name, earlier.output, earlier.video), *earlier.write]
-    files.check(overwrite=request.overwrite, earlier=continued)
-    for file in request.saved.values():
-        check_file(file, may_exist=request.overwrite, source=pipeline.source, made=files.output)
-
-
-def _doubts(request: _Request, pipeline: Pipeline) -> Iterator[str]:
-    """Yield descriptions of options that are valid, but hardly are what was meant."""
-    objects = {*request.boxes, *request.models}
-    if objects and (unknown := request.saved.keys() - objects - {UNNAMED}):  # without a name, the only one is meant
-        yield f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name"
-    yield from doubtful(request.boxes, *pipeline.size)
-
-
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Run:
-    """Runs the pipeline, writes its tracks to the files, and prints the progress and the results."""
+    """A run with the options of the command.
 
-    def __init__(self, request: _Request, pipeline: Pipeline, files: RunFiles, console: Console) -> None:
-        self._request, self._pipeline, self._files, self._console = request, pipeline, files, console
-        self._progress = RunProgress(pipeline)
+    given   the settings that were given
+    boxes   the objects in the first frame, by name
+    models  the saved models of objects that are searched for, by name
+    saved   the files for what is learned of each object, by name
+    view    address of the web page; None for none
+    """
+
+    source: str | None
+    boxes: dict[str, Box]
+    models: dict[str, Path]
+    given: dict[str, object]
+    part: slice
+    output: Path | None
+    video: bool
+    write: tuple[str, ...]
+    overwrite: bool
+    saved: dict[str, Path]
+    view: Address | None
+    token: str | None
+    lockstep: bool
+    paused: bool
+    state: Path | None
+    resume: Path | None
 
     def execute(self) -> None:
-        """Run to the end, or until Ctrl-C or a signal; then the exit code is `INTERRUPTED`."""
+        """Check everything that can be checked, then run to the end; after Ctrl-C, the exit code is `INTERRUPTED`."""
+        self._check_options()
+        pipeline = self._pipeline()
+        files = self._files(pipeline)
+        console = messages()
+        for line in self._doubts(pipeline):
+            console.print(line)
+        if self.resume is not None:
+            pipeline = pipeline.starting_after(files.position())
+        progress = RunProgress(pipeline)
         try:
-            interrupted = self._run()
+            interrupted = self._run(pipeline, files, progress, console)
         finally:
-            if self._progress.frames and not isinstance(sys.exception(), BrokenPipeError):
-                self._print_summary()
-        request, folder = self._request, self._request.folder
-        if request.resume is not None and not self._progress.frames and not interrupted:
-            self._console.print(
-                f"no frames were left to track, the run in {request.resume} is complete: to track the source again, "
+            if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
+                output = [] if files.output is None else [files.output]
+                console.print(progress.summary([*output, *map(Path, pipeline.results.write)]))
+        if self.resume is not None and not progress.frames and not interrupted:
+            console.print(
+                f"no frames were left to track, the run in {self.resume} is complete: to track the source again, "
                 "start a new run in another folder (--state DIR)"
             )
-        saved = self._pipeline.saved_models
+        saved = pipeline.saved_models
         for file in saved:
-            self._console.print(f"saved model: {file}")
+            console.print(f"saved model: {file}")
         if interrupted:
-            unsaved = [str(file) for file in self._pipeline.results.models.values() if file not in saved]
+            unsaved = [str(file) for file in pipeline.results.models.values() if file not in saved]
             lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
+            folder = self.state or self.resume
             hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
             stopped(f"the results so far are kept{lost}{hint}")
 
-    def _run(self) -> bool:
+    def _check_options(self) -> None:
+        """Raise UsageError if the options contradict each other."""
+        if self.state and self.resume:
+            raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
+        if not self.resume and not self.source:
+            raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
+        if self.resume and self.overwrite:
+            raise click.UsageError(
+                "--resume continues the existing results, and --overwrite replaces them: give one of them"
+            )
+        if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
+            raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
+
+    def _pipeline(self) -> Pipeline:
+        """The pipeline of the run, not started; a resumed run continues the results of its earlier part."""
+        return Pipeline(
+            self.source,
+            self.boxes or None,
+            self.given | ({"run.lockstep": True} if self.lockstep else {}),
+            model=self.models or None,
+            part=self.part,
+            state=self.state,
+            resume=self.resume,
+            paused=self.paused,
+            results=Results(  # absolute, to resume from any folder
+                output=self.output and self.output.absolute(),
+                video=self.video,
+                write=tuple(str(Path(it).absolute()) if is_file(it) else it for it in self.write if it != STDOUT),
+                models={name: file.absolute() for name, file in self.saved.items()},
+            ),
+        )
+
+    def _files(self, pipeline: Pipeline) -> RunFiles:
+        """Everything that the tracks are written to; raise an error if one of the run's files could not be written."""
+        if self.view is not None:
+            require_extra("view")
+        results, settings = pipeline.results, pipeline.settings.run
+        if results.video and results.output is None:
+            raise click.UsageError("--video requires --output, the folder for the video")
+        places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
+        origin = Origin(pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys)
+        files = RunFiles(origin, results.output, places)
+        files.check(overwrite=self.overwrite, earlier=places_of(pipeline.name, pipeline.earlier_results))
+        for file in self.saved.values():
+            check_file(file, may_exist=self.overwrite, source=pipeline.source, made=files.output)
+        return files
+
+    def _doubts(self, pipeline: Pipeline) -> Iterator[str]:
+        """Yield descriptions of options that are valid, but hardly are what was meant."""
+        objects = {*self.boxes, *self.models}
+        if objects and (unknown := self.saved.keys() - objects - {UNNAMED}):  # without a name, the only one is meant
+            yield f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name"
+        yield from doubtful(self.boxes, *pipeline.size)
+
+    def _run(self, pipeline: Pipeline, files: RunFiles, progress: RunProgress, console: Console) -> bool:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
         try:
             # The files are closed after the processes, which would track on meanwhile, for none of them.
-            with ExitStack() as files, self._pipeline, ExitStack() as stack:
-                self._files.make_folder()
-                if self._request.view is not None:
-                    self._serve(self._request.view, stack)
-                if self._pipeline.holding == "waiting":
-                    self._console.print(f"waiting for a box: {self._ways_to_set_box()}")
-                elif self._pipeline.holding:
-                    self._console.print(f"paused: to continue, catstream resume --endpoint {self._pipeline.endpoint}")
-                self._write_tracks(files)
+            with ExitStack() as closed_last, pipeline, ExitStack() as stack:
+                files.make_folder()
+                place = f"--endpoint {pipeline.endpoint}"
+                if self.view is not None:
+                    self._serve(pipeline, self.view, stack, console)
+                if pipeline.holding == "waiting":
+                    page = "the page" if self.view is not None else f"the page of catstream view {place}"
+                    ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
+                    console.print(f"waiting for a box: {ways}")
+                elif pipeline.holding:
+                    console.print(f"paused: to continue, catstream resume {place}")
+                with progress.line(console) as line:
+                    self._write_tracks(pipeline, files, lambda tracks: progress.show(line, tracks), closed_last)
         except KeyboardInterrupt:
             return True
         return False
 
-    def _serve(self, view: Address, stack: ExitStack) -> None:
+    def _serve(self, pipeline: Pipeline, view: Address, stack: ExitStack, console: Console) -> None:
         """Serve the web page of the pipeline until the stack is left."""
         from catstream.web.app import pipeline_site
         from catstream.web.server import Server
 
-        site = pipeline_site(self._pipeline.endpoint, self._pipeline.settings.run.keys)
-        server = Server(site, host=view.host, port=view.port, token=self._request.token)
+        site = pipeline_site(pipeline.endpoint, pipeline.settings.run.keys)
+        server = Server(site, host=view.host, port=view.port, token=self.token)
         stack.enter_context(server.in_background())
         for url in server.urls:
-            self._console.print(f"page: {url}")
+            console.print(f"page: {url}")
 
-    def _ways_to_set_box(self) -> str:
-        place = f"--endpoint {self._pipeline.endpoint}"
-        page = "the page" if self._request.view is not None else f"the page of catstream view {place}"
-        return f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
+    def _write_tracks(self, pipeline: Pipeline, files: RunFiles, show: Callable[..., None], stack: ExitStack) -> None:
+        """Write every track to all files, which the stack closes, and show it."""
+        endpoint = pipeline.endpoint
+        write = stack.enter_context(files.opened(endpoint, resume=True)) if self.resume is not None else None
+        moment = time.perf_counter()
+        for tracks in pipeline.by_frame():
+            # New files are opened with the first track: a run that cannot start does not change older results.
+            write = write or stack.enter_context(files.opened(endpoint))
+            before, moment = moment, time.perf_counter()
+            with INTERRUPTS.deferred():  # so that a frame is in all results or in none
+                write(TrackedFrame([*tracks.values()], moment - before))
+                show(tracks)
 
-    def _write_tracks(self, stack: ExitStack) -> None:
-        """Write every track to all files, which the stack closes, and show the progress."""
-        with self._progress.progress(self._console) as progress:
-            resume, endpoint = self._request.resume is not None, self._pipeline.endpoint
-            write = stack.enter_context(self._files.opened(endpoint, resume=True)) if resume else None
-            moment = time.perf_counter()
-            for tracks in self._pipeline.by_frame():
-                # New files are opened with the first track: a run that cannot start does not change older results.
-                write = write or stack.enter_context(self._files.opened(endpoint))
-                before, moment = moment, time.perf_counter()
-                with INTERRUPTS.deferred():  # so that a frame is in all results or in none
-                    write(TrackedFrame([*tracks.values()], moment - before))
-                    self._progress.show(progress, tracks)
 
-    def _print_summary(self) -> None:
-        output = [] if self._files.output is None else [self._files.output]
-        self._console.print(self._progress.summary([*output, *map(Path, self._pipeline.results.write)]))
+@dataclass(slots=True)
+class _Counted:
+    """The counters of an object: frames in which it was tracked, and present; the newest version of its model."""
+
+    frames: int = 0
+    present: int = 0
+    version: int = 0
+
+
+class _State(ProgressColumn):
+    """The state of the objects; while there are no tracks, why: the source is lost, or the run is paused or waits."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        super().__init__(Column(no_wrap=True))
+        self._pipeline = pipeline
+
+    def render(self, task: Task) -> Text:
+        lost = self._pipeline.lost_seconds
+        return Text(f"{f'lost {lost:.0f} s' if lost else self._pipeline.holding or task.description:13}")
+
+
+class RunProgress:
+    """Counts the tracks of a run, and shows them during the run and at its end."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._started = time.perf_counter()
+        self._first = self._shown = 0.0
+        self.frames = 0
+        self._objects: dict[str, _Counted] = {}
+
+    def line(self, console: Console) -> Progress:
+        """The line that `show` updates."""
+        total = "" if self._pipeline.live else f"/{self._pipeline.frames or '?'}"
+        count = text("{task.completed:.0f}" + total)
+        line = line_of(console, _State(self._pipeline), count, text("{task.fields[figures]}", last=True))
+        self._task = line.add_task("starting", total=self._pipeline.frames, figures="")
+        return line
+
+    def show(self, line: Progress, tracks: Mapping[str, Track]) -> None:
+        """Count and show the tracks of a frame."""
+        now = time.perf_counter()
+        self._first = self._first or now - self._started
+        self.frames += 1
+        for name, track in tracks.items():
+            each = self._objects.setdefault(name, _Counted())
+            each.frames += 1
+            each.present += track.box is not None
+            each.version = track.model_version
+        if not line.disable and now - self._shown >= _REFRESH_SECONDS:
+            self._shown = now
+            present = sum(track.box is not None for track in tracks.values())
+            states = [track.state for track in tracks.values()]
+            state = states[0] if len(states) == 1 else f"{present}/{len(states)} present"
+            line.update(self._task, completed=self.frames, description=state, figures=self._figures(tracks))
+
+    def _figures(self, tracks: Mapping[str, Track]) -> str:
+        figures = [f"{self._rate(time.perf_counter()):.0f} frames/s"]
+        if self._pipeline.live:
+            figures.append(f"{self._detector('skipped'):.0f} skipped")
+        if len(tracks) == 1:
+            (track,) = tracks.values()
+            figures += [f"score {track.score:+.2f}", f"model {track.model_version}"]
+        else:
+            figures += [f"{name or '(no name)'} {track.score:+.2f}" for name, track in tracks.items()]
+        return "  ".join([*figures, f"{self._pipeline.health.get('compressor', {}).get('leaves', 0):.0f} leaves"])
+
+    def summary(self, results: Sequence[Path]) -> str:
+        """The closing lines of the run."""
+        rate = f"first track after {self._first:.2f} s"
+        if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
+            rate = f"{self._rate(now):.0f} frames/s, {rate}"
+        frames = counted(self.frames, "frame")
+        if self._objects.keys() == {UNNAMED}:
+            alone = self._objects[UNNAMED]
+            lines = [f"{frames}, present in {alone.present}, {rate}, model version {alone.version}"]
+        else:
+            lines = [f"{frames}, {rate}"]
+            for name, each in self._objects.items():
+                present = f"present in {each.present} of {each.frames} frames"
+                lines.append(f"  {name or '(no name)'}: {present}, model version {each.version}")
+        if self._pipeline.live:
+            skipped, again = counted(self._detector("skipped"), "frame"), counted(self._detector("reopened"), "time")
+            lines.append(f"live: {skipped} skipped, lost and opened again {again}")
+        if damaged := self._detector("damaged"):
+            lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
+        if totals := self._pipeline.totals:
+            sent = counted(totals["sent"], "message")
+            lines.append(f"features: {sent} sent, {totals['stored']} stored in the coreset trees")
+        if self._pipeline.restarts:
+            lines.append(f"processes restarted: {self._pipeline.restarts}")
+        if results:
+            here = Path.cwd()
+            shown = (str(path.relative_to(here) if path.is_relative_to(here) else path) for path in results)
+            lines.append(f"results: {', '.join(shown)}")
+        return "\n".join(lines)
+
+    def _detector(self, counter: str) -> float:
+        """A counter of the detector: the final one, or before the end that of its last report."""
+        return (self._pipeline.health.get("detector", {}) | self._pipeline.totals).get(counter, 0)
+
+    def _rate(self, now: float) -> float:
+        return (self.frames - 1) / max(now - self._started - self._first, 1e-9)

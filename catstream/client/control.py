@@ -34,9 +34,9 @@ REGISTRY_SECONDS = 1.0  #: for the registry before each command; without an answ
 
 
 class Control:
-    """Sends commands to one running pipeline; close it, or use it in a `with`. Several clients may connect at once.
+    """Sends commands to one running pipeline, from one thread at a time; close it, or use it in a `with`.
 
-    A client is used by one thread at a time.
+    In each command, `object` is the name of an object; without a name, the only object is meant.
 
     Attributes
     ----------
@@ -50,8 +50,8 @@ class Control:
     CommandRejectedError
         From each command, if the pipeline does not execute it.
     SilenceError
-        From each command, if no answer arrives in time; the command may still be executed later. If no pipeline runs at
-        the endpoint, a folder, that is said after a second.
+        From each command, if no answer arrives in time, or after a second if no pipeline runs in the folder; the
+        command may still be executed later.
     ServiceError
         From each command, if these keys do not have the role "control".
     ObjectError
@@ -77,30 +77,18 @@ class Control:
         During a pause it is the frame that is held, or the next one of a live source; the pipeline tracks it and stays
         paused.
 
-        Parameters
-        ----------
-        object : str
-            Name of the object. If no object has this name, it is tracked from that frame on, beside the others. Without
-            a name, the only object is meant.
-        keep : bool
-            Whether the box corrects the position of the same object. By default, another object takes the name, and
-            everything that was learned of the previous one is dropped.
+        If no object has this name, it is tracked from that frame on, beside the others. Otherwise another object takes
+        the name, and everything that was learned of the previous one is dropped; with `keep`, the box corrects the
+        position of the same object.
         """
         return self.execute("set-box", object, box=Box.parse(box), keep=keep)
 
     def search(self, model: Learned | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Search for the object of a saved model from the next frame on, beside the others.
 
-        The object is absent until it is found in the whole frame, and learning continues from the saved model, as with
-        the argument `model` of `catstream.Pipeline`. The model is sent to the pipeline, which keeps a copy.
-
-        Parameters
-        ----------
-        model : path or Learned
-            The saved model, or a file of it on this machine.
-        object : str
-            Name of the object. If an object has this name already, this one takes its place, and everything that was
-            learned of the previous one is dropped. Without a name, the only object is meant.
+        The model, or the path of its file on this machine, is sent to the pipeline, which keeps a copy. The object is
+        absent until it is found in the whole frame, and learning continues from the saved model. If an object has this
+        name already, this one takes its place, and everything that was learned of the previous one is dropped.
 
         Raises
         ------
@@ -111,7 +99,7 @@ class Control:
         return self.execute("search", object, model=learned.to_bytes())
 
     def forget(self, object: str = UNNAMED) -> Answer:
-        """Stop tracking an object, and drop everything that was learned of it; without a name, the only object.
+        """Stop tracking an object, and drop everything that was learned of it.
 
         The other objects continue. If none is left, the run waits for a box, as if it was paused.
         """
@@ -126,16 +114,7 @@ class Control:
         return self.execute("resume")
 
     def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
-        """Write everything that was learned of an object to a file on this machine, atomically.
-
-        The file is written by this process; `catstream.Learned` reads it. The pipeline is not interrupted.
-
-        Parameters
-        ----------
-        path : path
-            The file.
-        object : str
-            Name of the object; without a name, the only object is meant.
+        """Write everything that was learned of an object to a file of this machine, which `catstream.Learned` reads.
 
         Raises
         ------
@@ -222,8 +201,8 @@ def control(endpoint: Place = "", *, timeout: float = ANSWER_SECONDS, keys: str 
     Parameters
     ----------
     endpoint : str or path
-        Endpoint of the pipeline, in the format of the setting `run.endpoint`. Empty for the only pipeline of this user.
-        The address of a stream of a fleet, as for `catstream.subscribe`: each command goes where the stream runs then.
+        Endpoint of the pipeline, or address of a stream of a fleet, as for `catstream.subscribe`: each command goes
+        where the stream runs then.
     timeout : float
         Seconds to wait for the answer to a command.
     keys : str

@@ -23,7 +23,7 @@ from typing import Any, Generic, Self, TypeVar, cast
 import zmq
 import zmq.asyncio
 
-from catstream.client.registry import described, follow
+from catstream.client.registry import FollowedStream, described, follow
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Track
 from catstream.messages.names import check_name
@@ -42,45 +42,35 @@ class Subscription(Generic[Message]):
     """The messages of one channel of a running pipeline, until the pipeline ends; iterate with `for` or `async for`.
 
     There is one features message for each frame, and one track for each object and frame; after a restart of the
-    detector some are repeated. For models, samples, previews and health reports, the last message arrives at once; then
-    each iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for
-    each object, and the object that has waited longest comes first. A subscriber to a named endpoint may start before
-    the pipeline.
+    detector some are repeated. Of models, samples, previews and health reports, the last ones arrive at once; then each
+    iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for each
+    object, and the object that has waited longest comes first.
 
     The subscription to a stream of a fleet continues if the stream moves or is started again, and while the registry of
-    the fleet cannot be reached. It ends if the stream has ended, or was removed from the fleet. A frame that the stream
-    repeats is not returned a second time; the frames that nobody tracked in between are counted in `missed`.
+    the fleet cannot be reached. A frame that the stream repeats is not returned a second time.
 
     Attributes
     ----------
     end : End or None
-        The last message of the pipeline, or the reason why the stream of a fleet has ended; None before that. A
-        pipeline whose sockets are gone from its folder has ended too.
-    endpoint : str
-        Endpoint of the pipeline, or the address of the stream.
-    keys : str
-        Folder of the client keys; empty if there are none.
+        The last message of the pipeline, or the reason why the stream of a fleet has ended or why there is no such
+        message; None before that.
+    endpoint, keys : str
+        Endpoint of the pipeline, or the address of the stream; folder of the client keys, empty if there are none.
     timeout : float or None
-        Seconds without a message after which iteration raises `SilenceError`.
+        Seconds without a message after which iteration raises `SilenceError`; it may continue afterwards.
     place : Endpoint or None
         Endpoint of the connected pipeline; None if the stream of a fleet has not run yet.
 
     Raises
     ------
     SilenceError
-        During iteration, if no message arrived within `timeout`. Iteration may continue afterwards.
+        During iteration, if no message arrived within `timeout`.
     ServiceError
         During iteration, if the pipeline rejects the keys, or the subscription is closed.
     """
 
     def __init__(
-        self,
-        endpoint: Place,
-        channel: str,
-        *,
-        object: str | None = None,
-        timeout: float | None = None,
-        keys: str = "",
+        self, endpoint: Place, channel: str, *, object: str | None = None, timeout: float | None = None, keys: str = ""
     ) -> None:
         if channel not in PUBLIC:
             raise ServiceError(
@@ -107,7 +97,7 @@ class Subscription(Generic[Message]):
         self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
         self._stream = follow(endpoint, keys)
         if self._stream is not None:
-            self._follow()
+            self._follow(self._stream)
         else:
             place = find(endpoint, keys)
             self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
@@ -116,10 +106,7 @@ class Subscription(Generic[Message]):
 
     @property
     def missed(self) -> int:
-        """Number of frames whose tracks or features were not received: sent before the connection, or dropped.
-
-        For one object, the frames between its first and its last track that was received.
-        """
+        """Number of frames whose tracks or features were not received; of one object, between its first and last."""
         return self._gaps.missed + self._gaps.before
 
     @property
@@ -129,7 +116,7 @@ class Subscription(Generic[Message]):
 
     def losses(self) -> str:
         """Describe the missed messages in words."""
-        before = f", {self.missed_before} of them before this subscriber connected" if self.missed_before else ""
+        before = f", {self._gaps.before} of them before this subscriber connected" if self._gaps.before else ""
         return f"{self.missed} missed{before}"
 
     @property
@@ -190,7 +177,7 @@ class Subscription(Generic[Message]):
 
     def _milliseconds(self, deadline: float) -> float:
         """The time to wait for the sockets."""
-        until = min(deadline if self.end is None else float("inf"), self._close_time)
+        until = self._close_time if self.end is not None else deadline
         return 1000 * max(0.0, min(until - monotonic(), CHECK_SECONDS))
 
     def _take(self, deadline: float) -> Message | None:
@@ -201,9 +188,8 @@ class Subscription(Generic[Message]):
             if (message := self._receive()) is not None:
                 self._has_run = True
                 return message
-            self._follow()
-            if self.end is None and self._stream is None:
-                self._look_for_sockets()
+            if self.end is None:
+                self._look_for_pipeline()
             if self.end is None and monotonic() >= deadline:
                 why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
                 raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
@@ -236,27 +222,27 @@ class Subscription(Generic[Message]):
         else:
             self.end, self._close_time = end, monotonic() + seconds
 
-    def _follow(self) -> None:
-        """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
-        if self._stream is None or self.end is not None:
-            return
-        moved = self._stream.update()
-        if self._stream.end is not None:
-            self.end, self._close_time = self._stream.end, monotonic() + DRAIN_SECONDS
-        elif (moved or self._messages is None) and (place := self._stream.place) is not None:
-            self._disconnect()
-            self._connect(place)
-
-    def _look_for_sockets(self) -> None:
-        """End if the pipeline has removed its sockets from its folder, which it does once it has ended.
+    def _look_for_pipeline(self) -> None:
+        """Follow a stream of a fleet; end if the pipeline has removed its sockets from its folder, as it does at last.
 
         ZeroMQ connects again only while the subscriber reads: the end is lost if it did not read since a restart.
         """
-        lacks_sockets = self.place is not None and self.place.lacks_sockets()
-        if lacks_sockets and self._has_run:
+        if self._stream is not None:
+            self._follow(self._stream)
+        elif self.place is not None and not self.place.lacks_sockets():
+            self._has_run = True
+        elif self._has_run:
             gone = "its sockets were removed, and this subscriber did not receive its end"
             self._pipeline_ended(End(0, gone), DRAIN_SECONDS)
-        self._has_run = self._has_run or not lacks_sockets
+
+    def _follow(self, stream: FollowedStream) -> None:
+        """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
+        moved = stream.update()
+        if stream.end is not None:
+            self.end, self._close_time = stream.end, monotonic() + DRAIN_SECONDS
+        elif (moved or self._messages is None) and (place := stream.place) is not None:
+            self._disconnect()
+            self._connect(place)
 
     def _connect(self, place: Endpoint) -> None:
         only = None if self._about is None else self._channel.messages[0]
@@ -274,21 +260,16 @@ class Subscription(Generic[Message]):
 
 
 def subscribe(
-    endpoint: Place,
-    channel: str,
-    *,
-    object: str | None = None,
-    timeout: float | None = None,
-    keys: str = "",
+    endpoint: Place, channel: str, *, object: str | None = None, timeout: float | None = None, keys: str = ""
 ) -> Subscription[Any]:
     """Subscribe to a channel of a running pipeline.
 
     Parameters
     ----------
     endpoint : str or path
-        Endpoint of the pipeline, which may start later; the format is that of the setting `run.endpoint`. Empty for the
-        only running pipeline of this user. The address of a stream of a fleet is `fleet://HOST:PORT/STREAM`, with host
-        and port of its registry; `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
+        Endpoint of the pipeline, which may start later, as in the setting `run.endpoint`; empty for the only running
+        pipeline of this user. Or the address of a stream of a fleet: `fleet://HOST:PORT/STREAM` with host and port of
+        its registry, `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
     channel : str
         "tracks", "models", "health", "samples", "features" or "previews": the messages are `Track`, `Model` and so on
         of `catstream.messages.kinds`.
@@ -314,16 +295,9 @@ def subscribe(
 
 
 def wait_until_running(endpoint: str, keys: str = "", seconds: float = REPORT_SECONDS) -> Endpoint:
-    """Wait for a health report of the pipeline, and return its endpoint.
+    """Wait for a health report of the pipeline, and return its endpoint; tracks and models may pause for long.
 
-    Tracks and models are no sign of a running pipeline: they may pause for long.
-
-    Raises
-    ------
-    ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs, the pipeline rejects the keys, or it has ended.
-    SilenceError
-        If no report arrives in time.
+    SilenceError if no report arrives in time, ServiceError if the pipeline has ended, or as for `subscribe`.
     """
     with Subscription[Health](endpoint, "health", timeout=seconds, keys=keys) as reports:
         if next(reports, None) is None or reports.place is None:

@@ -264,34 +264,20 @@ class Model:
 class Track:
     """An object in one frame, detector -> anyone.
 
-    Attributes
-    ----------
-    seq : int
-        1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means missed messages, or
-        that the object was not tracked in between.
-    frame : int
-        Number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted.
-    time : float
-        Seconds since the start of the source, or of the run if the source is live.
-    state : str
-        "absent" if no box is reported. Otherwise "bootstrapping" while the model is that of the object's first frame
-        (version 0), then "present".
-    box : Box or None
-        Box of the object, in pixels of the frame; None while absent.
-    score : float
-        Confidence: about 0 on background, about 1 on the object.
-    model_version : int
-        Version of the model that scored it, 0 before the first.
-    pts : float or None
-        Time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file.
-    object : str
-        Name of the object; "" if it has none.
-    began : int
-        Number of the object's first frame. If it differs from that of the track before, another object was given this
-        name, by a box or a saved model.
+    seq            1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means missed
+                   messages, or that the object was not tracked in between
+    frame          number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted
+    time           seconds since the start of the source, or of the run if the source is live
+    state          "absent" if no box is reported. Otherwise "bootstrapping" while the model is that of the object's
+                   first frame (version 0), then "present"
+    box            box of the object, in pixels of the frame; None while absent
+    score          confidence: about 0 on background, about 1 on the object
+    model_version  version of the model that scored it, 0 before the first
+    pts            time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file
+    object         name of the object; "" if it has none
+    began          number of the object's first frame. If it differs from that of the track before, another object was
+                   given this name, by a box or a saved model
 
-    Examples
-    --------
     >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
     """
@@ -316,12 +302,8 @@ class Track:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields by name, of plain types for JSON: a box is a list [x, y, w, h], or None.
+        """The fields by name, of plain types for JSON, as in FILE.ndjson: a box is a list [x, y, w, h], or None.
 
-        `catstream sink FILE.ndjson` writes the same.
-
-        Examples
-        --------
         >>> Track(13, 12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
         True
         """

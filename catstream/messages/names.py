@@ -30,8 +30,6 @@ def is_name(text: str) -> bool:
 def check_name(name: str) -> str:
     """Return the name of an object; raise ObjectError if it is not valid.
 
-    Examples
-    --------
     >>> check_name("anna-2")
     'anna-2'
     """
@@ -46,8 +44,6 @@ def check_name(name: str) -> str:
 def split_name(text: str) -> tuple[str, str]:
     """Split the text NAME=VALUE; the name is "" if there is only a value.
 
-    Examples
-    --------
     >>> split_name("anna=120,80,64,48"), split_name("120,80,64,48")
     (('anna', '120,80,64,48'), ('', '120,80,64,48'))
     """
@@ -60,15 +56,8 @@ def split_name(text: str) -> tuple[str, str]:
 
 
 def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
-    """The boxes of objects by name.
+    """The boxes of objects by name; BoxError or ObjectError if one is not valid.
 
-    Raises
-    ------
-    BoxError, ObjectError
-        For a box or a name that is not valid.
-
-    Examples
-    --------
     >>> boxes_by_name("120,80,64,48")
     {'': Box(x=120.0, y=80.0, w=64.0, h=48.0)}
     """
@@ -91,8 +80,6 @@ def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
 def doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
     """Descriptions of boxes that can be followed, but hardly are what was meant: the whole frame, or one box twice.
 
-    Examples
-    --------
     >>> doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
     ['anna and ben have the same box: each costs time']
     """
@@ -130,8 +117,6 @@ def check_count(count: int, most: int) -> None:
 def listed(names: Iterable[str]) -> str:
     """Names of objects, for a message to the user.
 
-    Examples
-    --------
     >>> listed(["anna", ""]), listed([])
     ('anna, the object without a name', 'none')
     """
@@ -141,8 +126,6 @@ def listed(names: Iterable[str]) -> str:
 def counted(number: float, noun: str) -> str:
     """A number and what is counted, in the singular or the plural.
 
-    Examples
-    --------
     >>> counted(1, "frame"), counted(0, "frame")
     ('1 frame', '0 frames')
     """

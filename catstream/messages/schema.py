@@ -151,25 +151,14 @@ def _first(limits: tuple[object, ...], kind: type[Limit]) -> Limit | None:
 def check_message(message: object) -> _Lengths:
     """Check the arrays of a message, and of the messages in it: dtypes, shapes, numbers and names.
 
-    Returns
-    -------
-    the length that each letter in the shapes of its arrays stands for
-
-    Raises
-    ------
-    ProtocolError
-        If an array breaks its schema.
+    Returns the length that each letter in their shapes stands for; ProtocolError if an array breaks its schema.
     """
     lengths: _Lengths = {}
     kind: type = type(message)
-    for field in _with_arrays(kind):
-        _check(field, getattr(message, field.name), lengths, f"{kind.__name__.lower()} {field.name}")
+    for field in fields(kind):
+        if field.has_arrays:
+            _check(field, getattr(message, field.name), lengths, f"{kind.__name__.lower()} {field.name}")
     return lengths
-
-
-@cache
-def _with_arrays(kind: type) -> tuple[Field, ...]:
-    return tuple(field for field in fields(kind) if field.has_arrays)
 
 
 def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths | None:
@@ -190,9 +179,7 @@ def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths 
 def _check_names(found: dict[str, _Lengths | None], named: Named, where: str) -> None:
     """Check the names of a map, and that its messages have rows of d columns, each with those that its name adds.
 
-    Parameters
-    ----------
-    found : lengths of the messages, by name; of arrays None, since they share those of the message around them
+    The lengths found in an array are None: it shares those of the message around it.
     """
     if not named.required <= found.keys() <= named.columns.keys():
         expected = ", ".join(f"{name} (always)" if name in named.required else name for name in named.columns)

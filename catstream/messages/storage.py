@@ -36,20 +36,12 @@ Message = TypeVar("Message")
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
-_PAUSE_SECONDS = 0.05  # between two attempts to lock
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
-    """Replace a file atomically. After the return, the new content survives a power cut.
+    """Replace a file atomically; the new content then survives a power cut. The umask reduces the permissions `mode`.
 
-    Parameters
-    ----------
-    mode : permissions of the file, reduced by the umask
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written. The old file stays unchanged.
+    OSError if the file cannot be written; the old one stays unchanged.
     """
     path = Path(path)
     remove_parts(path.parent, path.name)
@@ -60,12 +52,7 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
 def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
     """Create a file for its owner only: it exists with its whole content, or not at all, also after a power cut.
 
-    Raises
-    ------
-    FileExistsError
-        If the file exists. It stays unchanged, also if two processes create it at the same moment.
-    OSError
-        If the file cannot be written, or the file system has no hard links.
+    FileExistsError if it exists, also if two processes create it at the same moment; OSError if it cannot be written.
     """
     path = Path(path)
     with _written_beside(path, data, 0o600) as part:
@@ -92,12 +79,7 @@ def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
 
 
 def remove_parts(folder: Path, name: str = "") -> None:
-    """Remove the unfinished files that processes left in a folder when they were killed while they wrote.
-
-    Parameters
-    ----------
-    name : of the file that was to be written; "" for any
-    """
+    """Remove the unfinished files, of this name or of any, that processes left when they were killed while writing."""
     for part in folder.glob(f".{glob.escape(name)}{'.' if name else ''}*.part"):
         with contextlib.suppress(OSError):
             if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
@@ -106,13 +88,7 @@ def remove_parts(folder: Path, name: str = "") -> None:
 
 @contextlib.contextmanager
 def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceError) -> Iterator[None]:
-    """A block that writes a file, or into a folder: an OSError in it is reported in one line, for a person.
-
-    Raises
-    ------
-    CatstreamError
-        Of this kind, if the block raises an OSError.
-    """
+    """A block that writes a file, or into a folder: an OSError in it becomes an error of this kind, for a person."""
     try:
         yield
     except OSError as error:
@@ -120,7 +96,7 @@ def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceEr
 
 
 def is_writable(folder: Path) -> bool:
-    """Return whether a file can be created in a folder."""
+    """Whether a file can be created in a folder."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return True
@@ -129,12 +105,7 @@ def is_writable(folder: Path) -> bool:
 
 
 def why_not_writable(path: Path, made: Path | None = None) -> str:
-    """Return why a file cannot be made or replaced, and what to do; empty if it can.
-
-    Parameters
-    ----------
-    made : a folder that is made before the file, if it does not exist
-    """
+    """Why a file cannot be made or replaced, and what to do; empty if it can. The folder `made` is made before it."""
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
         folder = next(each for each in (folder, *folder.parents) if each.exists())
@@ -144,22 +115,15 @@ def why_not_writable(path: Path, made: Path | None = None) -> str:
 
 
 def lock(handle: int, seconds: float = 0.0) -> bool:
-    """Lock an open file or folder for this process alone; False if another process keeps it locked for `seconds`.
-
-    The kernel releases the lock when the handle is closed, or when the process ends, however that happens.
-    """
+    """Lock an open file or folder until it is closed or this process ends; False if another keeps it for `seconds`."""
     deadline = time.monotonic() + seconds
     while not (locked := _flock(handle, fcntl.LOCK_EX)) and time.monotonic() < deadline:
-        time.sleep(_PAUSE_SECONDS)
+        time.sleep(0.05)
     return locked
 
 
 def is_locked(handle: int) -> bool:
-    """Whether another process has locked an open file.
-
-    The question is asked with a shared lock: two processes that ask at the same moment do not take each other for an
-    owner.
-    """
+    """Whether another process has locked an open file; asked with a shared lock, so that two may ask at once."""
     return not _flock(handle, fcntl.LOCK_SH)
 
 
@@ -173,53 +137,29 @@ def _flock(handle: int, kind: int) -> bool:
 
 
 def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode: int = 0o666) -> None:
-    """Write arrays and JSON metadata to a file, atomically.
-
-    Raises
-    ------
-    OSError
-        As in `write_atomically`.
-    """
+    """Write arrays and JSON metadata to a file, as `write_atomically` does."""
     write_atomically(path, encode(arrays, metadata), mode=mode)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
-    """Return the arrays and the metadata of a file that `write` wrote.
-
-    Raises
-    ------
-    ProtocolError
-        If the file is incomplete or damaged, or was not written by catstream.
-    """
+    """The arrays and the metadata of a file that `write` wrote; ProtocolError if it is damaged or another file."""
     return decode(Path(path).read_bytes(), str(path))
 
 
 def read_metadata(path: str | os.PathLike[str]) -> Metadata:
-    """Return the metadata of a file that `write` wrote; the arrays are only checked, not copied.
-
-    Raises
-    ------
-    ProtocolError
-        As in `read`.
-    """
+    """The metadata of a file, as `read` returns it; the arrays are only checked, not copied."""
     return _checked(Path(path).read_bytes(), str(path))[1]
 
 
 def encode(arrays: Arrays, metadata: Metadata) -> bytes:
-    """Return the content of the file that `write` writes."""
+    """The content of the file that `write` writes."""
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}  # as safetensors expects
     facts = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
     return safetensors.numpy.save(contiguous, {_KEY: json.dumps(facts, sort_keys=True)})
 
 
 def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
-    """Return the arrays and the metadata in the content of a file, whose name is for the error.
-
-    Raises
-    ------
-    ProtocolError
-        As in `read`.
-    """
+    """The arrays and the metadata in the content of a file, as `read` returns them; its name is for the error."""
     arrays, metadata = _checked(data, name)
     return {key: array.copy() for key, array in arrays.items()}, metadata
 
@@ -257,7 +197,7 @@ def _sync(folder: Path) -> None:
 
 
 def _checksum(arrays: Arrays, metadata: Metadata) -> int:
-    """Return the CRC-32 of the metadata and of the arrays with their names, shapes and types."""
+    """The CRC-32 of the metadata and of the arrays with their names, shapes and types."""
     check = zlib.crc32(json.dumps(metadata, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):
         check = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), check)
@@ -268,8 +208,6 @@ def _checksum(arrays: Arrays, metadata: Metadata) -> int:
 def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
     """Arrays, their names beginning with `name`, and metadata for JSON.
 
-    Examples
-    --------
     >>> from catstream.messages.kinds import Motion
     >>> arrays, metadata = pack(Motion(np.eye(4), np.eye(2)), "motion")
     >>> list(arrays), metadata
@@ -283,14 +221,9 @@ def pack(message: object, name: str) -> tuple[Arrays, Metadata]:
 
 
 def unpack(kind: type[Message], arrays: Arrays, metadata: Metadata, name: str) -> Message:
-    """The message that `pack` took, bit for bit.
+    """The message that `pack` took, bit for bit; TypeError or ValueError if it is none of this kind.
 
     The limits of its arrays are not checked: `catstream.messages.schema` does that.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the arrays and metadata are not those of a message of this kind.
     """
     whole: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(metadata))  # a copy, to put the arrays into
     for path, array in with_prefix(arrays, f"{name}.").items():

@@ -39,11 +39,8 @@ def write_layout(
 ) -> None:
     """Write the files of one object in one of the `LAYOUTS`; raises OSError if that is not possible.
 
-    Parameters
-    ----------
     boxes : float64 (frames, 4), x, y, w, h in pixels; NaN if there is none
-    confidence : float64 (frames,); None to write no such file
-    seconds : float64 (frames,), processing time; None to write no such file
+    confidence, seconds : score and processing time, float64 (frames,); None to write no such file
     """
     values = (boxes, confidence, seconds)
     for pattern, column, form in zip(LAYOUTS[layout], values, ("%.4f", "%.6f", "%.8f"), strict=True):

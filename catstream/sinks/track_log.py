@@ -1,4 +1,4 @@
-"""The log of tracks: NDJSON and CSV files that grow line by line. A run that is resumed continues them.
+"""The log of tracks, NDJSON and CSV files that grow line by line, and all files of a run, which it continues.
 
 A power cut or a full disk can cut a file within a frame of several objects. In each frame, the objects that were not in
 the frame before come first, so a last frame that has all objects of the frame before it is whole. Any other last frame
@@ -11,8 +11,9 @@ import json
 import os
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise
 from math import isnan, nan
 from pathlib import Path
@@ -23,7 +24,10 @@ from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing
-from catstream.sinks.destinations import Origin, TrackedFrame
+from catstream.run.job import Results
+from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
+from catstream.video.frames import without_password
+from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
 
@@ -34,11 +38,8 @@ _FIRST = frozenset({UNNAMED})
 class LineSink(ABC):
     """A file with a line for each track. What was written remains, however this process ends.
 
-    An existing file is replaced; if the run is resumed, it is cut after the frame `origin.last` and continued.
-
-    Attributes
-    ----------
-    last : number of the last frame in the file, -1 for none
+    An existing file is replaced; if the run is resumed, it is cut after the frame `origin.last` and continued. `last`
+    is the number of the last frame in it, -1 for none.
     """
 
     #: The first line of a file, with its line end.
@@ -181,3 +182,87 @@ def whole_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
 
 def _objects(frame: TrackedFrame) -> frozenset[str]:
     return frozenset(track.object for track in frame.tracks)
+
+
+def places_of(name: str, results: Results) -> list[str]:
+    """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
+    kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
+    own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
+    return [*dict.fromkeys([*own, *results.write])]
+
+
+@dataclass(frozen=True, slots=True)
+class RunFiles:
+    """All destinations of a run.
+
+    A resumed run continues after the last frame that its log holds whole: an NDJSON file, which has all digits, or else
+    a CSV file. All its logs are cut after that frame; one that is shorter or new gets the frames that it lacks from the
+    first one, and a video is drawn again.
+
+    origin  the source of the run, and the frames that are tracked
+    output  folder of the results, which is made; None for none
+    places  the destinations, each once
+    """
+
+    origin: Origin
+    output: Path | None
+    places: list[str]
+
+    def check(self, *, overwrite: bool, earlier: list[str]) -> None:
+        """Raise VideoError or MissingExtraError before the run if a destination cannot be written, or must not be.
+
+        If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued.
+        """
+        source = self.origin.source or ""
+        for place in self.places:
+            row = sink_of(place)
+            row.load()
+            if place.endswith(".mp4") and is_live(source):
+                raise VideoError(
+                    f"a video needs its frames once more, but {without_password(source)} is live: omit the video"
+                )
+            if is_file(place):
+                continued = place in earlier and row.repeats and self._log() is not None
+                if place in earlier and not continued and Path(place).exists():
+                    raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
+                check_file(Path(place), may_exist=overwrite or continued, source=source, made=self.output)
+
+    def position(self) -> int | None:
+        """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log."""
+        log = self._log()
+        return None if log is None else max((frame.number + 1 for frame, _ in whole_frames(log)), default=0)
+
+    def make_folder(self) -> None:
+        """Make the folder of the results, in which other files of the run may be, too."""
+        if self.output is not None:
+            with writing(self.output, VideoError):
+                self.output.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def opened(self, endpoint: str, *, resume: bool = False) -> Iterator[Callable[[TrackedFrame], None]]:
+        """Yield a function that writes a frame everywhere; at the end, everything is closed.
+
+        If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
+        raise VideoError if a destination cannot be written any more.
+        """
+        log = self._log() if resume else None  # before new ones exist, too
+        last = max((frame.number for frame, _ in whole_frames(log)), default=-1) if log is not None else -1
+        origin = replace(self.origin, endpoint=endpoint, last=last)
+        with ExitStack() as stack:
+            sinks = [stack.enter_context(closing(open_sink(place, origin))) for place in self.places]
+            behind = [(sink, sink.last) for sink in sinks if hasattr(sink, "last") and sink.last < last]
+            for frame, _ in read_frames(log) if log is not None and behind else ():
+                for sink, its_last in behind:
+                    if its_last < frame.number:
+                        sink.write(frame)
+
+            def write(frame: TrackedFrame) -> None:
+                for sink in sinks:
+                    sink.write(frame)
+
+            yield write
+
+    def _log(self) -> Path | None:
+        """Return the log that is continued, None if there is to be none."""
+        logs = (Path(place) for place in self.places if is_log(Path(place)))
+        return min(logs, key=lambda log: (not log.exists(), log.suffix == ".csv"), default=None)

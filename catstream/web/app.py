@@ -50,12 +50,12 @@ _CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, Cats
 
 
 def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
-    """Return the site of the pipeline at an endpoint, as in `PipelineFeed`."""
+    """The site of the pipeline at an endpoint, as in `PipelineFeed`."""
     return Site(PipelineFeed(endpoint, keys))
 
 
 def fleet_site(fleet: str = "", keys: str = "") -> Site:
-    """Return the site of a fleet, which may start later; the arguments are those of `FleetFeed`."""
+    """The site of a fleet, which may start later; the arguments are those of `FleetFeed`."""
     return Site(FleetFeed(fleet, keys))
 
 
@@ -73,18 +73,16 @@ class Site:
             Route("/readyz", self._readyz),
             Mount("/page", StaticFiles(directory=_PAGE)),
         ]
-        of_pipeline = [
+        routes = [
             *common,
             Route("/pictures/{frame:int}.jpg", self._picture),
             Route("/live.mjpeg", self._live),
             Route("/control", self._control, methods=["POST"]),
         ]
-        of_fleet = [*common, Mount("/streams/{stream}", routes=of_pipeline)]
-        self.app = Starlette(
-            lifespan=self._lifespan,
-            routes=of_pipeline if isinstance(feed, PipelineFeed) else of_fleet,
-            exception_handlers={CatstreamError: _failed},
-        )
+        if isinstance(feed, FleetFeed):
+            routes = [*common, Mount("/streams/{stream}", routes=routes)]
+        handlers = {CatstreamError: _failed}
+        self.app = Starlette(lifespan=self._lifespan, routes=routes, exception_handlers=handlers)
 
     def close(self) -> None:
         """End the streams of all open pages; called before the shutdown of a server, which waits for them."""
@@ -134,10 +132,6 @@ class Site:
             if len(body := body + part) > _MAX_BODY:
                 raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
         command = decode_json(body, Command)
-        if command.object and command.verb not in ("set-box", "forget"):
-            raise ProtocolError(f"expected no object with {command.verb}, got {command.object!r}")
-        if (command.box is not None) != (command.verb == "set-box"):
-            raise ProtocolError(f"expected a box with set-box and with no other verb, got {command.verb}")
         try:
             answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
@@ -146,11 +140,11 @@ class Site:
         return JSONResponse({"done": True} | result)
 
     def _feed_of(self, request: Request) -> Feed:
-        """Return the feed of the page that a request is about."""
+        """The feed of the page that a request is about."""
         return self._pipeline(request) if "stream" in request.path_params else self._feed
 
     def _pipeline(self, request: Request) -> PipelineFeed:
-        """Return the feed of the stream that a request names, or of the only one."""
+        """The feed of the stream that a request names, or of the only one."""
         return self._feed.pipeline(request.path_params.get("stream", ""))
 
     async def _updates(self, feed: Feed) -> AsyncIterator[str]:
@@ -206,6 +200,8 @@ class Command:
     def __post_init__(self) -> None:
         if (self.box is not None) != (self.verb == "set-box"):
             raise ProtocolError(f"expected a box with set-box and with nothing else, got {self.verb}")
+        if self.object and self.verb not in ("set-box", "forget"):
+            raise ProtocolError(f"expected no object with {self.verb}, got {self.object!r}")
 
 
 def _failed(_: Request, error: Exception) -> Response:

@@ -24,6 +24,7 @@ _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
 _PICTURES = 64  # number of pictures that a page with a slow connection may still request
+_SHOWN_OF_A_PICTURE = ("frame", "width", "height", "boxes")
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
@@ -31,9 +32,9 @@ _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
 
 
 class Parts:
-    """The state of a page, in parts that are sent to each open page, in this order, when they have changed.
+    """The state of a page: functions that return JSON values, sent to each open page, in this order, if they changed.
 
-    A part is a function of the number of its changes since the page has received it, which returns JSON values.
+    The argument of each is the number of its changes since the page has received it.
     """
 
     def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
@@ -114,7 +115,7 @@ class Dashboard(Parts):
         self.objects: dict[str, ShownObject] = {}  #: in the order in which they began
         self.colours = Colours()
         self.health: dict[str, Health] = {}  #: the last report of each process
-        self.last_reports: dict[str, float] = {}  #: the times at which they arrived
+        self.last_reports: dict[str, float] = {}  #: times of their arrivals
         self._pictures: dict[int, Preview] = {}
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
@@ -240,16 +241,11 @@ class Dashboard(Parts):
 
     def _status_part(self, _: int) -> dict[str, object]:
         counters = self.health["detector"].counters if "detector" in self.health else {}
-        return {
-            "phase": self.phase,
-            "reason": self.reason,
-            "endpoint": self.endpoint,
-            "source": self.source,
-            "paused": bool(counters.get("paused")),
-            "waiting": bool(counters.get("waiting")),
-            "lost_seconds": counters.get("lost_seconds"),
-            "skipped": counters.get("skipped"),
-        }
+        return (
+            {name: getattr(self, name) for name in ("phase", "reason", "endpoint", "source")}
+            | {name: bool(counters.get(name)) for name in ("paused", "waiting")}
+            | {name: counters.get(name) for name in ("lost_seconds", "skipped")}
+        )
 
     def _tracks_part(self, _: int) -> dict[str, object]:
         frame, time = self._frame or (None, None)
@@ -260,25 +256,18 @@ class Dashboard(Parts):
         return {"frame": frame, "time": time, "objects": objects}
 
     def _picture_part(self, _: int) -> dict[str, object] | None:
-        if self.newest is None:
-            return None
-        preview = self.newest[0]
-        return {"frame": preview.frame, "width": preview.width, "height": preview.height, "boxes": preview.boxes}
+        preview = next(reversed(self._pictures.values()), None)
+        return preview if preview is None else {name: getattr(preview, name) for name in _SHOWN_OF_A_PICTURE}
 
     def _trees_part(self, _: int) -> dict[str, object]:
         counted = self.health["compressor"].objects if "compressor" in self.health else {}
+        kinds = [{"title": tree.title, "meaning": tree.meaning} for tree in TREES.values()]
         objects = {
-            name: {
-                "leaves": [counters.get(f"{tree}_leaves", 0.0) for tree in TREES],
-                "bytes": counters.get("bytes", 0.0),
-                "rows": counters.get("rows", 0.0),
-            }
+            name: {"leaves": [counters.get(f"{tree}_leaves", 0.0) for tree in TREES]}
+            | {counter: counters.get(counter, 0.0) for counter in ("bytes", "rows")}
             for name, counters in counted.items()
         }
-        return {
-            "kinds": [{"title": tree.title, "meaning": tree.meaning} for tree in TREES.values()],
-            "objects": objects,
-        }
+        return {"kinds": kinds, "objects": objects}
 
 
 def _remember(recent: dict[Key, Value], key: Key, value: Value, most: int) -> None:

@@ -49,24 +49,12 @@ _HEADERS = {
 
 
 class Server:
-    """The web server of a site, with access control. Its constructor begins to listen.
+    """The web server of a site, with access control. Its constructor begins to listen; port 0 is a free one.
 
-    Parameters
-    ----------
-    site : what is served
-    host, port : address to listen on; port 0 for a free port
-    token : token that clients must have; None, which is possible on 127.0.0.1 only, lets every user of this machine
-        watch and give commands
-
-    Attributes
-    ----------
-    url : URL of the page for a browser on this machine, with the token
-    urls : `url`, and if the server listens on all interfaces, the URL for other machines
-
-    Raises
-    ------
-    ServiceError
-        If the page would be public without a token, the token is too short, or the port is in use.
+    Clients must have the token; None, which is possible on 127.0.0.1 only, lets every user of this machine watch and
+    give commands. `url` is for a browser on this machine, with the token; `urls` has one for other machines, too, if
+    the server listens on all interfaces. ServiceError if the page would be public without a token, the token is too
+    short, or the port is in use.
     """
 
     def __init__(self, site: Site, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:

@@ -25,7 +25,7 @@ LOOK_SECONDS = 0.05  #: from one look at the connection to the next
 RETRY_SECONDS = 0.2  #: after which a question is sent again; a large one later
 RETRY_BYTES_PER_SECOND = 1e6  #: of a slow network: a large question is sent again after so much longer
 _MAX_QUESTIONS = 64  # that wait, that are remembered with their answers, and that are received at once
-_LONGEST_QUESTION = 1 << 20  # bytes
+_LONGEST_QUESTION = 1 << 20  # bytes; once so many were received, the other questions wait
 _MOST_QUEUED = 256 << 20  # bytes of questions that a socket queues for each client
 
 
@@ -88,12 +88,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
 
 class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
-    """Receives questions from any number of clients and answers them; it binds.
-
-    Parameters
-    ----------
-    longest : bytes of a question at most
-    """
+    """Receives questions of at most `longest` bytes from any number of clients, and answers them; it binds."""
 
     def __init__(
         self, channel: Channel[Question | Answer], endpoint: Endpoint, longest: int = _LONGEST_QUESTION
@@ -108,15 +103,13 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
     def receive_all(self, seconds: float = 0.0) -> list[Question]:
         """The new questions, oldest first; each has to be answered. One that was repeated is not among them.
 
-        Parameters
-        ----------
-        seconds : time to wait for the first one
+        It waits so many seconds for the first one. A flood does not stop the process: the rest waits for the next call.
         """
         questions: list[Question] = []
-        for _ in range(_MAX_QUESTIONS):  # the rest waits for the next call: a flood does not stop the process
-            if not self._wait(seconds):
-                break
+        received = size = 0
+        while received < _MAX_QUESTIONS and size <= _LONGEST_QUESTION and self._wait(seconds):
             peer, data = self._receive_from_peer()
+            received, size = received + 1, size + (len(data) if data is not None else 0)
             question = self._decode(data, self._question_kind) if data is not None else None
             if question is not None and self._accept(question, peer):
                 questions.append(question)

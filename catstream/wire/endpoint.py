@@ -26,7 +26,7 @@ from catstream.wire.keys import Keys
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
-_HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252})|\*")
+_TCP = re.compile(r"tcp://(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,252}|\[[^\[\]]+\]):([0-9]{1,5})")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
 _FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
@@ -83,18 +83,20 @@ class Endpoint:
     @classmethod
     def _tcp(cls, text: str, keys: Keys | None) -> Endpoint:
         last = max(channel.port + len(channel.senders) for channel in CHANNELS.values()) - 1
-        host, _, port = text.removeprefix("tcp://").rpartition(":")
+        parts = _TCP.fullmatch(text)
+        host, port = (parts[1], int(parts[2])) if parts is not None else ("", 0)
         host = {"localhost": "127.0.0.1", "*": "0.0.0.0"}.get(host, host)
         address = _address(host)
-        if keys is None and _is_host(host) and (address is None or not address.is_loopback):
+        is_host = bool(host) and (address is not None or not host.startswith("["))
+        if keys is None and is_host and (address is None or not address.is_loopback):
             raise ServiceError(
                 f"other machines can reach {text}, and without keys anybody could connect: make keys "
                 "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
                 "tcp://127.0.0.1:PORT"
             )
-        if not (_is_host(host) and port.isascii() and port.isdecimal() and 1 <= int(port) <= 65535 - last):
+        if not (is_host and 1 <= port <= 65535 - last):
             raise ServiceError(f"a tcp endpoint is tcp://HOST:PORT with {last} more ports after PORT, got {text!r}")
-        return cls(host=host, port=int(port), keys=keys)
+        return cls(host=host, port=port, keys=keys)
 
     def address(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address of a channel, as ZeroMQ takes it; of the given sender if there are several."""
@@ -131,13 +133,6 @@ class Endpoint:
 Place = str | os.PathLike[str] | Endpoint
 
 
-def _is_host(host: str) -> bool:
-    """Whether a text is the name of a host, or an address; an IPv6 address is in brackets."""
-    if host.startswith("["):
-        return host.endswith("]") and _address(host) is not None
-    return bool(_HOST.fullmatch(host))
-
-
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
         return ipaddress.ip_address(host.strip("[]"))
@@ -172,14 +167,10 @@ def private_folder() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fleet: str = "") -> Iterator[Endpoint]:
-    """The endpoint of one pipeline, or of a fleet's registry, locked for it; removes all socket files afterwards.
+    """The endpoint of one pipeline, or of the registry of a fleet, locked for it; removes all socket files afterwards.
 
-    Parameters
-    ----------
-    text, keys : the settings `endpoint` and `keys`
-    default : the private folder of the process, used if `text` is empty; `running` and `fleets` find the endpoint by it
-    source : of the pipeline's frames, without a password, by which a user tells several pipelines apart
-    fleet : name of the fleet whose controller has this endpoint; empty for a pipeline
+    `text` and `keys` are settings. The private folder `default` is used if `text` is empty, and the endpoint is found
+    by a note in it, with the source of the frames, without a password, or the name of the fleet.
     """
     endpoint = Endpoint.parse(text or str(default), keys)
     if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
@@ -236,7 +227,7 @@ def fleets() -> dict[str, Endpoint]:
 def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, str]]:
     """The endpoint in each note whose process is running, and the source or name in it.
 
-    An endpoint whose keys cannot be read is skipped, because it must not hide the others; if `strict`, it is an error.
+    One whose keys cannot be read must not hide the others: it is skipped, or an error if `strict`.
     """
     for _, text in _notes(_homes(), f"{_PREFIX}*/{note}"):
         if text:
@@ -251,15 +242,8 @@ def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, s
 def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
     """The endpoint of a running pipeline: the given one, the one with this source, or the user's only one.
 
-    The source of a given one is not looked for: see `source_at`.
-
-    Parameters
-    ----------
-    text, keys : the settings `endpoint` and `keys`; the keys of this user's pipelines are known. What is an `Endpoint`
-        already is returned
-    source : of a pipeline of this user, as it was given, or its file name
-
-    ServiceError if there is none, or more than one.
+    The keys of this user's pipelines are known. The source is as it was given to the pipeline, or its file name; that
+    of a given endpoint is not looked for: see `source_at`. ServiceError if there is none, or more than one.
     """
     if isinstance(text, Endpoint):
         return text
@@ -269,16 +253,13 @@ def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or give its --endpoint")
-    if source:
-        found = [endpoint for endpoint in endpoints if _follows(endpoint, source)]
-        if not found:
-            raise ServiceError(f"no pipeline of yours tracks {source!r}: give one of these{_listed(endpoints)}")
-        if len(found) > 1:
-            raise ServiceError(f"{len(found)} pipelines track {source!r}: say which (--endpoint){_listed(found)}")
+    found = [endpoint for endpoint in endpoints if not source or _follows(endpoint, source)]
+    if len(found) == 1:
         return found[0]
-    if len(endpoints) > 1:
-        raise ServiceError(f"{len(endpoints)} pipelines are running: say which (--endpoint){_listed(endpoints)}")
-    return endpoints[0]
+    if not found:
+        raise ServiceError(f"no pipeline of yours tracks {source!r}: give one of these{_listed(endpoints)}")
+    what = f"track {source!r}" if source else "are running"
+    raise ServiceError(f"{len(found)} pipelines {what}: say which (--endpoint){_listed(found)}")
 
 
 def _listed(endpoints: list[Endpoint]) -> str:
@@ -289,8 +270,7 @@ def _listed(endpoints: list[Endpoint]) -> str:
 def is_deserted(endpoint: Endpoint) -> bool:
     """Whether an endpoint is a folder in which no pipeline runs: neither one of this user nor one that takes commands.
 
-    A folder that does not exist may be that of a pipeline that starts at this moment. A pipeline that was started by
-    hand is not known here, so the answer is wrong while its detector is restarted.
+    A folder that does not exist may be that of a pipeline that starts at this moment.
     """
     folder = endpoint.folder
     is_unknown = folder is not None and folder.is_dir() and _running_at(endpoint) is None

@@ -20,7 +20,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import zmq
 
@@ -64,8 +64,8 @@ class Keys:
     def load(cls, folder: str | os.PathLike[str]) -> Keys:
         """Read a folder of keys, a pipeline's or a client's."""
         folder = Path(folder).absolute()
-        own = _read(folder / _CLIENT)
-        return cls(folder, public_key(folder).encode(), _key(own, "public", folder), _key(own, "secret", folder))
+        public, secret = (_key(folder / _CLIENT, name).encode() for name in ("public", "secret"))
+        return cls(folder, public_key(folder).encode(), public, secret)
 
     def listening(self) -> bytes:
         """The secret key of the sockets that listen."""
@@ -74,7 +74,7 @@ class Keys:
                 f"{self.folder} holds the keys of a client, a pipeline needs those that `catstream keys new` made: "
                 "give that folder"
             )
-        return _key(_read(self.folder / _SERVER), "secret", self.folder)
+        return _key(self.folder / _SERVER, "secret").encode()
 
     def for_server(self, public: str) -> Keys:
         """The same key pair, to connect to sockets with another public key."""
@@ -90,10 +90,8 @@ def create(folder: Path) -> None:
     """Make the keys of a pipeline: a pair for its sockets that listen, and one for its processes that connect."""
     if any((folder / name).exists() for name in (_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS)):
         raise ServiceError(f"{folder} holds keys already, and clients that have them would be locked out: give another")
-    public, secret = zmq.curve_keypair()
-    _write(folder / _SERVER, public=public, secret=secret)
-    _write(folder / _SERVER_PUBLIC, public=public)
-    _write(folder / _CLIENTS / _OWN, role=b"pipeline", public=_pair(folder))
+    _write(folder / _SERVER_PUBLIC, public=_pair(folder / _SERVER))
+    _write(folder / _CLIENTS / _OWN, role="pipeline", public=_pair(folder / _CLIENT))
 
 
 def ensure(folder: Path) -> None:
@@ -103,14 +101,8 @@ def ensure(folder: Path) -> None:
 
 
 def allow(folder: Path, name: str, role: Role, output: Path | None = None, public: str | None = None) -> None:
-    """Add a client, which may connect from now on.
-
-    Parameters
-    ----------
-    output : new folder for the keys of the client; or
-    public : the public key of a client that has a key pair already
-    """
-    known, server = clients(folder), public_key(folder).encode()
+    """Add a client, which may connect from now on: with keys in the new folder `output`, or with its own public key."""
+    known, server = clients(folder), public_key(folder)
     if _named(name) in known:
         raise ServiceError(f"there is a client {name} already: take another name, or `catstream keys revoke` it first")
     for other, client in known.items():
@@ -120,10 +112,10 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
         _checked(public)
     elif output is not None:
         _write(output / _SERVER_PUBLIC, public=server)
-        public = _pair(output).decode()
+        public = _pair(output / _CLIENT)
     else:
         raise ServiceError("a new client needs a folder for its keys, or its public key")
-    _write(folder / _CLIENTS / name, role=role.encode(), public=public.encode())
+    _write(folder / _CLIENTS / name, role=role, public=public)
 
 
 def revoke(folder: Path, name: str) -> None:
@@ -138,12 +130,7 @@ def revoke(folder: Path, name: str) -> None:
 
 
 def allowed(folder: Path) -> dict[str, Client]:
-    """The clients that may connect to the streams of a fleet, by name, for `synchronise` at each stream.
-
-    Parameters
-    ----------
-    folder : keys of the fleet; its own processes are one of the clients
-    """
+    """The clients that a fleet with these keys allows at its streams, by name: its own processes are one of them."""
     return {_FLEET if name == _OWN else name: client for name, client in clients(folder).items()}
 
 
@@ -153,7 +140,7 @@ def synchronise(folder: Path, wanted: Mapping[str, Client]) -> None:
     A client that stays is allowed at any time. A connection that is open stays open.
     """
     texts = {
-        _named(name): _text(role=client.role.encode(), public=_checked(client.public).encode())
+        _named(name): _text(role=client.role, public=_checked(client.public))
         for name, client in wanted.items()
         if name != _OWN
     }
@@ -172,51 +159,28 @@ def clients(folder: Path) -> dict[str, Client]:
     found = {}
     for path in _listed(folder):
         try:
-            facts = _read(path)
+            if (role := _read(path).get("role")) not in ROLES:
+                raise ServiceError(
+                    f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, and allow it again"
+                )
+            found[path.name] = Client(role, _key(path, "public"))
         except ServiceError:
-            if not path.exists():  # it was revoked meanwhile
-                continue
-            raise
-        if (role := facts.get("role")) not in ROLES:
-            raise ServiceError(
-                f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, and allow it again"
-            )
-        found[path.name] = Client(role, _key(facts, "public", path).decode())
+            if path.exists():  # otherwise it was revoked meanwhile
+                raise
     return found
 
 
 def public_key(folder: Path) -> str:
     """The public key of the sockets that listen."""
-    return _key(_read(folder / _SERVER_PUBLIC), "public", folder).decode()
+    return _key(folder / _SERVER_PUBLIC, "public")
 
 
 def _listed(folder: Path) -> list[Path]:
+    """The files of the clients."""
     try:
         return sorted(path for path in (folder / _CLIENTS).iterdir() if _NAME.fullmatch(path.name))
     except OSError as error:
         raise ServiceError(f"no keys in {folder} ({error.strerror}): make them with `catstream keys new`") from None
-
-
-def _pair(folder: Path) -> bytes:
-    """Make a key pair for sockets that connect; returns the public key."""
-    public, secret = zmq.curve_keypair()
-    _write(folder / _CLIENT, public=public, secret=secret)
-    return public
-
-
-def _write(path: Path, **facts: bytes) -> None:
-    """Write a new file atomically; only its owner can read it at any time."""
-    with writing(path):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        try:
-            create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
-        except FileExistsError:
-            raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
-
-
-def _text(**facts: bytes) -> bytes:
-    """The content of a file, as TOML."""
-    return b"".join(b'%s = "%s"\n' % (name.encode(), value) for name, value in facts.items())
 
 
 def _named(name: str) -> str:
@@ -231,12 +195,42 @@ def _checked(public: str) -> str:
     return public
 
 
-def _read(path: Path) -> dict[str, object]:
-    others = 0o077 if path.suffix == ".key" else 0o022  # other users must not read a secret key or write any file
+def _pair(path: Path) -> str:
+    """Make a key pair in a new file; returns the public key."""
+    public, secret = (key.decode() for key in zmq.curve_keypair())
+    _write(path, public=public, secret=secret)
+    return public
+
+
+def _write(path: Path, **facts: str) -> None:
+    """Write a new file atomically; only its owner can read it at any time."""
+    with writing(path):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        try:
+            create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
+        except FileExistsError:
+            raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
+
+
+def _text(**facts: str) -> bytes:
+    """The content of a file, as TOML."""
+    return "".join(f'{name} = "{value}"\n' for name, value in facts.items()).encode()
+
+
+def _key(path: Path, name: str) -> str:
+    """The key of this name in a file."""
+    key = _read(path).get(name)
+    if not isinstance(key, str) or not _KEY.fullmatch(key):
+        raise ServiceError(f"{path} holds no {name} key as ZeroMQ writes it, 40 characters: make new keys")
+    return key
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What a file holds; only its owner may write it, and read it if it holds a secret key."""
     try:
         with path.open("rb") as file:
             facts = os.fstat(file.fileno())
-            if facts.st_uid not in (os.geteuid(), 0) or facts.st_mode & others:
+            if facts.st_uid not in (os.geteuid(), 0) or facts.st_mode & (0o077 if path.suffix == ".key" else 0o022):
                 raise ServiceError(
                     f"other users can access {path}: chmod 600, and make new keys if somebody may have read it"
                 )
@@ -248,10 +242,3 @@ def _read(path: Path) -> dict[str, object]:
         ) from None
     except (ValueError, RecursionError) as error:
         raise ServiceError(f"{path} is damaged ({error}): make new keys") from None
-
-
-def _key(facts: dict[str, object], name: str, path: Path) -> bytes:
-    key = facts.get(name)
-    if not isinstance(key, str) or not _KEY.fullmatch(key):
-        raise ServiceError(f"{path} holds no {name} key as ZeroMQ writes it, 40 characters: make new keys")
-    return key.encode()

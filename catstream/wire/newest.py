@@ -38,12 +38,7 @@ Message = TypeVar("Message")
 
 
 class Publisher(ChannelSocket[Message]):
-    """Sends to all subscribers, and waits for none.
-
-    Parameters
-    ----------
-    sender : which of the channel's senders this is, if there are several
-    """
+    """Sends to all subscribers, and waits for none; `sender` is one of the channel's senders if there are several."""
 
     def __init__(self, channel: Channel[Message], endpoint: Endpoint, sender: str | None = None) -> None:
         self._newest = channel.keeps == "newest"
@@ -89,8 +84,7 @@ class Publisher(ChannelSocket[Message]):
         for _ in range(_MAX_CHANGES):  # the rest waits for the next call: a flood does not stop the process
             if not arrives(self._socket, 0):
                 break
-            change = self._socket.recv()
-            joined |= self._process(subscribes=change.startswith(b"\x01"), topic=change[1:])
+            joined |= self._process(self._socket.recv())
         if self._last and (joined or monotonic() >= self._repeat_at):
             self._repeat()
 
@@ -102,13 +96,12 @@ class Publisher(ChannelSocket[Message]):
             self._socket.send(data, copy=False)
         self._repeat_at = monotonic() + REPEAT_SECONDS * len(topics) / len(self._last)
 
-    def _process(self, subscribes: bool, topic: bytes) -> bool:
+    def _process(self, change: bytes) -> bool:
         """Process one subscription or its end; returns whether there is a new subscriber."""
+        subscribes, topic = change.startswith(b"\x01"), change[1:]
         if topic and not topic.startswith(self._kinds):
-            self._reject(
-                "subscription",
-                "a message was dropped: expected a subscription to everything, to a kind of message, or to one object",
-            )
+            expected = "expected a subscription to everything, to a kind of message, or to one object"
+            self._reject("subscription", f"a message was dropped: {expected}")
         elif subscribes and topic not in self._subscribed and len(self._subscribed) >= _MOST_TOPICS:
             self._reject("topics", f"a subscription was not counted: expected at most {_MOST_TOPICS} topics")
         elif subscribes:
@@ -123,21 +116,12 @@ class Subscriber(ChannelSocket[Message]):
     """Receives what is published from now on; if the channel keeps the newest message, the last ones first.
 
     If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
-    message of the object that has waited longest is received first.
-
-    Parameters
-    ----------
-    only : the one kind of message to receive; None for all
-    about : name of the one object whose messages of this kind are received; None for all
+    message of the object that has waited longest is received first. `only` limits it to one kind of message, and
+    `about` to those of this kind about one object.
     """
 
     def __init__(
-        self,
-        channel: Channel[Message],
-        endpoint: Endpoint,
-        only: type | None = None,
-        *,
-        about: str | None = None,
+        self, channel: Channel[Message], endpoint: Endpoint, only: type | None = None, *, about: str | None = None
     ) -> None:
         self._newest = channel.keeps == "newest"
         self._passes_over = self._newest and len(channel.senders) == 1
@@ -209,9 +193,7 @@ class GapCounter:
     def take(self, seq: int, began: int | None = None) -> None:
         """Count the frames missing before the number of the next message, or of the end.
 
-        Parameters
-        ----------
-        began : first frame of the object if messages about one object are counted: there were none before that frame
+        If the messages are about one object, it `began` in this frame, and there were none before.
         """
         if began is not None and began != self._began:
             self._began = began

@@ -32,9 +32,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys
 
 LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last messages
-RECONNECT_SECONDS = 0.02  #: before the first attempt to connect again; doubled each time
-RECONNECT_MOST_SECONDS = 0.5  #: between two attempts at most
-HANDSHAKE_SECONDS = 5.0  #: limit for a peer to prove its key
+RECONNECT_MOST_SECONDS = 0.5  #: between two attempts to connect again
 KEEPALIVE_SECONDS = 5  #: without traffic, after which TCP probes the other host
 KEEPALIVE_PROBE_SECONDS = 2  #: between two probes
 KEEPALIVE_PROBES = 3  #: without an answer, after which the connection is closed
@@ -44,12 +42,12 @@ KEEPALIVE_PROBES = 3  #: without an answer, after which the connection is closed
 #: keepalive reports it after 11 s, or once the host is up again.
 _OPTIONS = {
     zmq.LINGER: round(LINGER_SECONDS * 1000),
-    zmq.HANDSHAKE_IVL: round(HANDSHAKE_SECONDS * 1000),
+    zmq.HANDSHAKE_IVL: 5000,
     zmq.TCP_KEEPALIVE: 1,
     zmq.TCP_KEEPALIVE_IDLE: KEEPALIVE_SECONDS,
     zmq.TCP_KEEPALIVE_INTVL: KEEPALIVE_PROBE_SECONDS,
     zmq.TCP_KEEPALIVE_CNT: KEEPALIVE_PROBES,
-    zmq.RECONNECT_IVL: round(RECONNECT_SECONDS * 1000),
+    zmq.RECONNECT_IVL: 20,  # before the first attempt to connect again; doubled each time
     zmq.RECONNECT_IVL_MAX: round(RECONNECT_MOST_SECONDS * 1000),
 }
 
@@ -69,10 +67,7 @@ _logged: set[tuple[str, str]] = set()
 
 @cache
 def context() -> zmq.Context[zmq.Socket[bytes]]:
-    """Return the ZeroMQ context of catstream in this process, not the user's own; a forked process gets its own.
-
-    Only the limit of open files of the process limits the number of its sockets.
-    """
+    """The ZeroMQ context of catstream in this process; only the limit of open files limits its number of sockets."""
     made = zmq.Context()
     made.set(zmq.MAX_SOCKETS, made.get(zmq.SOCKET_LIMIT))
     return made
@@ -82,7 +77,7 @@ os.register_at_fork(after_in_child=context.cache_clear)
 
 
 def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
-    """Return whether a socket has a message, or gets one within so many seconds."""
+    """Whether a socket has a message, or gets one within so many seconds."""
     # To look costs half as much as `poll`, and most sockets that are looked at have no message.
     has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
     return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))
@@ -154,7 +149,6 @@ class Monitor:
             yield Event.OTHER_MECHANISM if event is Event.FAILED and value == _MECHANISM_MISMATCH else event
 
     def close(self) -> None:
-        """Close the monitor socket."""
         self._events.close()
 
 
@@ -244,10 +238,7 @@ def _too_many(error: zmq.ZMQError) -> ServiceError:
 
 @atexit.register
 def _transmit_rest() -> None:
-    """Wait until the messages that closed sockets have queued are transmitted, at most `LINGER_SECONDS`.
-
-    They are transmitted by a thread of ZeroMQ from the memory of Python, which is freed when the process ends.
-    """
+    """Wait until ZeroMQ's thread has transmitted what closed sockets have queued: its memory is freed at the exit."""
     if not _OPEN:
         context().term()
 
@@ -414,20 +405,13 @@ class ChannelSocket(Generic[Message]):
     def _read_events(self, seconds: float = 0.0, until: Event | None = None) -> None:
         """Handle what was reported about connections; wait so long for each event, until a certain one.
 
-        Raises
-        ------
-        ServiceError
-            If this side connects and is denied: its key lacks the role, or it has none and the pipeline asks for some.
+        ServiceError if this side connects and is denied.
         """
-        if self._monitor is None:
-            return
-        for event in self._monitor.events(seconds):
+        for event in self._monitor.events(seconds) if self._monitor is not None else ():
             if event is Event.DISCONNECTED:
                 self._disconnected()
-            elif self._listens:
-                self._failed_to_connect(event)
-            else:
-                self._raise_if_denied(event)
+            elif event is not Event.STOPPED:
+                self._handshake_failed(event)
             if event is until:
                 break
 
@@ -436,20 +420,19 @@ class ChannelSocket(Generic[Message]):
         if self._listens:
             _counts["disconnected"] += 1
 
-    def _failed_to_connect(self, event: Event) -> None:
-        """A peer failed the handshake; a key that was denied is counted by the ZAP handler already."""
-        if event in (Event.OTHER_MECHANISM, Event.FAILED):
-            other = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
+    def _handshake_failed(self, event: Event) -> None:
+        """Count a peer that failed; a key that was denied is counted by the ZAP handler already. Or raise the cause."""
+        keys = self._endpoint.keys
+        if self._listens and event is not Event.DENIED:
+            other = "does not speak ZeroMQ" if keys is None else "lacks the pipeline's keys"
             reject(self.channel.name, "handshake", f"a peer has failed the handshake: it has ended, or it {other}")
-
-    def _raise_if_denied(self, event: Event) -> None:
-        if event is Event.DENIED:
+        elif event is Event.DENIED and not self._listens:
             raise ServiceError(
                 f"{self._endpoint} rejects this key: it was revoked, was never allowed, or lacks the role "
                 f"{self.channel.role}, which {self.channel.name} requires; the pipeline's log says which: "
                 "ask its administrator (catstream keys allow)"
             )
-        if event is Event.OTHER_MECHANISM and self._endpoint.keys is None:
+        elif event is Event.OTHER_MECHANISM and not self._listens and keys is None:
             raise ServiceError(
                 f"the pipeline at {self._endpoint} requires authentication: pass a folder of keys that it allows "
                 "(--keys DIR, see catstream keys)"

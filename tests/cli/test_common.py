@@ -13,7 +13,8 @@ import pytest
 from rich.console import Console
 
 from catstream.box import Box
-from catstream.cli.common import INTERRUPTED, Interrupts, RunProgress
+from catstream.cli.common import INTERRUPTED, Interrupts
+from catstream.cli.track import RunProgress
 from catstream.messages.kinds import Track
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -28,7 +29,7 @@ def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
     written = StringIO()
     console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
     run = RunProgress(pipeline)
-    with run.progress(console) as progress:
+    with run.line(console) as progress:
         run.show(progress, {"": Track(1, 0, 0.0, "bootstrapping", None, -12.25, 12345)})
         progress.refresh()
     lines = [part for part in written.getvalue().replace("\x1b[2K", "\r").split("\r") if "bootstrapping" in part]
@@ -44,7 +45,7 @@ def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_e
     written = StringIO()
     console = Console(file=written, width=120, force_terminal=True, color_system=None, soft_wrap=True)
     run = RunProgress(pipeline)
-    with run.progress(console) as progress:
+    with run.line(console) as progress:
         for box in (Box(1, 2, 30, 40), None):
             seen = {"anna": Track(1, 0, 0.0, "present", box, 0.9, 7, object="anna")}
             run.show(progress, seen | {"ben": Track(1, 0, 0.0, "absent", None, 0.1, 4, object="ben")})

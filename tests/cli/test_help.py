@@ -57,7 +57,7 @@ def test_nan_is_within_no_bounds(fail, name, option):
     assert f"Invalid value for '{option}': expected a number, got 'nan'" in fail(name, option, "nan")
 
 
-@pytest.mark.parametrize("name", [*NAMES, "supervisor"])
+@pytest.mark.parametrize("name", NAMES)
 def test_every_process_has_a_help_text(name):
     command = [sys.executable, "-P", "-m", "catstream.services", name, "--help"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.cli.common import RunProgress
+from catstream.cli.track import RunProgress
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
@@ -51,12 +51,13 @@ def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
 
 def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_path):
     source, box = video
-    part = ["--start", "4", "--end", "32", "--stride", "4"]
-    succeed("track", source, "--box", box, *part, "--output", tmp_path, "--video")
-    rows = table(tmp_path / "demo.csv")
+    part, out = ["--start", "4", "--end", "32", "--stride", "4"], tmp_path / "[red]a[b]"
+    _, errors = succeed("track", source, "--box", box, *part, "--output", out, "--video")
+    assert str(out.name) in errors, "brackets in a path are printed as they are"
+    rows = table(out / "demo.csv")
     assert [int(row["frame"]) for row in rows] == list(range(7))
     assert [float(row["seconds"]) for row in rows] == pytest.approx([k / 30 for k in range(4, 32, 4)], abs=1e-3)
-    with open_source(tmp_path / "demo.mp4") as film, open_source(source, part=slice(4, 32, 4)) as story:
+    with open_source(out / "demo.mp4") as film, open_source(source, part=slice(4, 32, 4)) as story:
         for drawn, frame in zip(film, story, strict=True):
             difference = cv2.absdiff(drawn.image[: len(frame.image)], frame.image)  # above the line of text
             assert np.median(difference) < 8
@@ -115,18 +116,7 @@ def started(process, results):
     return [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
 
 
-def test_a_truncated_video_is_followed_up_to_the_break(video, fail, tmp_path):
-    source, box = video
-    broken = tmp_path / "broken.mpg"
-    whole = encoded(source, tmp_path / "whole.mpg")
-    broken.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    good = readable(broken)
-    assert 0 < good < 32
-    assert f"is damaged at frame {good}" in fail("track", broken, "--box", box, "--output", tmp_path / "out")
-    assert len(frames_of(tmp_path / "out", "broken")) == good
-
-
-def test_damaged_frames_are_skipped_if_requested_and_counted(video, succeed, tmp_path):
+def test_a_damaged_video_is_followed_up_to_the_break_or_over_it_if_requested(video, fail, succeed, tmp_path):
     source, box = video
     damaged = tmp_path / "damaged.mpg"
     data = bytearray(encoded(source, damaged).read_bytes())
@@ -135,9 +125,15 @@ def test_damaged_frames_are_skipped_if_requested_and_counted(video, succeed, tmp
     damaged.write_bytes(data)
     with open_source(damaged, skip_damaged=True) as whole:
         good = sum(1 for _ in whole)
-    _, errors = succeed("track", damaged, "--box", box, "--output", tmp_path / "out", "--skip-damaged")
+    before = []
+    with open_source(damaged) as film, pytest.raises(VideoError, match="is damaged at frame"):
+        before.extend(frame.number for frame in film)
+    command = ["track", damaged, "--box", box, "--output"]
+    assert f"is damaged at frame {len(before)}" in fail(*command, tmp_path / "out")
+    assert frames_of(tmp_path / "out", "damaged") == before
+    _, errors = succeed(*command, tmp_path / "all", "--skip-damaged")
     assert "frames could not be decoded, and skipped" in errors
-    assert readable(damaged) < len(frames_of(tmp_path / "out", "damaged")) == good < 32
+    assert 0 < len(before) < len(frames_of(tmp_path / "all", "damaged")) == good < 32
 
 
 def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succeed, tmp_path):
@@ -163,18 +159,12 @@ REJECTED = {
     "a text": (["notes.txt"], "not a video|no video in"),
     "a box outside": (["--box", "400,10,20,20"], "frame"),
     "a box without size": (["--box", "10,10,0,20"], "10,10,0,20|width|area"),
-    "a box of NaN": (["--box", "10,nan,20,20"], "nan|number"),
     "a box of three numbers": (["--box", "10,10,20"], "x,y,w,h"),
     "two objects with one name": (["--box", "anna=1,2,30,40", "--box", "anna=5,6,30,40"], "its own name"),
     "two objects without a name": (["--box", "1,2,30,40", "--box", "5,6,30,40"], "NAME=5,6,30,40"),
-    "a name of no letters": (["--box", "=1,2,30,40"], "has no name before"),
     "a name with a blank": (["--box", "a b=1,2,30,40"], "'a b' is not a name"),
     "a box of an object outside": (["--box", "anna=400,10,20,20"], "anna: the box 400,10,20,20"),
-    "a box of an object of three numbers": (["--box", "anna=10,10,20"], "anna: a box is four numbers"),
-    "1,000 objects": (
-        [word for k in range(1000) for word in ("--box", f"n{k}=1,2,30,40")],
-        "1000 objects are more than 32",
-    ),
+    "40 objects": ([word for k in range(40) for word in ("--box", f"n{k}=1,2,30,40")], "40 objects are more than 32"),
     "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "give one of them"),
     "a model of several objects": (["--box", "a=1,2,30,40", "--box", "b=1,2,30,40", "--save-model", "m"], "NAME=FILE"),
     "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
@@ -206,14 +196,6 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     assert (tmp_path / "file").read_text() == "mine\n"
 
 
-@pytest.mark.parametrize("file", ["demo.ndjson", "demo.mp4.part"])
-def test_a_full_disk_ends_the_run_with_one_line(video, fail, tmp_path, file):
-    source, box = video
-    (tmp_path / file).symlink_to("/dev/full")
-    error = fail("track", source, "--box", box, "--output", tmp_path, "--video", "--overwrite")
-    assert "any more: No space left on device" in error
-
-
 def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_nothing(video, catstream, fail, tmp_path):
     source, box = video
     place, slowly = ["--set", f"run.endpoint={tmp_path / 'run'}"], ["--set", "run.unstored_frames=1", "--lockstep"]
@@ -241,20 +223,6 @@ def encoded(source, path):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame.image, format="bgr24")))
         container.mux(stream.encode(None))
     return path
-
-
-def readable(path):
-    """How many frames come before the break."""
-    frames = []
-    with open_source(path) as source, pytest.raises(VideoError, match="is damaged at frame"):
-        frames.extend(frame.number for frame in source)
-    return len(frames)
-
-
-def test_brackets_in_a_path_are_printed_as_they_are(video, succeed, tmp_path):
-    source, box = video
-    _, errors = succeed("track", source, "--box", box, "--end", 2, "--output", tmp_path / "[red]a[/b]")
-    assert "[red]a[/b]" in errors
 
 
 def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tmp_path):
@@ -287,7 +255,8 @@ def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, s
     tracking, close = [], LineSink.close
 
     def closed(sink):
-        tracking.extend(each for each in psutil.Process().children(recursive=True) if each.name() == "detector")
+        servers = psutil.Process().children()
+        tracking.extend(each for server in servers for each in server.children() if each.status() != "zombie")
         close(sink)
 
     monkeypatch.setattr(RunProgress, "show", lambda *_: signal.raise_signal(signal.SIGINT))
@@ -319,6 +288,6 @@ def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video
     run = catstream("track", source, "--box", box, "--paused", "--set", f"run.endpoint={endpoint}")
     assert "paused: to continue, catstream resume --endpoint" in run.stderr.readline()
     with subscribe(endpoint, "tracks", timeout=60) as tracks:
-        succeed("resume", "--endpoint", endpoint)
+        succeed("resume", "--endpoint", endpoint, "--timeout", 60)
         assert [track.frame for track in tracks] == list(range(32))
     assert run.wait(60) == 0

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
+from catstream.run.job import Results
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
-from catstream.sinks.run_files import RunFiles, places_of
-from catstream.sinks.track_log import read_frames
+from catstream.sinks.track_log import RunFiles, places_of, read_frames
 from catstream.video.rendered import write
 from catstream.video.source import open_source
 
@@ -104,7 +104,9 @@ def test_a_new_file_whose_first_line_the_disk_does_not_take_is_not_left(disk):
 def run_in(folder, *more, source="", video=False):
     """The files of a run in a folder."""
     output = folder / "out"
-    return RunFiles(Origin(source), output, [*places_of("walk", output, video), *(str(folder / name) for name in more)])
+    return RunFiles(
+        Origin(source), output, [*places_of("walk", Results(output, video)), *(str(folder / name) for name in more)]
+    )
 
 
 def add(run, history, first=0, resume=False):

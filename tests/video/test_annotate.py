@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from catstream.applications.html.page import COLOURS
+from catstream.applications.page import COLOURS
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track

@@ -181,14 +181,14 @@ def test_the_response_to_head_ends_and_its_client_is_no_viewer(page, path):
     assert "\ncatstream_viewers 0.0\n" in page.get("/metrics").text, "on the same connection"
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1"])
-def test_a_request_with_a_foreign_host_name_is_rejected(page, host):
-    assert page.get("/", headers={"Host": host}).status_code == 400
+def test_a_request_with_a_foreign_host_name_is_rejected(page):
+    for host in ("evil.example", "evil.example:8000", "127.0.0.1.evil.example", "[::1"):
+        assert page.get("/", headers={"Host": host}).status_code == 400, host
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1"])
-def test_a_page_of_another_origin_cannot_steer(page, origin):
-    assert page.post("/control", json={"verb": "pause"}, headers={"Origin": origin}).status_code == 403
+def test_a_page_of_another_origin_cannot_steer(page):
+    for origin in ("http://evil.example", "null", "https://127.0.0.1:1"):
+        assert page.post("/control", json={"verb": "pause"}, headers={"Origin": origin}).status_code == 403, origin
     assert page.post("/control", data={"verb": "pause"}).status_code == 415, "a form, without an origin header"
 
 
@@ -207,11 +207,10 @@ INVALID = [
 ]
 
 
-@pytest.mark.parametrize("body", [*map(json.dumps, INVALID), "[" * 4000, "pause"])
-def test_an_invalid_command_is_rejected_before_it_is_sent(page, body):
-    answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == 400
-    assert "expected" in answer.json()["reason"]
+def test_an_invalid_command_is_rejected_before_it_is_sent(page):
+    for body in (*map(json.dumps, INVALID), "[" * 4000, "pause"):
+        answer = page.post("/control", content=body, headers={"Content-Type": "application/json"})
+        assert (answer.status_code, "expected" in answer.json()["reason"]) == (400, True), body
 
 
 def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered(

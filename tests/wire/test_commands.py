@@ -51,21 +51,6 @@ def raw(endpoint):
         yield client
 
 
-def test_a_command_gets_its_answer(endpoint, answering):
-    with answering() as (_, heard), Requester(CONTROL, endpoint) as requester:
-        assert requester.ask(PAUSE, 20) == done(PAUSE)
-    assert heard == [PAUSE]
-
-
-def test_a_command_sent_before_the_pipeline_runs_is_answered_as_soon_as_it_does(endpoint, answering):
-    with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
-        assert requester.ask(PAUSE, 0.3) is None
-        answer = pool.submit(requester.ask, PAUSE, 20)
-        with answering() as (_, heard):
-            assert answer.result(20) == done(PAUSE)
-    assert heard == [PAUSE]
-
-
 @pytest.fixture
 def slow_network(monkeypatch):
     """Lets so much time pass before a question is repeated on the same connection that no test sees it."""
@@ -73,8 +58,9 @@ def slow_network(monkeypatch):
 
 
 @pytest.mark.usefixtures("slow_network")
-def test_a_question_that_nobody_was_connected_for_is_sent_as_soon_as_somebody_is(endpoint, answering):
+def test_a_command_before_the_pipeline_runs_is_sent_as_soon_as_it_does(endpoint, answering):
     with ThreadPoolExecutor(1) as pool, Requester(CONTROL, endpoint) as requester:
+        assert requester.ask(PAUSE, 0.3) is None
         answer = pool.submit(requester.ask, PAUSE, 60)
         assert not wait([answer], 0.2).done
         with answering() as (_, heard):
@@ -138,6 +124,22 @@ def test_a_flood_of_invalid_commands_is_counted_and_the_next_one_is_answered(ans
         assert decode(raw.recv(), Answer) == done(PAUSE)
     assert heard == [PAUSE]
     assert responder.rejected == 50
+
+
+def test_of_a_flood_of_large_commands_the_most_waits_for_the_next_turn(endpoint, raw, until):
+    with Responder(CONTROL, endpoint, CONTROL.limit) as responder:
+        raw.sndhwm = 0
+        for _ in range(6):
+            raw.send(bytes(900_000))
+        turns = []
+
+        def turn():
+            before = responder.rejected
+            responder.receive_all()
+            turns.append(responder.rejected - before)
+
+        until(lambda: responder.rejected == 6, turn)
+    assert max(turns) <= 2
 
 
 def test_of_a_flood_of_commands_64_wait_the_others_are_rejected_and_stop_is_let_through(endpoint, raw, until):

@@ -13,7 +13,7 @@ import numpy as np
 
 from catstream.applications.evaluation.runs import EvaluationRun, provenance
 from catstream.applications.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
-from catstream.applications.html.page import SHARES, Axis, plot, table, write_page
+from catstream.applications.page import SHARES, Axis, plot, table, write_page
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from catstream.applications.evaluation.datasets import FIRST, Sequence, Start, Starts, one_pass
 from catstream.applications.evaluation.peers import PEERS, Peer
-from catstream.applications.evaluation.runs import EvaluationRun, load, prepare_folder, run_name, save
+from catstream.applications.evaluation.runs import EvaluationRun, load, prepare_folder, save
 from catstream.applications.workers import run_tasks
 from catstream.box import Box
 from catstream.errors import CatstreamError, SettingsError, VideoError
@@ -37,7 +37,7 @@ class _Task(NamedTuple):
     @property
     def name(self) -> tuple[str, str]:
         """Names of the tracker and of the run."""
-        return self.tracker, run_name(self.sequence, self.start)
+        return self.tracker, self.sequence.name + self.start.suffix
 
     @property
     def frames(self) -> int:
@@ -81,24 +81,15 @@ def evaluate(
     done: Callable[[EvaluationRun], None] = lambda _: None,
     failed: Callable[[CatstreamError], None] | None = None,
 ) -> list[EvaluationRun]:
-    """Run all trackers on all sequences.
+    """Run trackers, by their names in `TRACKERS`; return the runs in order of sequence, tracker and start.
 
-    Parameters
-    ----------
-    sequences, trackers : sequences, and names from `TRACKERS`
-    settings : settings of catstream
     starts : the starts of a sequence, `one_pass`, or what `choose_starts` returns
     peer_models : folder of the model files of `nano` and `vit`
     jobs : number of processes, with one thread each
     output : folder for results, or None; runs that are complete there are not repeated
-    begin : function that is called with the total number of frames
-    done : function that is called with each finished run
+    begin, done : functions that are called with the total number of frames, and with each finished run
     failed : function that is called with the error of each run that fails, while the other runs continue; if None, the
         error is raised
-
-    Returns
-    -------
-    runs in order of sequence, tracker and start
     """
     trackers = list(dict.fromkeys(trackers))
     folder, models = (None if path is None else Path(path) for path in (output, peer_models))

@@ -67,7 +67,7 @@ class EvaluationRun:
     @property
     def name(self) -> str:
         """Name of the sequence and of the start."""
-        return run_name(self.sequence, self.start)
+        return self.sequence.name + self.start.suffix
 
     @property
     def truth(self) -> Float64:
@@ -82,11 +82,6 @@ class EvaluationRun:
     def score(self) -> Score:
         """Return the measures of this run."""
         return score(self.boxes, self.truth, self.confidence)
-
-
-def run_name(sequence: Sequence, start: Start) -> str:
-    """Return the name of a run."""
-    return sequence.name + start.suffix
 
 
 def prepare_folder(output: Path, settings: Settings) -> None:
@@ -128,7 +123,7 @@ def save(output: Path, run: EvaluationRun) -> None:
 
 def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> EvaluationRun | None:
     """Return a complete run, or None if there is none or it started with another box."""
-    boxes, confidence, seconds = _files(output, tracker, run_name(sequence, start))
+    boxes, confidence, seconds = _files(output, tracker, sequence.name + start.suffix)
     if not boxes.parent.is_dir():
         return None
     try:
@@ -162,9 +157,7 @@ def provenance(settings: Settings, words: Words[str] | None = None) -> dict[str,
     """Return the provenance of figures as a JSON object, without host name and folder names.
 
     The commit is that of the checkout, with -dirty if files were changed, and None if catstream runs from elsewhere;
-    the settings are those that differ from the default.
-
-    words : words of the command; None for the command that started this process
+    the settings are those that differ from the default; `words` are those of the command, by default of this process.
     """
     given = [Path(sys.argv[0]).name, *sys.argv[1:]] if words is None else words
     return {

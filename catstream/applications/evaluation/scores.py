@@ -84,11 +84,7 @@ def success_plot(boxes: Float64, truth: Float64) -> Float64:
 
 
 def is_lost(boxes: Float64, truth: Float64) -> bool:
-    """Return whether a run has lost the object in the end.
-
-    It has if fewer than half of the frames with the object in the last quarter of the run have an overlap above 0.5;
-    not if that quarter has no frame with the object.
-    """
+    """Return whether fewer than half of the frames with the object in the last quarter have an overlap above 0.5."""
     last = slice(-math.ceil(len(truth) / 4), None)
     followed = overlaps(boxes[last], truth[last])[_present(truth[last])] > 0.5
     return bool(len(followed)) and bool(followed.mean() < 0.5)
@@ -105,12 +101,7 @@ def long_term(boxes: Float64, truth: Float64, confidence: Float64) -> LongTerm:
 
     A box counts as reported if its confidence reaches a threshold. Precision is the mean overlap over the reported
     boxes (0 if the object is absent), recall the mean overlap over the frames with the object. The threshold with the
-    best F-score is used.
-
-    Parameters
-    ----------
-    boxes, truth : float64 (frames, 4), NaN if there is no box
-    confidence : float64 (frames,), in any range; NaN is lower than any number
+    best F-score is used; the confidence, float64 (frames,), may be in any range, and NaN is lower than any number.
     """
     answered = np.flatnonzero(_present(boxes))
     answered = answered[np.argsort(-np.nan_to_num(confidence[answered], nan=-np.inf), kind="stable")]
@@ -129,8 +120,6 @@ def long_term(boxes: Float64, truth: Float64, confidence: Float64) -> LongTerm:
 def score(boxes: Float64, truth: Float64, confidence: Float64 | None = None) -> Score:
     """Return all measures of one run.
 
-    Parameters
-    ----------
     boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN if there is no box
     confidence : float64 (frames,), or None for a tracker without a confidence
     """

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from catstream.applications.finding.find import File, Sighting, Step
-from catstream.applications.html.page import Bar, clock, figure, legend, table, timeline, write_page
+from catstream.applications.page import Bar, clock, figure, legend, table, timeline, write_page
 from catstream.box import Box
 from catstream.errors import ServiceError
 from catstream.messages.names import counted

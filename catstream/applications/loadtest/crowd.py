@@ -33,50 +33,29 @@ _PIECES = ((160, 150), (500, 320))  # corners of pieces of the photograph of the
 def render(
     count: int, frames: int, size: tuple[int, int] = SIZE, seed: int = 0
 ) -> Iterator[tuple[np.ndarray, dict[str, Box | None]]]:
-    """Yield the images in order, each with the box of every object by name.
+    """Yield images of `count` objects, 1 to 16, uint8 (height, width, 3), each with the box of every object by name.
 
-    Parameters
-    ----------
-    count : number of objects, 1 to 16
-    frames : number of images
-    size : (width, height) of the images; if it is not 4:3, the images are stretched
-    seed : seed of paths and sensor noise
-
-    Yields
-    ------
-    image : uint8 (height, width, 3), blue green red
-    boxes : box of each whole object, including parts that are occluded or outside the image; None if less than a tenth
-        of it is visible
+    A box is that of the whole object, including parts that are occluded or outside the image; it is None if less than a
+    tenth of the object is visible. If `size`, (width, height), is not 4:3, the images are stretched; the seed is that
+    of paths and sensor noise.
     """
-    scene = _Scene(count, frames, seed)
-    for number in range(frames):
-        yield resized(*scene.render(number), size)
-
-
-class _Scene:
-    """Renders single frames; colours are float32, 0 to 255."""
-
-    def __init__(self, count: int, frames: int, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        photograph, dahlia = load_photograph("china"), cut_out_dahlia(load_photograph("flower"))
-        self.sprites = [_sprite(number, photograph, dahlia) for number in range(count)]
-        self.paths = [_path(number, count, frames, rng) for number in range(count)]
-        self.lake = Lake(_ZOOM, rng)
-        turn = 2 * np.pi * np.arange(frames) / 240
-        self.camera = np.stack([150 + 90 * np.sin(turn), 90 + 60 * np.sin(1.3 * turn)], axis=1)
-
-    def render(self, frame: int) -> tuple[np.ndarray, dict[str, Box | None]]:
-        """Return the image of one frame in full size, and the box of each object."""
-        left, top = self.camera[frame]
-        image, free = self.lake.seen(np.array([[1, 0, -left], [0, 1, -top]])), np.ones(SIZE[::-1], np.float32)
-        view = np.array([[1.0, 0, 0], [0, 1, 0]])  # the paths are in the picture, not in the scene
+    rng = np.random.default_rng(seed)
+    photograph, dahlia = load_photograph("china"), cut_out_dahlia(load_photograph("flower"))
+    sprites = [_sprite(number, photograph, dahlia) for number in range(count)]
+    paths = [_path(number, count, frames, rng) for number in range(count)]
+    lake = Lake(_ZOOM, rng)
+    view = np.array([[1.0, 0, 0], [0, 1, 0]])  # the paths are in the picture, not in the scene
+    for frame in range(frames):
+        turn = 2 * np.pi * frame / 240
+        left, top = 150 + 90 * np.sin(turn), 90 + 60 * np.sin(1.3 * turn)
+        image, free = lake.seen(np.array([[1, 0, -left], [0, 1, -top]])), np.ones(SIZE[::-1], np.float32)
         boxes: dict[str, Box | None] = {}
-        for name, sprite, path in reversed(list(zip(NAMES, self.sprites, self.paths, strict=False))):
-            turn = sprite.turned(path[frame], view)
-            seen = sprite.paint(image, turn, free)
-            free *= 1 - cv2.warpAffine(sprite.mask, turn, SIZE)
-            boxes[name] = sprite.box(turn) if seen >= VISIBLE else None
-        return self.lake.with_noise(image, frame), dict(reversed(boxes.items()))
+        for name, sprite, path in reversed(list(zip(NAMES, sprites, paths, strict=False))):
+            place = sprite.turned(path[frame], view)
+            seen = sprite.paint(image, place, free)
+            free *= 1 - cv2.warpAffine(sprite.mask, place, SIZE)
+            boxes[name] = sprite.box(place) if seen >= VISIBLE else None
+        yield resized(lake.with_noise(image, frame), dict(reversed(boxes.items())), size)
 
 
 def _sprite(number: int, lake: np.ndarray, dahlia: Sprite) -> Sprite:

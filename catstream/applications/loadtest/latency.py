@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 
 from catstream.applications.evaluation.scores import overlaps
-from catstream.applications.loadtest.broadcast import Schedule
+from catstream.applications.loadtest.camera import Schedule
 from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health, Model, Track

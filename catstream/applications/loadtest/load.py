@@ -1,4 +1,4 @@
-"""The load: a camera that sends a rendered video to all streams, a pipeline for each stream, and its subscribers."""
+"""The load: the video that the camera sends, a pipeline for each stream, and its subscribers."""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, MutableSequence
 from contextlib import ExitStack, suppress
-from multiprocessing.connection import Connection
 from time import monotonic, sleep
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from catstream.applications.loadtest import crowd
-from catstream.applications.loadtest.broadcast import Broadcast, Schedule
-from catstream.applications.loadtest.plan import Plan
 from catstream.applications.workers import SPAWN, sigint_blocked
 from catstream.box import Box
 from catstream.client.control import control
-from catstream.errors import CatstreamError, CommandRejectedError, ServiceError, SilenceError
+from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.messages.kinds import End
 from catstream.messages.names import UNNAMED
 from catstream.numerics.arrays import Float64
@@ -44,92 +41,29 @@ class Video(NamedTuple):
     """The images that are sent, forwards, then backwards, and so on.
 
     files  JPEG files
-    size   (width, height) in pixels
     boxes  boxes of all objects in the first image, by name; the first object is the one whose tracks are measured
     truth  boxes of the first object in all images, float64 (images, 4), NaN if it is absent
     """
 
     files: list[bytes]
-    size: tuple[int, int]
     boxes: dict[str, Box]
     truth: Float64
 
 
-def render(plan: Plan, images: int, done: Callable[[int], None] = lambda _: None) -> Video:
-    """Render the first images of the demo video of the objects; `done` is called with their number so far."""
+def render(objects: int, images: int, size: tuple[int, int], done: Callable[[int], None]) -> Video:
+    """Render the first images of the demo video of so many objects; `done` is called with their number so far."""
     files, truth = [], []
     shown: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
-    if plan.objects == 1:
-        shown = ((image, {UNNAMED: box}) for image, box in rendered.render(images, plan.size))
+    if objects == 1:
+        shown = ((image, {UNNAMED: box}) for image, box in rendered.render(images, size))
     else:
-        shown = crowd.render(plan.objects, images, plan.size)
+        shown = crowd.render(objects, images, size)
     for image, boxes in shown:
         files.append(jpeg(image, quality=_QUALITY))
         truth.append(boxes)
         done(len(files))
     name, *_ = first = {name: box for name, box in truth[0].items() if box is not None}
-    return Video(files, plan.size, first, np.array([boxes[name] or (np.nan,) * 4 for boxes in truth]))
-
-
-class Camera:
-    """A process that sends the video, so that frames are sent on time regardless of other work; a context manager.
-
-    urls : URL of each stream
-    """
-
-    def __init__(self, video: Video, streams: int) -> None:
-        self.video = video
-        self._pipe, self._other = SPAWN.Pipe()
-        arguments = self._other, video.files, video.size, streams, os.getpid()
-        self._process = SPAWN.Process(target=_send_video, args=arguments, daemon=True)
-
-    @property
-    def pid(self) -> int:
-        return self._process.pid or 0
-
-    @property
-    def late(self) -> float:
-        """Largest delay in seconds of a frame of this schedule that was not caused by a slow receiver."""
-        self._pipe.send(None)
-        seconds: float = self._receive()
-        return seconds
-
-    def show_still(self) -> None:
-        """Send the first image repeatedly, at the frame rate of the video."""
-        self.play(Schedule(monotonic(), rendered.RATE, frames=1))
-
-    def play(self, schedule: Schedule) -> list[Schedule]:
-        """Send the video by a schedule; return the schedule of each stream."""
-        self._pipe.send(schedule)
-        schedules: list[Schedule] = self._receive()
-        return schedules
-
-    def __enter__(self) -> Self:
-        with sigint_blocked():
-            self._process.start()
-        self._other.close()
-        self.urls = self._receive()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.join()
-        self._pipe.close()
-
-    def _receive(self) -> Any:
-        try:
-            return self._pipe.recv()
-        except (EOFError, ConnectionError):
-            raise ServiceError("the camera of the load test has exited: its error is printed above") from None
-
-
-def _send_video(pipe: Connection, files: list[bytes], size: tuple[int, int], streams: int, parent: int) -> None:
-    die_with(parent)
-    with Broadcast(files, size, streams) as broadcast:
-        pipe.send(broadcast.urls)
-        while True:
-            asked = pipe.recv()
-            pipe.send(broadcast.late if asked is None else broadcast.play(asked))
+    return Video(files, first, np.array([boxes[name] or (np.nan,) * 4 for boxes in truth]))
 
 
 class Stream(threading.Thread):
@@ -195,19 +129,21 @@ class Subscribers:
         self._quick, self._readers = readers - slow - frozen, readers
         self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
         self._frozen_since = 0.0  # time of `freeze`
-        self._groups: list[list[Any]] = []
-        first = 0
-        for size, pace in ((self._quick, _QUICK), (slow, _SLOW), (frozen, _QUICK)):
-            self._groups.append([])
-            for begin in range(first, first + size, _PER_PROCESS):
-                numbers = range(begin, min(begin + _PER_PROCESS, first + size))
-                arguments = (endpoint, keys, numbers, pace, self._received, self._missed, os.getpid())
-                self._groups[-1].append(SPAWN.Process(target=_read_until_end, args=arguments, daemon=True))
-            first += size
+
+        def processes(numbers: range, pace: tuple[int, float]) -> list[Any]:
+            parts = [numbers[begin : begin + _PER_PROCESS] for begin in range(0, len(numbers), _PER_PROCESS)]
+            rest = pace, self._received, self._missed, os.getpid()
+            return [
+                SPAWN.Process(target=_read_until_end, args=(endpoint, keys, part, *rest), daemon=True) for part in parts
+            ]
+
+        self._fast = processes(range(self._quick), _QUICK)
+        self._frozen = processes(range(readers - frozen, readers), _QUICK)
+        self._all = [*self._fast, *processes(range(self._quick, self._quick + slow), _SLOW), *self._frozen]
 
     @property
     def pids(self) -> list[int]:
-        return [process.pid for group in self._groups for process in group]
+        return [process.pid for process in self._all]
 
     @property
     def connected(self) -> bool:
@@ -221,15 +157,15 @@ class Subscribers:
 
     def freeze(self) -> None:
         """Stop the processes of the subscribers to be frozen, if all are connected."""
-        if not self._frozen_since and self._groups[2] and self.connected:
-            for process in self._groups[2]:
+        if not self._frozen_since and self._frozen and self.connected:
+            for process in self._frozen:
                 os.kill(process.pid, signal.SIGSTOP)
             self._frozen_since = monotonic()
 
     def wait(self) -> None:
         """Wait until each fast subscriber has received the end, with a time-out."""
         deadline = monotonic() + _DRAIN_SECONDS
-        for process in self._groups[0]:
+        for process in self._fast:
             process.join(max(0.0, deadline - monotonic()))
 
     def received(self) -> list[int]:
@@ -242,16 +178,14 @@ class Subscribers:
 
     def __enter__(self) -> Self:
         with sigint_blocked():
-            for group in self._groups:
-                for process in group:
-                    process.start()
+            for process in self._all:
+                process.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for group in self._groups:
-            for process in group:
-                process.kill()
-                process.join()
+        for process in self._all:
+            process.kill()
+            process.join()
 
 
 def _read_until_end(
@@ -267,9 +201,8 @@ def _read_until_end(
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     with ExitStack() as stack:
-        readers = {
-            number: stack.enter_context(Subscriber(TRACKS, Endpoint.parse(endpoint, keys))) for number in numbers
-        }
+        place = Endpoint.parse(endpoint, keys)
+        readers = {number: stack.enter_context(Subscriber(TRACKS, place)) for number in numbers}
         gaps = {number: GapCounter() for number in numbers}
         last = dict.fromkeys(numbers, 0)  # number of the last frame: the tracks of all objects in it have the same
         most, pause = pace
@@ -283,7 +216,6 @@ def _read_until_end(
                     if isinstance(message, End):
                         del readers[number]
                         break
-                    if message.seq != last[number]:
-                        received[number] += 1
-                        last[number] = message.seq
+                    received[number] += message.seq != last[number]
+                    last[number] = message.seq
             sleep(pause)

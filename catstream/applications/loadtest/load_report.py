@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from catstream.applications.evaluation.runs import provenance
-from catstream.applications.html.page import Axis, plot, table, write_page
 from catstream.applications.loadtest.latency import Measures, percentiles, summary
-from catstream.applications.loadtest.load_test import LoadTest, Result
-from catstream.applications.loadtest.plan import violations
+from catstream.applications.loadtest.load_test import LoadTest, Result, violations
+from catstream.applications.page import Axis, plot, table, write_page
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64
 

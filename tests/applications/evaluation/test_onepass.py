@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,11 +12,11 @@ import psutil
 import pytest
 
 from catstream.applications.evaluation import onepass, runs
-from catstream.applications.evaluation.accuracy import MEASURES, describe_flips, flips_of, mean_of, rows_of, to_json
+from catstream.applications.evaluation.accuracy import describe_flips, flips_of, mean_of, rows_of
 from catstream.applications.evaluation.datasets import FIRST, Sequence, Start, jittered, spatial, temporal
 from catstream.applications.evaluation.onepass import evaluate, follow
 from catstream.applications.evaluation.runs import EvaluationRun, load, save
-from catstream.errors import CatstreamError, ServiceError, SettingsError
+from catstream.errors import CatstreamError, SettingsError
 from catstream.settings import Settings
 
 SETTINGS = Settings()
@@ -146,18 +144,6 @@ def test_runs_of_another_version_or_with_other_settings_are_not_mixed_in(
     assert len(counted) == 1
 
 
-def test_a_full_disk_leaves_no_settings_that_a_repetition_cannot_read(tmp_path, sequence, counted):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
-    try:
-        with pytest.raises(ServiceError, match="cannot write"):
-            evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    evaluate([sequence], ["catstream"], SETTINGS, output=tmp_path)
-    assert len(counted) == 1
-
-
 def test_a_moved_first_box_is_found_again_and_a_different_one_is_not(tmp_path, sequence):
     border = Sequence("border", sequence.path, sequence.boxes - sequence.boxes[0] + (-29, 40, 60, 60))
     (left, *_), right = spatial(border), spatial(border)[1]
@@ -167,20 +153,6 @@ def test_a_moved_first_box_is_found_again_and_a_different_one_is_not(tmp_path, s
     assert load(tmp_path, "mil", border, left) is not None
     save(tmp_path, replace(run, start=right))
     assert load(tmp_path, "mil", border, right) is None
-
-
-@pytest.mark.usefixtures("counted")
-def test_begin_and_done_report_the_progress(sequence):
-    said: list[int] = []
-    evaluate(
-        [sequence],
-        ["catstream"],
-        SETTINGS,
-        starts=temporal(2),
-        begin=lambda frames: said.append(-frames),
-        done=lambda run: said.append(len(run.boxes)),
-    )
-    assert said == [-16, 12, 4]
 
 
 @pytest.mark.parametrize(
@@ -273,15 +245,3 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
         "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
     ]
     assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}
-
-
-def test_the_json_has_every_row_and_the_means(run):
-    numbers = json.loads(
-        json.dumps(to_json(rows_of([run]), Settings(), {"blur": ["walk"], "clutter": []}), allow_nan=False)
-    )
-    (row,) = numbers["sequences"]
-    assert {"name", "frames", "auc", "success", "precision", "f_score", "fps", "tracker"} <= row.keys()
-    assert numbers["mean"].keys() == {"catstream"}
-    assert numbers["flips"] == {}
-    assert numbers["attributes"] == {"blur": {"sequences": ["walk"], "mean": numbers["mean"]}}
-    assert numbers["mean"]["catstream"].keys() == set(MEASURES)

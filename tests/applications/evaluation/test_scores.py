@@ -127,23 +127,16 @@ def test_boxes_in_frames_without_the_object_reduce_precision_unless_their_confid
         ([True] * 6 + [False, False], True),
         ([True] * 3 + [False] * 2, True),  # the last quarter of five frames is two
         ([True] * 5 + [False, True, True, True], False),
+        ([True] * 12 + [True, None, None, None], False),  # frames without the object count for no loss
+        ([True] * 12 + [False, None, None, None], True),
+        ([True] * 12 + [None, None, None, None], False),
     ],
 )
 def test_a_run_is_lost_if_less_than_half_of_its_last_quarter_is_followed(followed, lost):
     truth = np.tile([10.0, 10, 20, 20], (len(followed), 1))
-    boxes = np.where(np.array(followed)[:, None], truth, truth + 15)
+    boxes = np.where(np.array(followed, bool)[:, None], truth, truth + 15)
+    truth[[each is None for each in followed]] = np.nan
     assert is_lost(boxes, truth) == score(boxes, truth).lost == lost
-
-
-def test_frames_without_the_object_count_for_no_loss():
-    truth = np.tile([10.0, 10, 20, 20], (16, 1))
-    boxes = truth.copy()
-    truth[13:] = np.nan
-    assert not is_lost(boxes, truth)
-    boxes[12] = np.nan
-    assert is_lost(boxes, truth)
-    truth[12] = np.nan
-    assert not is_lost(boxes, truth)
 
 
 SIDES = st.tuples(*[st.floats(-50, 50)] * 2, *[st.floats(0.1, 50)] * 2)

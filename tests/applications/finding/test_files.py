@@ -76,14 +76,6 @@ def test_a_single_image_is_one_frame(tree):
     assert frames(file)[0] == [(0, "", (30, 30, 3))]
 
 
-def test_a_changed_file_has_another_signature(tree):
-    for file in find_files([tree]):
-        before = file.signature
-        assert file.signature == before
-    (tree / "photos" / "11.png").write_bytes(b"new")
-    assert file.signature != before
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.applications.finding.scan import Scan
+from catstream.applications.finding.find import Scan
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
 

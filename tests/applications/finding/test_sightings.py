@@ -33,11 +33,6 @@ def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one()
     assert [interval.count for interval in intervals_of(*([each] for each in alone))] == [4, 1]
 
 
-def test_two_sightings_of_one_object_in_a_frame_are_in_one_interval():
-    pairs = [[sighting(0.2 * step, x=2.0 * step), sighting(0.2 * step, x=60.0 - 2 * step)] for step in range(5)]
-    assert [interval.count for interval in intervals_of(*pairs)] == [10]
-
-
 seen = st.tuples(st.floats(0, 30), st.sampled_from(["anna", "ben"]), st.floats(0.5, 1))
 
 

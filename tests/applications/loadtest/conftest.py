@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from catstream.applications.loadtest.broadcast import Schedule
+from catstream.applications.loadtest.camera import Schedule
 from catstream.applications.loadtest.latency import Measures
-from catstream.applications.loadtest.load_test import Result
-from catstream.applications.loadtest.plan import Plan
+from catstream.applications.loadtest.load_test import Plan, Result
 from catstream.box import Box
 from catstream.messages.kinds import Track
 

@@ -10,8 +10,7 @@ from dataclasses import replace
 import pytest
 
 from catstream.applications.loadtest.load_report import to_json, write_report
-from catstream.applications.loadtest.load_test import LoadTest
-from catstream.applications.loadtest.plan import Limit
+from catstream.applications.loadtest.load_test import Limit, LoadTest
 
 
 def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result, tmp_path):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import time
-from multiprocessing import resource_tracker
 
 import psutil
 import pytest
 
 from catstream.applications.loadtest.latency import REST, Usage
-from catstream.applications.loadtest.load_test import run_load_test
-from catstream.applications.loadtest.plan import Limit, Plan, violations
+from catstream.applications.loadtest.load_test import Limit, Plan, run_load_test, violations
 
 
 @pytest.fixture
@@ -23,18 +21,10 @@ def sleeper():
 
 
 def children():
-    """Processes of this one, but for the two servers that stay to its end."""
-    tracker = getattr(resource_tracker._resource_tracker, "_pid", None)
-    own = [child for child in psutil.Process().children() if child.pid != tracker]
-    family = own + [process for child in own for process in child.children(recursive=True)]
-    return [process for process in family if not is_start_server(process)]
-
-
-def is_start_server(process):
-    try:
-        return process.name() == "start server"
-    except psutil.Error:  # it has ended
-        return True
+    """Processes of this one, but for the start server and the resource tracker, which stay to its end."""
+    servers = ("services.start_server", "resource_tracker")
+    stay = [child for child in psutil.Process().children() if any(name in str(child.cmdline()) for name in servers)]
+    return [child for child in psutil.Process().children(recursive=True) if child not in stay]
 
 
 def test_usage_shows_which_process_is_busy(sleeper):

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.applications.loadtest.load_test import find_highest_rate
-from catstream.applications.loadtest.plan import KINDS, Limit, Plan, violations
+from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, find_highest_rate, violations
 from catstream.errors import ObjectError, SettingsError
 from catstream.settings import Settings
 

@@ -1,27 +1,28 @@
-"""A test stream over HTTP: known images are sent at the times of a schedule.
+"""The camera of a load test: a process that sends known images over HTTP at the times of a schedule.
 
-    with Broadcast(pictures, (640, 480)) as camera:
-        source = open_source(camera.urls[0])
-        camera.play(Schedule(start=monotonic() + 1, rate=25.0, frames=250))
-
-It is the load generator of the load tests. Each frame is sent when it is due, even if the receiver has not read the
-frames before it; a slow receiver gets frames late, but none is left out. The time stamp of a frame in the stream is its
-due time by `time.monotonic`, so the receiver can compute its number and its age. The container is NUT, because FFmpeg
-returns its frames without delay; for other containers it buffers one frame.
+Each frame is sent when it is due, even if the receiver has not read the frames before it; a slow receiver gets frames
+late, but none is left out. The time stamp of a frame in the stream is its due time by `time.monotonic`, so the receiver
+can compute its number and its age. The container is NUT, because FFmpeg returns its frames without delay; for other
+containers it buffers one frame.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BufferedIOBase
+from multiprocessing.connection import Connection
 from time import monotonic
-from typing import Any, Self
+from typing import Any, Self, cast
+
+from catstream.applications.workers import SPAWN, sigint_blocked
+from catstream.errors import ServiceError
+from catstream.services.process import die_with
 
 _TICKS_PER_SECOND = 1_000_000  # time base of the stream
 _STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
@@ -66,41 +67,101 @@ class Schedule:
         return last - abs(shown % max(2 * last, 1) - last)
 
 
-class Broadcast:
-    """Serves streams of the same images on the loopback interface; a context manager.
+class Camera:
+    """A process with a `Broadcast`, so that frames are sent on time regardless of other work; a context manager.
+
+    urls : URL of each stream
+    """
+
+    def __init__(self, pictures: Sequence[bytes], size: tuple[int, int], streams: int) -> None:
+        self._pipe, self._other = SPAWN.Pipe()
+        arguments = self._other, pictures, size, streams, os.getpid()
+        self._process = SPAWN.Process(target=_broadcast, args=arguments, daemon=True)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid or 0
+
+    @property
+    def late(self) -> float:
+        """Largest delay in seconds of a frame of this schedule that was not caused by a slow receiver."""
+        seconds: float = self._ask(None)
+        return seconds
+
+    def show_still(self) -> None:
+        """Send the first image repeatedly."""
+        self.play(Schedule(monotonic(), _STILL_RATE, frames=1))
+
+    def play(self, schedule: Schedule) -> list[Schedule]:
+        """Send the images by a schedule; return the schedule of each stream."""
+        schedules: list[Schedule] = self._ask(schedule)
+        return schedules
+
+    def __enter__(self) -> Self:
+        with sigint_blocked():
+            self._process.start()
+        self._other.close()
+        self.urls = self._receive()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+
+    def _ask(self, question: Schedule | None) -> Any:
+        self._pipe.send(question)
+        return self._receive()
+
+    def _receive(self) -> Any:
+        try:
+            return self._pipe.recv()
+        except (EOFError, ConnectionError):
+            raise ServiceError("the camera of the load test has exited: its error is printed above") from None
+
+
+def _broadcast(pipe: Connection, pictures: Sequence[bytes], size: tuple[int, int], streams: int, parent: int) -> None:
+    die_with(parent)
+    with Broadcast(pictures, size, streams) as broadcast:
+        pipe.send(broadcast.urls)
+        while True:
+            asked = pipe.recv()
+            pipe.send(broadcast.late if asked is None else broadcast.play(asked))
+
+
+class Broadcast(ThreadingHTTPServer):
+    """Serves streams of the same images, JPEG files, on the loopback interface; a context manager.
 
     The schedules of n streams are shifted by 1/n of a frame each, so that frames are not due at the same time.
 
-    Parameters
-    ----------
-    pictures : images as JPEG files
-    size : (width, height) of all images in pixels
-    streams : number of streams
-
-    Attributes
-    ----------
     urls : URL of each stream
     late : largest delay in seconds of a sent frame that was not caused by a slow receiver
     """
 
+    daemon_threads = True
+
     def __init__(self, pictures: Sequence[bytes], size: tuple[int, int], streams: int = 1) -> None:
+        super().__init__(("127.0.0.1", 0), _Connection)
         self._pictures, self._size, self._closed = pictures, size, threading.Event()
         self._schedules = [Schedule(monotonic(), _STILL_RATE, frames=1)] * streams
         self.late = 0.0
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_ConnectionHandler, self))
-        self._server.daemon_threads = True
-        self.urls = [f"http://127.0.0.1:{self._server.server_port}/{number}" for number in range(streams)]
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
-        self._thread.start()
+        self.urls = [f"http://127.0.0.1:{self.server_port}/{number}" for number in range(streams)]
 
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Start to send the images by a schedule; return the schedule of each stream."""
-        step = 1 / (schedule.rate * len(self._schedules))
-        self._schedules = [
-            replace(schedule, start=schedule.start + number * step) for number in range(len(self._schedules))
-        ]
+        step = 1 / (schedule.rate * len(self.urls))
+        self._schedules = [replace(schedule, start=schedule.start + number * step) for number in range(len(self.urls))]
         self.late = 0.0
         return self._schedules
+
+    def __enter__(self) -> Self:
+        threading.Thread(target=self.serve_forever, args=(0.02,), daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        self.shutdown()
+        self.server_close()
 
     def send(self, stream: int, file: BufferedIOBase) -> None:
         """Send a stream to one receiver until it disconnects."""
@@ -117,19 +178,6 @@ class Broadcast:
                 container.mux(packet)
                 if pipe.broken:
                     break
-
-    def close(self) -> None:
-        """Close all connections and the server."""
-        self._closed.set()
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _frames(self, stream: int) -> Iterator[tuple[float, int]]:
         """Yield due time and image of each frame when it is due; switch to a new schedule as soon as it is set."""
@@ -148,24 +196,20 @@ class Broadcast:
                 number += 1
 
 
-class _ConnectionHandler(BaseHTTPRequestHandler):
-    """Handles one HTTP connection."""
+class _Connection(BaseHTTPRequestHandler):
+    """The connection of one receiver."""
 
     disable_nagle_algorithm = True  # otherwise the end of a frame waits 40 ms for a delayed acknowledgement
 
-    def __init__(self, broadcast: Broadcast, *arguments: Any) -> None:
-        self._broadcast = broadcast
-        super().__init__(*arguments)
-
     def do_GET(self) -> None:
-        name = self.path.strip("/")
-        if not name.isdigit() or int(name) >= len(self._broadcast.urls):
+        broadcast, name = cast(Broadcast, self.server), self.path.strip("/")
+        if not name.isdigit() or int(name) >= len(broadcast.urls):
             self.send_error(404)
             return
         self.send_response(200)
         self.send_header("Content-Type", "video/x-nut")
         self.end_headers()
-        self._broadcast.send(int(name), self.wfile)
+        broadcast.send(int(name), self.wfile)
 
     def log_message(self, *_: object) -> None:
         pass

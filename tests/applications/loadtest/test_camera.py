@@ -10,7 +10,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from catstream.applications.loadtest.broadcast import Broadcast, Schedule
+from catstream.applications.loadtest.camera import Broadcast, Schedule
 from catstream.video.frames import jpeg
 from catstream.video.source import open_source
 

@@ -1,20 +1,38 @@
-"""`catstream sink`: write the tracks of a running pipeline to files and elsewhere."""
+"""`catstream sink` and `export`: write the tracks of a running pipeline, or other formats from the log of a run."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
+from inspect import cleandoc
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
 
 from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
-from catstream.cli.export import with_table
 from catstream.client.subscription import subscribe
+from catstream.errors import VideoError
 from catstream.messages.names import counted, listed
-from catstream.services.options import with_overwrite
-from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
+from catstream.services.options import PATH, with_overwrite
+from catstream.sinks import destinations
+from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
+from catstream.sinks.track_log import is_log, read_frames
+
+Command = Callable[..., Any]
+
+
+def with_table(*, sinks: bool) -> Callable[[Command], Command]:
+    """Replace {table} in the help of a command by the lines of the sinks, or of the exports."""
+
+    def changed(command: Command) -> Command:
+        lines = (f"  {key:9} {row.meaning}" for key, row in (SINKS if sinks else EXPORTS).items())
+        command.__doc__ = cleandoc(command.__doc__ or "").replace("{table}", "\n".join(["\b", *lines]))
+        return command
+
+    return changed
 
 
 @click.command()
@@ -43,16 +61,17 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
       catstream sink - | jq .box
     """
     for place in places:
-        sink_of(place).load()
-        if is_file(place):
-            check_file(Path(place), may_exist=overwrite)
+        destinations.sink_of(place).load()
+        if destinations.is_file(place):
+            destinations.check_file(Path(place), may_exist=overwrite)
     written, reason, run = 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
             origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys)
-            sinks = [stack.enter_context(closing(open_sink(place, origin))) for place in dict.fromkeys(places)]
+            opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
+            sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in tracks:
                 run = run or tracks.run
@@ -71,3 +90,34 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
             reason = f": {tracks.end.reason}"
         of = f" of {listed(newest)}" if any(newest) else ""
         click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{reason}", err=True)
+
+
+@click.command()
+@click.argument("log", type=PATH)
+@click.argument("dest", type=PATH)
+@click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
+@with_overwrite
+@with_table(sinks=False)
+def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
+    """Make another format from the log of a run.
+
+    LOG is an .ndjson or .csv file of `catstream track` or `catstream sink`. The
+    extension of DEST selects the format, or --format, which a folder needs. A
+    folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
+    that of LOG. Processing times are in .csv only.
+
+    {table}
+
+    \b
+    EXAMPLES
+      catstream export out/walk.ndjson walk.sqlite
+      catstream export out/walk.csv results --format otb
+    """
+    row = destinations.export_of(dest, name)
+    if not is_log(log) or not log.is_file():
+        raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
+    if next(read_frames(log), None) is None:
+        raise VideoError(f"{log} contains no tracks")
+    if row.suffix:
+        destinations.check_file(dest, may_exist=overwrite, source=str(log))
+    destinations.export((frame for frame, _ in read_frames(log)), dest, row, log.stem)

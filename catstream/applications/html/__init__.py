@@ -1,1 +1,0 @@
-"""Pages of one file that need nothing else, and the plots on them."""
