@@ -76,6 +76,8 @@ class StartedProcess:
     def _receive(self, seconds: float) -> bool:
         """Receive the next answer; returns whether one arrived in time."""
         with self._lock:  # several threads may ask
+            if self._code is not None:  # another thread has received the end, and may have closed the socket
+                return False
             self._answers.settimeout(seconds)
             try:
                 data = self._answers.recv(_ANSWER.size)
@@ -84,7 +86,7 @@ class StartedProcess:
             except ConnectionError:
                 data = b""
             if not data:  # the server has ended, and the kernel kills the process
-                self._code = -signal.SIGKILL if self._code is None else self._code
+                self._code = -signal.SIGKILL
             elif self._pid:
                 self._code = int(_ANSWER.unpack(data)[0])
             else:

@@ -188,9 +188,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
                 variables = {key: value.replace(there, place) for key, value in variables.items()}
                 line = [word.replace(there, place) for word in line]
             stack.enter_context(
-                ended(
-                    subprocess.Popen([sys.executable, "-m", "catstream.services", *line], env=os.environ | variables)
-                )
+                ended(subprocess.Popen([sys.executable, "-m", "catstream.services", *line], env=os.environ | variables))
             )
         with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
             assert next(tracks).box is not None

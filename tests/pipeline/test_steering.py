@@ -102,7 +102,7 @@ def refuses_what_cannot_be_done(pipeline, steering):
         stranger.connect(Endpoint.parse(pipeline.endpoint).address(CHANNELS["control"]))
         for data in (b"", b"\xc1", b"\x93\x01\xa4", bytes(9000)):
             stranger.send(data)
-        told(pipeline, lambda counters: counters["rejected"] == 4)
+        told(pipeline, lambda counters: counters["rejected"] >= 4)
 
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor")], ids=str)
