@@ -8,6 +8,7 @@ itself is the owner of the run, which receives every track.
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import os
 import signal
@@ -21,6 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from typing import Self
+from unittest.mock import patch
 
 from catstream.box import Box
 from catstream.client.control import Control, control
@@ -48,18 +50,32 @@ LINKS = {
 
 _PATIENCE_SECONDS = 120.0  # the run counts as stuck after this time without a track
 _DISK = 128  # megabytes of the small disk for each object: three checkpoints, as the oldest of them is removed last
-#: The module `sitecustomize` of each process: it shifts the wall clock by the seconds in a file. Monotonic clocks are
-#: unchanged, as they are if an administrator or NTP sets the clock.
-_CLOCK = """
-import os, time
-_true = time.time
+#: The module `sitecustomize` of each process. It shifts the wall clock by the seconds in a file; monotonic clocks are
+#: unchanged, as they are if an administrator or NTP sets the clock. And it writes down how many rows of each message
+#: belong into the trees of each object, counted without the trees: `Arena.rows_due` adds them up.
+_MODULE = """
+import json, os, time
+from catstream.numerics.threads import limit_process
+limit_process()  # before anything imports numpy
+from catstream.compression.forest import Forest
+from catstream.messages.heads import TREES
+_folder, _true, _take = os.environ["ARENA"], time.time, Forest.take
 def _shifted():
     try:
-        with open(os.environ["ARENA_CLOCK"]) as file:
+        with open(_folder + "/clock") as file:
             return _true() + float(file.read() or 0)
     except OSError:
         return _true()
-time.time = _shifted
+def _rows(part):
+    found = [(tree.label, part.training[tree.group]) for tree in TREES.values() if tree.group in part.training]
+    return sum(len(rows) if label is None else int((rows.labels == label).sum()) for label, rows in found)
+def _counted(self, features, *more):
+    if features.seq == self.seq + 1:
+        parts = {name: [part.begins, _rows(part)] for name, part in features.objects.items()}
+        with open(_folder + "/rows", "a") as file:
+            file.write(json.dumps([features.seq, parts]) + chr(10))
+    return _take(self, features, *more)
+time.time, Forest.take = _shifted, _counted
 """
 
 
@@ -152,17 +168,16 @@ class Arena:
 
     Attributes
     ----------
-    tracks : the received tracks of each frame by name, in order
+    tracks, frames : the received tracks of each frame by name, and the number of that frame, in order
     end : the last message of the stream, None before it was received
     deaths : number of restarts of processes
     links : link of each channel
     """
 
     def __init__(self, source: str, boxes: dict[str, Box], settings: Settings, state: Path, scratch: Path) -> None:
-        self.state, self.tracks, self.deaths = state, list[dict[str, Track]](), 0
+        self.state, self.tracks, self.frames, self.deaths = state, list[dict[str, Track]](), list[int](), 0
         self.end: End | None = None
         self._settings, self._source, self._boxes, self._folder = settings, source, boxes, scratch
-        self._clock = scratch / "clock"
         self._children: dict[str, Child] = {}
         self._places: dict[str, Endpoint] = {}
         self._last_received = monotonic()
@@ -177,7 +192,7 @@ class Arena:
             }
             for link in self.links.values():
                 stack.callback(link.close)
-            (self._folder / "sitecustomize.py").write_text(_CLOCK)
+            (self._folder / "sitecustomize.py").write_text(_MODULE)
             window = self._settings.run.unstored_frames + 1
             self._results = stack.enter_context(ResultsReceiver(self._places["detector"], window, 0))
             self._models = stack.enter_context(Subscriber(MODELS, self._places["trainer"]))
@@ -186,7 +201,7 @@ class Arena:
             path = os.pathsep.join([str(self._folder), *filter(None, [os.environ.get("PYTHONPATH")])])
             close_start_server()  # the next one has these variables
             stack.callback(close_start_server)
-            stack.enter_context(_variables({"PYTHONPATH": path, "ARENA_CLOCK": str(self._clock)}))
+            stack.enter_context(patch.dict(os.environ, {"PYTHONPATH": path, "ARENA": str(self._folder)}))
             for name in NAMES:
                 self._children[name] = Child(name, self._job(name), self._folder)
                 stack.callback(self._children[name].close)
@@ -210,8 +225,7 @@ class Arena:
             self._last_received = monotonic()
             if isinstance(message, Tracks):
                 self.tracks.append(message.tracks)
-                if message.seq != len(self.tracks):
-                    raise ServiceError(f"frame {len(self.tracks) - 1} is missing, frame {message.frame} came instead")
+                self.frames.append(message.frame)
             else:
                 self.end = message
             self._children["detector"].watchdog.read = math.inf if self.end is not None else message.seq
@@ -265,7 +279,17 @@ class Arena:
 
     def set_clock(self, seconds: float) -> None:
         """Shift the wall clock of all processes by some seconds."""
-        self._clock.write_text(str(seconds))
+        (self._folder / "clock").write_text(str(seconds))
+
+    def rows_due(self) -> int:
+        """Return how many rows of all messages belong into the trees of the objects that there are at the end."""
+        newest: dict[int, dict[str, tuple[bool, int]]] = {}  # after a restart, messages come again
+        for line in (self._folder / "rows").read_text().splitlines():
+            seq, newest[seq] = json.loads(line)
+        rows: dict[str, int] = {}
+        for _, parts in sorted(newest.items()):
+            rows = {name: count + (0 if begins else rows.get(name, 0)) for name, (begins, count) in parts.items()}
+        return sum(rows.values())
 
     def words(self) -> str:
         """Return the last log line of each process."""
@@ -278,21 +302,6 @@ class Arena:
         job = Job(self._source, self._boxes, settings=self._settings, owned=True, resume=True)
         state = self.state if name == "compressor" else folder
         return replace(job, state=state, endpoint=str(self._places[name])).save(folder)
-
-
-@contextmanager
-def _variables(variables: dict[str, str]) -> Iterator[None]:
-    """Set environment variables of this process, which those that it starts inherit."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 @contextmanager

@@ -51,6 +51,8 @@ def assert_kept(video, calm, faults, lockstep=True):
 def kept(run, frames):
     numbers = [{track.frame for track in tracks.values()} for tracks in run.tracks]
     assert numbers == [{frame} for frame in range(frames)]
+    kept = dict(zip(chaos.KEPT, chaos.kept(run, frames), strict=True))
+    assert not any(kept[f"{what} {how}"] for what in ("frames", "rows") for how in ("lost", "twice")), kept
     assert run.totals["sent"] == run.totals["stored"] == run.learned.seq == frames
 
 
