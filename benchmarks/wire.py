@@ -89,8 +89,9 @@ def receive(endpoint: str) -> None:
         message = None
         while not isinstance(message, End):
             message = features.receive(0.1)
+            features.answer()
             if message is not None:
-                features.acknowledge(Position(message.seq))
+                features.acknowledge(Position(message.seq, message.seq))
 
 
 if __name__ == "__main__":
