@@ -92,8 +92,8 @@ def beside_others(record: Record) -> Iterator[Table]:
 
 
 def speeds(record: Record) -> Iterator[Table]:
-    """Select the speed in a user's program, and that of the slowest frames."""
-    yield from _titled(record, {"Tracker in a user's program": "", "Time of a frame": ""})
+    """Select the speed in a user's program, the time of the slowest frames, and that of each stage."""
+    yield from _titled(record, dict.fromkeys(("Tracker in a user's program", "Time of a frame", _STAGES), ""))
 
 
 def _titled(record: Record, titles: Mapping[str, str]) -> Iterator[Table]:
@@ -332,11 +332,12 @@ _PAPER_DETAILS = """
     the paper, implemented from its text; the rows with the name of the paper are its printed figures, on other videos.
     Plots: [long videos](../docs/images/long_videos.png), [time of one training](../docs/images/time_complexity.png)."""
 _SPEED_DETAILS = """
-    `Tracker` in a program of a user, and the time of a frame in one process and in three. The three processes,
-    `throughput.py` and `subscribers.py` decode the video, the others do not."""
+    `Tracker` in a program of a user, the time of a frame in one process and in three, and that of each stage. The three
+    processes and `subscribers.py` decode the video, the others do not."""
 _LIMITS = """
     [A plot](../docs/images/soak.png) shows the memory over the million messages of `soak.py`."""
 _PEERS = "Beside OpenCV's trackers"
+_STAGES = "Milliseconds a frame, on one core"
 _SIZES = "Frames/s against the size of the image"
 _SOAK = ("messages", "rows", "us a message", "trees MB", "law MB", "resident MB", "disk MB")
 
@@ -388,7 +389,6 @@ DETAILS = (
         _SPEED_DETAILS,
         (
             Shown("speed", speeds),
-            Shown("throughput", select(without=".* full ")),
             Shown("wire", select()),
             Shown("subscribers", select(without="0 ")),
         ),
