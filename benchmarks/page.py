@@ -15,7 +15,7 @@ from statistics import fmean
 from textwrap import fill
 from typing import Any, NamedTuple
 
-from groups import CHECK, TUNED
+from sequences import CHECK, TUNED
 from table import Cell, Table, text
 
 _NOTES = Path(__file__).parent
@@ -384,7 +384,7 @@ _SPEED = """
     run takes as long as one at its beginning."""
 _LOAD = """
     The load tests use videos of 640x480 pixels at 25 frames/s; the latency is measured from the due time of a frame.
-    Faults (kill -9, SIGSTOP, cut links, a full disk) are measured in seconds until recovery. The last table is of runs
+    Faults (kill -9, SIGSTOP, a full disk) are measured in seconds until recovery. The last table is of runs
     that were killed with all their processes, and resumed."""
 _SEQUENCES = """
     One run from the first box of each sequence. * is the check list; the defaults were chosen on the first 20."""
@@ -450,7 +450,6 @@ DETAILS = (
         _SPEED_DETAILS,
         (
             Shown("speed", speeds),
-            Shown("wire", select()),
             Shown("subscribers", select(without="0 ")),
         ),
     ),

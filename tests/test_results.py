@@ -14,7 +14,7 @@ BENCHMARKS = ROOT / "benchmarks"
 sys.path.append(str(BENCHMARKS))
 
 import page  # noqa: E402
-from groups import CHECK, TUNED  # noqa: E402
+from sequences import CHECK, TUNED  # noqa: E402
 
 from catstream.applications.evaluation.datasets import read_attributes  # noqa: E402
 

@@ -23,9 +23,8 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
-from groups import CHECK
 from learning import each, features, hits, learning_command, model_of, tracked
-from sequences import painted, rendered, scratch, sequences
+from sequences import CHECK, painted, rendered, scratch, sequences
 from table import Table, publish
 
 from catstream.applications.evaluation.datasets import Sequence, find_sequences

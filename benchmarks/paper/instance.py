@@ -26,8 +26,7 @@ from time import perf_counter
 import cv2
 import numpy as np
 import shared  # noqa: F401
-from groups import CHECK
-from sequences import painted, sequences
+from sequences import CHECK, painted, sequences
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
