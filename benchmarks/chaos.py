@@ -254,10 +254,6 @@ def kill(*names: str) -> Fault:
     return strike
 
 
-def kill_start_server(arena: Arena, _: np.random.Generator) -> None:
-    arena.kill_start_server()
-
-
 def freeze(arena: Arena, random: np.random.Generator) -> None:
     name = str(random.choice(NAMES))
     arena.signal(name, signal.SIGSTOP)
@@ -277,20 +273,16 @@ def fill(arena: Arena, random: np.random.Generator) -> None:
     ballast.unlink()
 
 
-def jump(arena: Arena, random: np.random.Generator) -> None:
-    arena.set_clock(random.uniform(-HOUR, HOUR))
-
-
 #: Kinds of faults, and their relative frequencies.
 FAULTS: dict[str, tuple[Fault, float]] = {
     "kill -9 detector": (kill("detector"), 3),
     "kill -9 compressor": (kill("compressor"), 3),
     "kill -9 trainer": (kill("trainer"), 2),
     "kill -9 all three": (kill(*NAMES), 2),
-    "kill -9 start server": (kill_start_server, 1),
+    "kill -9 start server": (lambda arena, _: arena.kill_start_server(), 1),
     "SIGSTOP, SIGCONT": (freeze, 2),
     FULL: (fill, 1),
-    "clock jump": (jump, 1),
+    "clock jump": (lambda arena, random: arena.set_clock(random.uniform(-HOUR, HOUR)), 1),
 }
 
 

@@ -74,11 +74,6 @@ def named(options: argparse.Namespace, name: str) -> Sequence:
     return rendered(FRAMES, (320, 240))
 
 
-def video(sequence: Sequence) -> str:
-    """Return the source argument of `catstream track` for a sequence."""
-    return str(sequence.path)
-
-
 @cache
 def _dahlia() -> Sprite:
     return cut_out_dahlia(load_photograph("flower"))

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from accuracy import available, shortened
 from journey import Journey, travel
-from sequences import named, rendered, video
+from sequences import named, rendered
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
@@ -224,7 +224,7 @@ def costs(sequence: Sequence, settings: Settings) -> list[float]:
 def sequence_in_pipeline(sequence: Sequence) -> Journey:
     """Run the pipeline on a sequence."""
     part = slice(sequence.begin, sequence.begin + len(sequence))
-    return travel(video(sequence), sequence.boxes[0], Settings(), part=part)
+    return travel(str(sequence.path), sequence.boxes[0], Settings(), part=part)
 
 
 def demo(size: tuple[int, int], frames: int, tiny: bool) -> Sequence:
@@ -240,7 +240,7 @@ def demo(size: tuple[int, int], frames: int, tiny: bool) -> Sequence:
 def demo_in_pipeline(frames: int, size: tuple[int, int], tiny: bool, settings: Settings) -> Journey:
     """Run the pipeline on the rendered video."""
     sequence = demo(size, frames, tiny)
-    return travel(video(sequence), sequence.boxes[0], settings)
+    return travel(str(sequence.path), sequence.boxes[0], settings)
 
 
 if __name__ == "__main__":

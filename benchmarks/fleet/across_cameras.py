@@ -15,7 +15,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import NamedTuple
 
 import cv2
@@ -25,7 +25,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 
 from learning import each, features, hits, learning_command, model_of, tracked
 from sequences import CHECK, painted, rendered, scratch, sequences
-from table import Table, publish
+from table import Table, mean_and_error, publish
 
 from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.run.learned import Learned, merge
@@ -152,10 +152,8 @@ def _summary(names: list[str], rows: list[Row]) -> Iterator[tuple]:
         yield f"{merged} less {name}", *_means(differences)
 
 
-def _means(rows: list[tuple[float, ...]]) -> Iterator[float]:
-    for column in zip(*rows, strict=True):
-        yield fmean(column)
-        yield stdev(column) / len(column) ** 0.5 if len(column) > 1 else 0.0
+def _means(rows: list[tuple[float, ...]]) -> list[float]:
+    return [cell or 0.0 for column in zip(*rows, strict=True) for cell in mean_and_error(column)]
 
 
 if __name__ == "__main__":
