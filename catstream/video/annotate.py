@@ -71,15 +71,8 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
     An object that is alone and has no name is drawn in the colour of its state. Other objects have a colour each and
     their names at their boxes. Their scores are below the frame.
 
-    Parameters
-    ----------
-    image : uint8 (h, w, 3), blue green red
-    tracks : the tracks of this frame, at least one
-    colours : the colours of the objects, which are kept from frame to frame
-
-    Returns
-    -------
-    uint8 (h + k, w, 3): the frame, and k rows of pixels with the text below it
+    The image is uint8 (h, w, 3), blue green red, the result uint8 (h + k, w, 3) with k rows for the text. There is at
+    least one track; the colours are kept from frame to frame.
     """
     height, width = image.shape[:2]
     unit = max(width / 640, _MIN_UNIT)
@@ -106,12 +99,7 @@ def drawn_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) -> bytes:
-    """Draw the tracks of its frame into a preview, with a line of text below; the line is empty without tracks.
-
-    Returns
-    -------
-    JPEG file, of the same size with and without tracks
-    """
+    """Draw the tracks of its frame into a preview, with a line of text below, empty without tracks: a JPEG file."""
     image = preview_image(preview, tracks, colours)
     return preview.jpeg if image is None else jpeg(image)
 
@@ -128,17 +116,9 @@ def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -
 
 
 def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
-    """Return a small image of a frame with the ground truth box in white and the tracker's box in orange.
+    """A small JPEG of a frame with the ground truth box in white and the tracker's box in orange.
 
-    Parameters
-    ----------
-    image : uint8 (h, w, 3), blue green red
-    truth, box : float64 (4,), x, y, w, h; a box with NaN is not drawn
-    width : width of the small image in pixels
-
-    Returns
-    -------
-    JPEG file
+    The image is uint8 (h, w, 3), blue green red, a box float64 (4,) with x, y, w, h; one with NaN is not drawn.
     """
     boxes = [(one, colour) for one, colour in ((truth, _WHITE), (box, _ORANGE)) if np.isfinite(one).all()]
     scale = width / image.shape[1]
