@@ -27,7 +27,6 @@ _Colour = tuple[int, int, int]
 
 _COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
 _WHITE, _DARK, _BLACK = (245, 245, 245), (32, 32, 32), (17, 17, 17)
-_ORANGE = (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Height of the line of text below an image that is 640 pixels wide, and the smallest factor by which it is scaled.
@@ -113,22 +112,6 @@ def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -
         return np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
     scale = image.shape[1] / preview.width
     return draw(image, [_scaled(track, scale) for track in tracks], colours)
-
-
-def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
-    """A small JPEG of a frame with the ground truth box in white and the tracker's box in orange.
-
-    The image is uint8 (h, w, 3), blue green red, a box float64 (4,) with x, y, w, h; one with NaN is not drawn.
-    """
-    boxes = [(one, colour) for one, colour in ((truth, _WHITE), (box, _ORANGE)) if np.isfinite(one).all()]
-    scale = width / image.shape[1]
-    small = cv2.resize(image, (width, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
-    for box, colour in boxes:
-        x, y, w, h = (float(value) * scale for value in box)
-        corners = (round(x), round(y)), (round(x + w), round(y + h))
-        cv2.rectangle(small, *corners, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.rectangle(small, *corners, colour, 1, cv2.LINE_AA)
-    return jpeg(small)
 
 
 def _scaled(track: Track, scale: float) -> Track:
