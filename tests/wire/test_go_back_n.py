@@ -362,16 +362,6 @@ def test_a_sender_that_only_waits_transmits_nothing_again():
         assert frames(sender) == []
 
 
-def test_the_end_and_a_broken_connection_are_noticed_and_reset_by_a_new_message():
-    window = ReceiveWindow(Position(), size=4)
-    assert (window.connected, window.ended) == (False, False)
-    window.receive(b"peer", 1, now=0.0)
-    window.disconnected()
-    assert (window.connected, window.ended) == (False, False)
-    window.receive(b"peer", 2, now=0.0, last=True)
-    assert (window.connected, window.ended) == (True, True)
-
-
 @pytest.mark.parametrize("late", [Position(1, 3), Position(2, 2)], ids=["stored less", "received less"])
 def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late):
     window = filled(size=4, count=4)
