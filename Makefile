@@ -44,7 +44,7 @@ demo: $(READY)  ## render a video, track the object in it, print the accuracy
 test: $(TOOLS)  ## all tests but those of test-system and test-slow, with doctests
 	@$(BIN)/pytest -n auto --dist worksteal
 
-test-system: $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, several hosts, or a whole benchmark
+test-system: $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, or a whole benchmark
 	@$(BIN)/pytest -n 2 --dist worksteal -m 'system and not slow'
 
 test-slow: $(TOOLS)  ## the slow ones: many faults, a load test (4 minutes)

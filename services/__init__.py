@@ -1,1 +1,1 @@
-"""The processes of a pipeline: a loop each, the detector's pure core, the supervisor and the start server."""
+"""The processes of a pipeline: a loop each, its decisions as pure functions, the supervisor and the start server."""

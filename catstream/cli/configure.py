@@ -66,7 +66,7 @@ def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str
     ROLE
       watch     subscribe to all channels
       control   the same, and send commands to a running pipeline
-      pipeline  everything: for another machine that runs processes of this pipeline
+      pipeline  everything: the pipeline's own processes
 
     \b
     EXAMPLES

@@ -42,11 +42,15 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
         return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
 
 
+#: In the place of a token: everybody on this machine may use the page.
+_OPEN = "none"
+
+
 def with_token(prefix: str = "") -> Decorator:
     """Add --PREFIXtoken; the argument `token` is a new random one if none is given, and None for "none"."""
     return combined(
         "token",
-        lambda token: None if token == "none" else token or secrets.token_hex(16),
+        lambda token: None if token == _OPEN else token or secrets.token_hex(16),
         click.option(
             f"--{prefix}token",
             "token",

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable
 from functools import cached_property
 from time import monotonic
+from typing import cast
 
 import numpy as np
 
@@ -45,8 +46,7 @@ def first_box(text: str) -> Box:
     Box(x=184.0, y=88.0, w=57.0, h=58.0)
     """
     _, box = rendered.Demo(_SIZE, _seed(text)).image(_BEGIN)
-    assert box is not None
-    return Box(*(float(round(value)) for value in box))
+    return Box(*(float(round(value)) for value in cast(Box, box)))
 
 
 class LiveDemo(Source):
