@@ -11,8 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from groups import CHECK
-from sequences import sequences
+from sequences import CHECK, sequences
 from table import command, mean_and_error
 
 from catstream.applications.evaluation.accuracy import rows_of

@@ -10,8 +10,7 @@ from itertools import islice
 from typing import TypeVar
 
 import numpy as np
-from groups import CHECK
-from sequences import sequences
+from sequences import CHECK, sequences
 from table import command
 
 from catstream.applications.evaluation.datasets import Sequence

@@ -15,9 +15,7 @@ measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
 }
 
 measure startup "$python" benchmarks/startup.py --runs 3
-measure throughput "$python" benchmarks/throughput.py --runs 2
 measure objects "$python" benchmarks/objects.py
-measure wire "$python" benchmarks/wire.py
 measure subscribers "$python" benchmarks/subscribers.py --frames 1500 --runs 1
 measure resume "$python" benchmarks/resume.py --moments 8
 measure loadtest "$catstream" loadtest --streams 2 --duration 20

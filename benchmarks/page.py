@@ -6,19 +6,112 @@ of the tutorial come from the same records.
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
+from textwrap import fill
+from typing import Any, NamedTuple
 
-from groups import CHECK, TUNED
-from sections import DOCS, Page, Record, Section, Shown, every, filled, records, select, written
-from table import Cell, Table
+from sequences import CHECK, TUNED
+from table import Cell, Table, text
 
 _NOTES = Path(__file__).parent
+DOCS = _NOTES.parent / "docs"
 _README = _NOTES.parent / "README.md"
 _MARKS = re.compile(r"(<!-- results: .*? -->\n).*?(<!-- /results -->)", re.DOTALL)
+
+Record = Mapping[str, Any]
+
+
+class Shown(NamedTuple):
+    """A record on the page: its file in `benchmarks/results`, and the tables made from it."""
+
+    record: str
+    tables: Callable[[Record], Iterable[Table]]
+
+
+class Section(NamedTuple):
+    """A part of the page: its heading, an introduction to its tables, and the tables."""
+
+    heading: str
+    introduction: str | Callable[[Mapping[str, Record]], str]
+    parts: tuple[Shown, ...]
+
+
+class Page(NamedTuple):
+    """A page of results: its file, its title, an introduction, and the sections."""
+
+    path: Path
+    title: str
+    introduction: str
+    sections: tuple[Section, ...]
+
+
+def records() -> dict[str, Record]:
+    """Return all records by name."""
+    return {
+        path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted((_NOTES / "results").glob("*.json"))
+    }
+
+
+def written(page: Page, found: Mapping[str, Record]) -> str:
+    """Return the text of a page."""
+    parts = [f"# {page.title}", filled(page.introduction)]
+    for section in page.sections:
+        blocks = [_block(found[name], tables) for name, tables in section.parts]
+        introduction = section.introduction if isinstance(section.introduction, str) else section.introduction(found)
+        parts += [f"## {section.heading}", filled(introduction)]
+        parts += ["```console\n" + "\n".join(blocks) + "\n```"] if blocks else []
+    return "\n\n".join(parts) + "\n"
+
+
+def _block(record: Record, tables: Callable[[Record], Iterable[Table]]) -> str:
+    machine = record["machine"]
+    made = f"{record['date']}, commit {record['commit']}, {machine['cores']} cores of {machine['processor']}"
+    settings = f", {len(record['settings'])} settings differ from the defaults" if record["settings"] else ""
+    return f"$ {record['command']}  # {made}{settings}\n" + "\n\n".join(map(text, tables(record)))
+
+
+def select(number: int = 0, *, columns: Sequence[str] = (), without: str = "") -> Callable[[Record], Iterator[Table]]:
+    """Return a function that selects table `number` of a record, with these columns, without the rows of a pattern."""
+
+    def chosen(record: Record) -> Iterator[Table]:
+        table = record["tables"][number]
+        every_place = range(len(table["columns"]))  # two columns may have one name
+        places = [table["columns"].index(column) for column in columns] or every_place
+        kept = [row for row in table["rows"] if not (without and re.match(without, " ".join(map(str, row))))]
+        yield Table(
+            "", [table["columns"][place] for place in places], [[row[place] for place in places] for row in kept]
+        )
+
+    return chosen
+
+
+def several(*parts: Callable[[Record], Iterable[Table]]) -> Callable[[Record], Iterator[Table]]:
+    """Return a function that makes the tables of several functions."""
+    return lambda record: (table for part in parts for table in part(record))
+
+
+def every(record: Record) -> Iterator[Table]:
+    """Select all tables of a record."""
+    return several(*map(select, range(len(record["tables"]))))(record)
+
+
+def filled(paragraphs: str) -> str:
+    """Return paragraphs, which blank lines separate, in lines of at most 120 characters."""
+    return "\n\n".join(
+        fill(
+            " ".join(paragraph.split()),
+            120,
+            subsequent_indent="  " if paragraph.lstrip().startswith("- ") else "",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for paragraph in re.split(r"\n\s*\n", paragraphs.strip())
+    )
 
 
 def shown() -> set[str]:
@@ -30,30 +123,6 @@ def with_figures(path: Path, found: Mapping[str, Record]) -> str:
     """Return a page of `MARKED` with the figures between its marks."""
     page, figures = path.read_text(encoding="utf-8"), MARKED[path](found)
     return _MARKS.sub(lambda marks: f"{marks[1]}{figures}\n{marks[2]}", page)
-
-
-def merged(record: Record) -> Iterator[Table]:
-    """Select the means of the models of parts of a sequence, and the differences between them."""
-    yield from select(without="(?!mean)")(record)
-    differences = record["tables"][1]
-    yield Table("", differences["columns"], differences["rows"])
-
-
-def means_only(record: Record) -> Iterator[Table]:
-    """Select the means over all saved models."""
-    yield from select(without="(?!mean|±)")(record)
-
-
-def across(record: Record) -> Iterator[Table]:
-    """Select all tables but the first one, which has a row for each scene."""
-    for table in record["tables"][1:]:
-        yield Table("", table["columns"], table["rows"])
-
-
-def recognised(record: Record) -> Iterator[Table]:
-    """Select the tables over all objects."""
-    for number in range(3):
-        yield from select(number)(record)
 
 
 def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
@@ -92,8 +161,8 @@ def beside_others(record: Record) -> Iterator[Table]:
 
 
 def speeds(record: Record) -> Iterator[Table]:
-    """Select the speed in a user's program, and that of the slowest frames."""
-    yield from _titled(record, {"Tracker in a user's program": "", "Time of a frame": ""})
+    """Select the speed in a user's program, the time of the slowest frames, and that of each stage."""
+    yield from _titled(record, dict.fromkeys(("Tracker in a user's program", "Time of a frame", _STAGES), ""))
 
 
 def _titled(record: Record, titles: Mapping[str, str]) -> Iterator[Table]:
@@ -115,16 +184,8 @@ def load(record: Record) -> Iterator[Table]:
     """Summarise a load test over all its streams."""
     streams, track, model = record["streams"], record["latency"]["track"], record["latency"]["model"]
     skipped = sum(stream["skipped"] for stream in streams) / sum(stream["frames"] for stream in streams)
-    heads = (
-        "streams",
-        "frames/s due",
-        "frames/s of each",
-        "skipped",
-        "track p50, ms",
-        "p99, ms",
-        "model p50, ms",
-        "success",
-    )
+    times = ("track p50, ms", "p99, ms", "model p50, ms")
+    heads = ("streams", "frames/s due", "frames/s of each", "skipped", *times, "success")
     rate = fmean(stream["frames_per_second"] for stream in streams)
     success = fmean(stream["success"] for stream in streams)
     milliseconds = [1000 * seconds for seconds in (track["p50"], track["p99"], model["p50"])]
@@ -323,7 +384,7 @@ _SPEED = """
     run takes as long as one at its beginning."""
 _LOAD = """
     The load tests use videos of 640x480 pixels at 25 frames/s; the latency is measured from the due time of a frame.
-    Faults (kill -9, SIGSTOP, cut links, a full disk) are measured in seconds until recovery. The last table is of runs
+    Faults (kill -9, SIGSTOP, a full disk) are measured in seconds until recovery. The last table is of runs
     that were killed with all their processes, and resumed."""
 _SEQUENCES = """
     One run from the first box of each sequence. * is the check list; the defaults were chosen on the first 20."""
@@ -332,11 +393,12 @@ _PAPER_DETAILS = """
     the paper, implemented from its text; the rows with the name of the paper are its printed figures, on other videos.
     Plots: [long videos](../docs/images/long_videos.png), [time of one training](../docs/images/time_complexity.png)."""
 _SPEED_DETAILS = """
-    `Tracker` in a program of a user, and the time of a frame in one process and in three. The three processes,
-    `throughput.py` and `subscribers.py` decode the video, the others do not."""
+    `Tracker` in a program of a user, the time of a frame in one process and in three, and that of each stage. The three
+    processes and `subscribers.py` decode the video, the others do not."""
 _LIMITS = """
     [A plot](../docs/images/soak.png) shows the memory over the million messages of `soak.py`."""
 _PEERS = "Beside OpenCV's trackers"
+_STAGES = "Milliseconds a frame, on one core"
 _SIZES = "Frames/s against the size of the image"
 _SOAK = ("messages", "rows", "us a message", "trees MB", "law MB", "resident MB", "disk MB")
 
@@ -388,8 +450,6 @@ DETAILS = (
         _SPEED_DETAILS,
         (
             Shown("speed", speeds),
-            Shown("throughput", select(without=".* full ")),
-            Shown("wire", select()),
             Shown("subscribers", select(without="0 ")),
         ),
     ),
@@ -406,10 +466,17 @@ DETAILS = (
 MORE = (
     Section("Several objects", _OBJECTS, (Shown("objects", every),)),
     Section("Frequent directions", _REDUCTION, (Shown("reduction", every),)),
-    Section("Saved models", _SAVED, (Shown("merge", merged), Shown("saved_models", means_only))),
-    Section("Across cameras", _ACROSS, (Shown("across_cameras", across),)),
+    Section(
+        "Saved models",
+        _SAVED,
+        (
+            Shown("merge", several(select(without="(?!mean)"), select(1))),
+            Shown("saved_models", select(without="(?!mean|±)")),
+        ),
+    ),
+    Section("Across cameras", _ACROSS, (Shown("across_cameras", several(select(1), select(2))),)),
     Section("A fleet under faults", _FLEET, (Shown("fleet_faults", every), Shown("fleet_faults-free", select(1)))),
-    Section("Objects found again", _FOUND, (Shown("instance", recognised),)),
+    Section("Objects found again", _FOUND, (Shown("instance", several(*map(select, range(3)))),)),
 )
 
 ROBUSTNESS = (

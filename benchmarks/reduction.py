@@ -13,8 +13,7 @@ from time import perf_counter
 
 import numpy as np
 from accuracy import MEANS, accuracy_command, compared, described, difference, means, videos
-from groups import TUNED
-from sequences import named
+from sequences import TUNED, named
 from table import Cell, Table, benchmark
 
 from catstream.applications.evaluation.datasets import Sequence

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from accuracy import available, many_sequences, videos
-from groups import CHECK
+from sequences import CHECK
 from table import Cell, Table, benchmark, command, mean_and_error
 
 from catstream.applications.evaluation.accuracy import Row, rows_of

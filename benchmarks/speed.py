@@ -9,26 +9,33 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
 from statistics import median
+from time import perf_counter
+from typing import Any
 
 import cv2
 import numpy as np
 from accuracy import available, shortened
 from journey import Journey, travel
-from sequences import named, rendered, video
+from sequences import named, rendered
 from table import Table, benchmark, command
-from throughput import MODES, steps
 
 from catstream.applications.evaluation.datasets import Sequence
 from catstream.applications.evaluation.onepass import evaluate, follow
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.box import Box
+from catstream.compression.forest import Forest
+from catstream.detection.objects import Detectors
+from catstream.features.pyramid import Pyramid
+from catstream.messages.names import UNNAMED
 from catstream.settings import Settings
+from catstream.training.trainer import Trainer
 
 TRACKERS = ("catstream", "csrt", "kcf")
+MODES = ("local", "full")
 #: Frames that count as the start of a run: there are no models of many frames yet, and the trees grow fast.
 START = 150
 SIZES = ((320, 240), (640, 480), (960, 720), (1280, 720), (1920, 1080), (3840, 2160))
@@ -181,10 +188,43 @@ def spread(milliseconds: np.ndarray) -> tuple[float, float, float, float, float]
     return 1000 / float(milliseconds.mean()), middle, late, slowest, slowest / middle
 
 
+def steps(videos: list[Sequence]) -> Table:
+    """Return the milliseconds per frame of decoding and of each of the three stages, run in one process."""
+    columns = ("video", "detection", "decode", "detect", "compress", "train", "all")
+    rows = []
+    for sequence in videos:
+        for mode in MODES:
+            spent = np.array(costs(sequence, Settings(search={"mode": mode}))) / len(sequence)
+            rows.append((sequence.name, mode, *spent.tolist(), float(spent.sum())))
+    return Table("Milliseconds a frame, on one core", columns, rows, "in the pipeline the last three run side by side")
+
+
+def costs(sequence: Sequence, settings: Settings) -> list[float]:
+    """Total milliseconds of decoding, detection, compression and training."""
+    detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
+    spent = [0.0] * 4
+
+    def timed(step: int, work: Callable[..., Any], *arguments: Any) -> Any:
+        begin = perf_counter()
+        answer = work(*arguments)
+        spent[step] += (perf_counter() - begin) * 1000
+        return answer
+
+    frames = sequence.frames()
+    for row in range(len(sequence)):
+        image = timed(0, next, frames)
+        frame = timed(1, Pyramid, image)
+        given = {} if row else {UNNAMED: timed(1, detectors.begin, UNNAMED, frame, Box(*sequence.boxes[0]))}
+        _, features = timed(1, detectors.step, frame, 0.0, given)
+        for sample in timed(2, forest.take, features):
+            detectors.adopt(timed(3, trainer.train, sample))
+    return spent
+
+
 def sequence_in_pipeline(sequence: Sequence) -> Journey:
     """Run the pipeline on a sequence."""
     part = slice(sequence.begin, sequence.begin + len(sequence))
-    return travel(video(sequence), sequence.boxes[0], Settings(), part=part)
+    return travel(str(sequence.path), sequence.boxes[0], Settings(), part=part)
 
 
 def demo(size: tuple[int, int], frames: int, tiny: bool) -> Sequence:
@@ -200,7 +240,7 @@ def demo(size: tuple[int, int], frames: int, tiny: bool) -> Sequence:
 def demo_in_pipeline(frames: int, size: tuple[int, int], tiny: bool, settings: Settings) -> Journey:
     """Run the pipeline on the rendered video."""
     sequence = demo(size, frames, tiny)
-    return travel(video(sequence), sequence.boxes[0], settings)
+    return travel(str(sequence.path), sequence.boxes[0], settings)
 
 
 if __name__ == "__main__":

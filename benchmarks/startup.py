@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 
-from sequences import named, video
+from sequences import named
 from table import Table, benchmark, command
 
 from catstream.box import Box
@@ -32,7 +32,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         for kernels in ("warm",) if options.quick else ("cold", "warm"):
             # Each cold start has an empty kernel folder of its own; the warm starts use the first of these folders.
             caches = [Path(folder, str(run) if kernels == "cold" else "0") for run in range(runs)]
-            times = [start(video(sequence), box, {} if options.quick else {CACHE: str(cache)}) for cache in caches]
+            times = [start(str(sequence.path), box, {} if options.quick else {CACHE: str(cache)}) for cache in caches]
             first = [seconds for seconds, _ in times]
             learned = [seconds for _, seconds in times if seconds is not None]
             rows.append((kernels, runs, median(first), max(first), median(learned) if learned else None))

@@ -14,7 +14,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 from journey import Journey, travel
-from sequences import rendered, video
+from sequences import rendered
 from table import Table, benchmark, command
 
 import catstream
@@ -94,7 +94,7 @@ def run_with(frames: int, readers: int, frozen: int) -> Run:
 
         settings = Settings(run={"endpoint": str(folder)})
         try:
-            journey = travel(video(sequence), sequence.boxes[0], settings, frames // 50 + 1, turn=turn)
+            journey = travel(str(sequence.path), sequence.boxes[0], settings, frames // 50 + 1, turn=turn)
         finally:
             ended.set()
             if late.ident is not None:

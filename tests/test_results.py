@@ -14,18 +14,17 @@ BENCHMARKS = ROOT / "benchmarks"
 sys.path.append(str(BENCHMARKS))
 
 import page  # noqa: E402
-import sections  # noqa: E402
-from groups import CHECK, TUNED  # noqa: E402
+from sequences import CHECK, TUNED  # noqa: E402
 
 from catstream.applications.evaluation.datasets import read_attributes  # noqa: E402
 
 SCRIPTS = {path.relative_to(ROOT).as_posix() for path in BENCHMARKS.rglob("*.py") if "__main__" in path.read_text()}
 SCRIPTS -= {"benchmarks/page.py"}  # it writes the pages
-FOUND = sections.records()
+FOUND = page.records()
 EVERY_RECORD = pytest.mark.parametrize("record", FOUND.values(), ids=FOUND.keys())
 
 
-def measured_by(record: sections.Record) -> str:
+def measured_by(record: page.Record) -> str:
     """The benchmark, or the verb, that wrote a record."""
     program, name = record["command"].split()[:2]
     return name if program == "python" else f"{program} {name}"
@@ -34,9 +33,7 @@ def measured_by(record: sections.Record) -> str:
 @pytest.mark.parametrize("one", page.PAGES, ids=lambda one: one.path.name)
 def test_a_page_is_the_one_that_the_records_give(one):
     shown = one.path.read_text(encoding="utf-8")
-    assert shown == sections.written(one, FOUND) == sections.written(one, sections.records()), (
-        "it is old: run `make results`"
-    )
+    assert shown == page.written(one, FOUND) == page.written(one, page.records()), "it is old: run `make results`"
     assert shown.count("\n") <= 200
 
 
@@ -73,7 +70,7 @@ def test_the_tuning_set_is_reported_separately():
     names = {row["name"] for row in FOUND["accuracy"]["sequences"]}
     assert (len(TUNED), len(CHECK), len(TUNED & CHECK)) == (20, 15, 3)
     assert names >= TUNED | CHECK
-    assert "The defaults were chosen on the first 20" in sections.written(page.PAGES[0], FOUND)
+    assert "The defaults were chosen on the first 20" in page.written(page.PAGES[0], FOUND)
 
 
 def test_every_sequence_of_the_benchmarks_has_the_attributes_that_need_looking():

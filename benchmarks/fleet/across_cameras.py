@@ -15,7 +15,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import NamedTuple
 
 import cv2
@@ -23,21 +23,18 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
-from groups import CHECK
 from learning import each, features, hits, learning_command, model_of, tracked
-from sequences import rendered, scratch, sequences
-from table import Table, publish
+from sequences import CHECK, painted, rendered, scratch, sequences
+from table import Table, mean_and_error, publish
 
 from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.run.learned import Learned, merge
 from catstream.settings import Settings
-from catstream.video.rendered import cut_out_dahlia, load_photograph
 from catstream.video.writer import VideoWriter
 
 _CAMERAS = 4
 _LONG = 500  # frames of a sequence that is cut
 _SIZE = (320, 240)
-_IDENTITY = np.eye(2, 3)
 _FIGURES = ("recall", "wrong", "stranger")
 
 
@@ -93,7 +90,7 @@ def cut(found: list[Sequence], learning: int) -> Iterator[Scene]:
             yield Scene(sequence.name, [Camera(sequence, start) for start in starts], Camera(other, 0))
 
 
-def painted(found: list[Sequence], scenes: int, frames: int) -> Iterator[Scene]:
+def before_backgrounds(found: list[Sequence], scenes: int, frames: int) -> Iterator[Scene]:
     """Render an object before backgrounds from sequences, at cameras in different lights."""
     rng = np.random.default_rng(0)
     for scene in range(scenes):
@@ -111,19 +108,15 @@ def painted(found: list[Sequence], scenes: int, frames: int) -> Iterator[Scene]:
 def _paint(folder: Path, background: np.ndarray, frames: int, rng: np.random.Generator, *, empty: bool) -> None:
     """Write the video of a camera and its ground truth."""
     folder.mkdir()
-    flower = cut_out_dahlia(load_photograph("flower"))
     light, size, phase = rng.uniform(0.6, 1.3), rng.uniform(50, 90), rng.uniform(0, 2 * np.pi)
     lines = []
     with VideoWriter(folder / "camera.mp4", 25.0, _SIZE) as video:
         for frame in range(frames):
-            image, turn = background.copy(), phase + 0.08 * frame
-            place = np.array([160 + 80 * np.sin(turn), 120 + 50 * np.sin(2 * turn), size, np.degrees(0.3 * turn)])
-            matrix = flower.turned(place, _IDENTITY)
-            if not empty:
-                flower.paint(image, matrix, np.ones(background.shape[:2], np.float32))
-            noisy = image * light + rng.normal(scale=3.0, size=image.shape)
-            video.write(noisy.clip(0, 255).astype(np.uint8))
-            lines.append(",".join(f"{side:.3f}" for side in flower.box(matrix)))
+            turn = phase + 0.08 * frame
+            place = (160 + 80 * np.sin(turn), 120 + 50 * np.sin(2 * turn), size, np.degrees(0.3 * turn))
+            image, box = painted(background, place, light, rng, empty=empty)
+            video.write(image)
+            lines.append(",".join(f"{side:.3f}" for side in box))
     (folder / "groundtruth_rect.txt").write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
@@ -131,11 +124,11 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     learning, frames = (12, 4) if options.quick else (options.learning, options.frames)
     if options.quick:
         backgrounds = [rendered(4 * learning + frames, _SIZE)]
-        scenes = [*painted(backgrounds, 1, learning)]
+        scenes = [*before_backgrounds(backgrounds, 1, learning)]
     else:
         found = [sequence for sequence in sequences(options) if (sequence.name in CHECK) == options.check]
         long = [sequence for sequence in found if len(sequence) >= _LONG]
-        scenes = [*cut(long, learning), *painted(found, options.scenes, max(learning, frames))]
+        scenes = [*cut(long, learning), *before_backgrounds(found, options.scenes, max(learning, frames))]
     rows = [*each(options, measured, [(scene, learning, frames) for scene in scenes])]
     names = list(rows[0][1])
     columns = ("scene", *(f"{name}: {figure}" for name in names for figure in _FIGURES))
@@ -159,10 +152,8 @@ def _summary(names: list[str], rows: list[Row]) -> Iterator[tuple]:
         yield f"{merged} less {name}", *_means(differences)
 
 
-def _means(rows: list[tuple[float, ...]]) -> Iterator[float]:
-    for column in zip(*rows, strict=True):
-        yield fmean(column)
-        yield stdev(column) / len(column) ** 0.5 if len(column) > 1 else 0.0
+def _means(rows: list[tuple[float, ...]]) -> list[float]:
+    return [cell or 0.0 for column in zip(*rows, strict=True) for cell in mean_and_error(column)]
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ them, `--films 0 --rate 2` leaves one of two cores free.
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import signal
+import socket
+import subprocess
 import sys
 import tempfile
 from collections import defaultdict
@@ -28,14 +29,13 @@ import psutil
 
 sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchmarks
 
-from arena import Link
 from chaos import fingerprint, quantiles, undisturbed
-from table import Table, command, publish
+from table import Table, benchmark, command
 
 from catstream.box import Box
 from catstream.client.registry import REGISTRY_PORT, Registry
 from catstream.compression.forest import Forest
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, ServiceError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
@@ -92,7 +92,7 @@ class Trial:
         self.films = 0  # that have ended with the right trees
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cs-")))
         os.environ |= VARIABLES | {"XDG_STATE_HOME": str(folder)}
-        self.link = self._open_store(stack)
+        self.server = self._open_store(stack)
         rendered.write(folder, FILM, (320, 240))
         self.film = folder / "demo.mp4"
         self.box = Box(*np.loadtxt(folder / "groundtruth_rect.txt", delimiter=",", max_rows=1).tolist())
@@ -140,22 +140,25 @@ class Trial:
             with suppress(psutil.Error):
                 process.send_signal(number)
 
-    def _open_store(self, stack: ExitStack) -> Link:
-        """Start an S3 server, and a link to it."""
+    def _open_store(self, stack: ExitStack) -> subprocess.Popen[bytes]:
+        """Start an S3 server."""
         import boto3
-        from moto.server import ThreadedMotoServer
+        from botocore.exceptions import EndpointConnectionError
 
-        logging.getLogger("werkzeug").setLevel(logging.ERROR)  # it logs every request
-        server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-        server.start()
-        stack.callback(server.stop)
-        host, port = server.get_host_and_port()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        command = [sys.executable, "-m", "moto.server", "-p", str(port)]
+        server = stack.enter_context(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        stack.callback(server.kill)
         os.environ |= {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
-        boto3.client("s3", endpoint_url=f"http://{host}:{port}").create_bucket(Bucket="states")
-        link = Link(("127.0.0.1", 0), (host, port))
-        stack.callback(link.close)
-        os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{link.port}"
-        return link
+        os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{port}"
+        store, deadline = boto3.client("s3"), monotonic() + PATIENCE
+        while monotonic() < deadline:
+            with suppress(EndpointConnectionError):  # it is starting
+                store.create_bucket(Bucket="states")
+                return server
+        raise ServiceError(f"the S3 server did not start in {PATIENCE:g} s")
 
     def _streams(self) -> Iterator[StreamSpec]:
         for name, source in self.live.items():
@@ -327,9 +330,9 @@ def kill_controller(trial: Trial, status: FleetStatus) -> None:
 
 
 def unreachable(trial: Trial, status: FleetStatus) -> None:
-    trial.link.cut()
+    trial.server.send_signal(signal.SIGSTOP)
     sleep(UNREACHABLE)
-    trial.link.mend()
+    trial.server.send_signal(signal.SIGCONT)
     _stored(trial, "store not reached for a minute", status, _on(status, "node-1", *NODES))
 
 
@@ -371,37 +374,29 @@ FAULTS: dict[Callable[[Trial, FleetStatus], None], int] = {
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    cycles = options.cycles
-    faults = (
-        [kill]
-        if options.quick
-        else [fault for fault, often in FAULTS.items() for _ in range(max(1, round(often * cycles / 100)))]
-    )
+    shares = {kill: 0} if options.quick else FAULTS
+    faults = [fault for fault, often in shares.items() for _ in range(max(1, round(often * options.cycles / 100)))]
     live, films = (1, 1) if options.quick else (STREAMS - options.films, options.films)
     with ExitStack() as stack:
         trial = Trial(stack, options.seed, live, films, options.rate)
         order = trial.random.permutation(len(faults))
         begin = monotonic()
-        done = 0
-        with suppress(KeyboardInterrupt):  # the tables then show the faults until here
-            for number, place in enumerate(order, start=1):
-                trial.settle()
-                sleep(float(trial.random.uniform(*CALM)))
-                status = trial.status()
-                if status is None:
-                    trial.wrong.append("the registry did not answer")
-                    continue
-                faults[place](trial, status)
-                done = number
-                print(f"{done} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
-                print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
+        for done, place in enumerate(order, start=1):
+            trial.settle()
+            sleep(float(trial.random.uniform(*CALM)))
+            if (status := trial.status()) is None:
+                trial.wrong.append("the registry did not answer")
+                continue
+            faults[place](trial, status)
+            print(f"{done} of {len(faults)}: {faults[place].__name__}, {len(trial.wrong)} wrong", file=sys.stderr)
+            print(*trial.wrong[-3:], sep="\n", end="", file=sys.stderr, flush=True)
         trial.until(
             lambda status: all(status.streams[name].state == "ended" for name in trial.lockstep), "the end of all films"
         )
         trial.settle()
         minutes = (monotonic() - begin) / 60
     yield Table(
-        f"Recovery of {done} faults, 3 nodes, {len(trial.live) + len(trial.lockstep)} streams",
+        f"Recovery of {len(faults)} faults, 3 nodes, {len(trial.live) + len(trial.lockstep)} streams",
         ("fault", "times", "p50 s", "p99 s", "slowest s"),
         list(quantiles(trial.recovery)),
         "killed, frozen: from the fault to the next track of each stream that it hit; controller: until the registry "
@@ -415,25 +410,17 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield Table(
         "Learned rows",
         ("films", "trees the same", "rows lost", "rows doubled", "wrong", "minutes"),
-        [
-            (
-                "in lockstep",
-                trial.films,
-                0 if not trial.wrong else None,
-                0 if not trial.wrong else None,
-                len(trial.wrong),
-                minutes,
-            )
-        ],
+        [("in lockstep", trial.films, *([None if trial.wrong else 0] * 2), len(trial.wrong), minutes)],
         "; ".join(trial.wrong),
     )
 
 
 if __name__ == "__main__":
-    parser = command(__doc__)
-    parser.add_argument("--cycles", type=int, default=100, help="number of faults (default: %(default)s)")
-    parser.add_argument("--films", type=int, choices=range(STREAMS + 1), default=3, help="default: %(default)s")
-    parser.add_argument("--rate", type=float, default=5.0, help="frames/s of the live streams (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the schedule (default: %(default)s)")
-    options = parser.parse_args()
-    publish(figures(options), options)
+    benchmark(
+        figures,
+        command(__doc__),
+        cycles=(100, "number of faults"),
+        films=(3, f"number of films among the {STREAMS} streams"),
+        rate=(5.0, "frames/s of the live streams"),
+        seed=(0, "seed of the schedule"),
+    )

@@ -12,7 +12,6 @@ backgrounds, in other lights. The paper shows pictures of this, and no figures.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -20,15 +19,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import islice
+from itertools import islice, repeat
 from pathlib import Path
 from time import perf_counter
 
 import cv2
 import numpy as np
 import shared  # noqa: F401
-from groups import CHECK
-from sequences import sequences
+from sequences import CHECK, painted, sequences
 from table import Table, benchmark, command
 
 from catstream.applications.evaluation.datasets import Sequence
@@ -39,7 +37,6 @@ from catstream.features.score_map import non_maximum_suppression
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.tracker import Tracker
-from catstream.video import rendered
 from catstream.video.source import open_source
 
 Found = list[tuple[float, Box]]
@@ -68,8 +65,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     milliseconds: dict[str, list[float]] = {method: [] for method in METHODS}
     with ProcessPoolExecutor(options.jobs, mp_context=SPAWN) as pool:
         learned = found[:: options.step]
-        tasks = [partial(searched, sequence.name, options) for sequence in learned]
-        for sequence, (result, spent) in zip(learned, (map if options.quick else pool.map)(_call, tasks), strict=True):
+        found_again = (map if options.quick else pool.map)(searched, learned, repeat(options))
+        for sequence, (result, spent) in zip(learned, found_again, strict=True):
             answers[sequence.name] = result
             for method in METHODS:
                 milliseconds[method].append(spent[method])
@@ -81,27 +78,16 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield _each(answers)
 
 
-def searched(name: str, options: argparse.Namespace) -> tuple[dict[str, list[Answer]], dict[str, float]]:
+def searched(sequence: Sequence, options: argparse.Namespace) -> tuple[dict[str, list[Answer]], dict[str, float]]:
     """The answers of each method for the object of a sequence, and its milliseconds a frame."""
-    found = sequences(options)
-    sequence = next(each for each in found if each.name == name)
-    store = options.output and options.output / f"{sequence.name}.json"
-    if store and store.exists():
-        result, spent = json.loads(store.read_text())
-        return {name: [Answer(*each) for each in answers] for name, answers in result.items()}, spent
     with one_thread(opencv=True):
         finders = finders_of(sequence)
         own = _spread(sequence, len(sequence) // 3, options.own)
         tasks = [(image, box) for image, box in _frames(sequence, own)]
-        for other in found:
-            if other is not sequence and not _is_same_video(sequence, other):
+        for other in sequences(options):
+            if not _is_same_video(sequence, other):
                 tasks += [(image, None) for image, _ in _frames(other, _spread(other, 0, options.others))]
-        result, spent = _answers(finders, tasks)
-    if store:
-        store.parent.mkdir(parents=True, exist_ok=True)
-        plain = {name: [(each.present, each.sightings) for each in answers] for name, answers in result.items()}
-        store.write_text(json.dumps([plain, spent]))
-    return result, spent
+        return _answers(finders, tasks)
 
 
 def finders_of(sequence: Sequence) -> dict[str, Finder]:
@@ -269,20 +255,14 @@ def _each(answers: dict[str, dict[str, list[Answer]]]) -> Table:
 def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
     """Learned before a plain background, searched before others and in other lights."""
     rng = np.random.default_rng(0)
-    image, box = next(rendered.render(1))
-    assert box is not None
-    flower = cut(image, box)
-    plain = [np.full((240, 320, 3), 190, np.uint8) for _ in range(learning)]
-    shown = [
-        _painted(each, flower, rng, 20, (0.9, 1.1), (0.95, 1.05), centre)
-        for each, centre in zip(plain, _path(learning), strict=True)
-    ]
+    plain = np.full((240, 320, 3), 190, np.uint8)
+    shown = [_shown(plain, rng, 20, (0.9, 1.1), (0.95, 1.05), centre) for centre in _path(learning)]
     backgrounds = [cv2.resize(next(iter(sequence.frames(len(sequence) // 2))), (320, 240)) for sequence in found]
     tasks: list[tuple[np.ndarray, Box | None]] = []
     for number in range(searched):
         background = backgrounds[number % len(backgrounds)]
         tasks.append((background, None))
-        tasks.append(_painted(background, flower, rng, 40, (0.6, 1.6), (0.5, 1.4)))
+        tasks.append(_shown(background, rng, 40, (0.6, 1.6), (0.5, 1.4)))
     learned = learn([each for each, _ in shown], shown[0][1])
     first = learn([shown[0][0]], shown[0][1])
     finders = dict(zip(METHODS, [ours(learned), ours(first), *others(*shown[0])], strict=True))
@@ -301,39 +281,19 @@ def _path(frames: int) -> list[tuple[float, float]]:
     return [(160 + 60 * np.sin(turn), 120 + 40 * np.sin(2 * turn)) for turn in turns.tolist()]
 
 
-def _painted(
+def _shown(
     background: np.ndarray,
-    flower: np.ndarray,
     rng: np.random.Generator,
     degrees: float,
     sizes: tuple[float, float],
     lights: tuple[float, float],
     centre: tuple[float, float] | None = None,
 ) -> tuple[np.ndarray, Box]:
-    """A background with the round object, turned and scaled, and all of it in another light."""
+    """A background with the object, turned and scaled, and all of it in another light."""
     height, width = background.shape[:2]
     side = 64 * float(np.exp(rng.uniform(*np.log(sizes))))
     x, y = centre or (rng.uniform(side / 2, width - side / 2), rng.uniform(side / 2, height - side / 2))
-    rows, columns = flower.shape[:2]
-    matrix = cv2.getRotationMatrix2D(
-        (columns / 2, rows / 2), float(rng.uniform(-degrees, degrees)), side / max(rows, columns)
-    )
-    matrix[:, 2] += np.array([x - columns / 2, y - rows / 2])
-    disc = cv2.ellipse(
-        np.zeros((rows, columns), np.float32),
-        (columns // 2, rows // 2),
-        (int(columns * 0.47), int(rows * 0.47)),
-        0,
-        0,
-        360,
-        1.0,
-        -1,
-    )
-    share = cv2.warpAffine(cv2.GaussianBlur(disc, (0, 0), 1.0), matrix, (width, height))[..., None]
-    placed = cv2.warpAffine(flower, matrix, (width, height))
-    image = (share * placed + (1 - share) * background) * rng.uniform(*lights)
-    noisy = image + rng.normal(scale=3.0, size=image.shape)
-    return noisy.clip(0, 255).astype(np.uint8), Box(x - side / 2, y - side / 2, side, side)
+    return painted(background, (x, y, side, float(rng.uniform(-degrees, degrees))), rng.uniform(*lights), rng)
 
 
 def _apart(found: Found) -> Found:
@@ -369,12 +329,6 @@ def _is_same_video(one: Sequence, other: Sequence) -> bool:
     return first.shape == second.shape and float(cv2.absdiff(first, second).mean()) < _SAME_VIDEO
 
 
-def _call(
-    task: Callable[[], tuple[dict[str, list[Answer]], dict[str, float]]],
-) -> tuple[dict[str, list[Answer]], dict[str, float]]:
-    return task()
-
-
 if __name__ == "__main__":
     benchmark(
         figures,
@@ -383,5 +337,4 @@ if __name__ == "__main__":
         others=(2, "frames of each other sequence"),
         step=(1, "learn only every N-th sequence"),
         jobs=(os.cpu_count() or 1, "number of processes"),
-        output=(Path, "folder for the answers; objects that are complete are not repeated"),
     )
