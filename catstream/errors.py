@@ -99,10 +99,7 @@ EXTRAS = {
 def require_extra(extra: str) -> None:
     """Check that the modules of an extra are installed, without importing them.
 
-    Raises
-    ------
-    MissingExtraError
-        If one of them is not installed; the message has the command that installs the extra.
+    Otherwise raise MissingExtraError, whose message has the command that installs the extra.
     """
     feature, modules = EXTRAS[extra]
     missing = [module for module in modules if find_spec(module) is None]

@@ -152,12 +152,7 @@ class SavedModels(Publisher[SavedModel]):
         self._sent: dict[str, tuple[int, float]] = {}  # version and time of the last file of each object
 
     def turn(self, compressors: Mapping[str, Compressor], after_each: Callable[[], object]) -> None:
-        """Send the files that are due; call it in every turn, as subscribers may join.
-
-        Parameters
-        ----------
-        after_each : is called after each file
-        """
+        """Send the files that are due, with `after_each` after each; call it in every turn, as subscribers may join."""
         self.serve_late_joiners()
         if not self.has_subscribers:
             if self._sent:  # the next subscriber gets new files only

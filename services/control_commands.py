@@ -22,17 +22,9 @@ Changed = tuple[DesiredState, Answer]
 def carried_out(
     command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None = None
 ) -> Changed:
-    """The desired state after a command that needs no frame, and the answer.
+    """The desired state after a command that needs no frame, and the answer; `model` begins an object for `search`.
 
-    Parameters
-    ----------
-    detectors : the objects that are tracked now; they are not changed
-    model : the object that a saved model begins, for the command `search`
-
-    Raises
-    ------
-    ObjectError, SettingsError
-        If the command cannot be carried out.
+    ObjectError or SettingsError if it cannot be carried out. The `detectors` are not changed.
     """
     return _VERBS[command.verb](command, desired, detectors, model)
 

@@ -147,15 +147,10 @@ def awaited(
 ) -> Literal["", "features", "models"]:
     """The channel on which a detector waits before its next frame; empty if it need not wait.
 
-    Parameters
-    ----------
-    due : seq of the newest features that the models must include by now; 0 or less if there are none yet
-    taken : seq of the newest features that the compressor has processed
-    samples : version of each object's newest sample of the features up to `due`
-    newest : version of the newest model that has arrived, of each object that had begun by `due`
+    `due` is the seq of the newest features that the models must include by now, and `taken` that of the newest ones
+    that the compressor has processed. `samples` are the versions of each object's newest sample of the features up to
+    `due`, and `newest` those of the newest models that have arrived, of each object that had begun by then.
 
-    Examples
-    --------
     >>> awaited(due=7, taken=6, samples={}, newest={"": 0})
     'features'
     >>> awaited(due=7, taken=8, samples={"": 3}, newest={"": 2})
@@ -169,12 +164,9 @@ def awaited(
 
 
 def checkpoint_is_due(since: float, took: float, interval: float) -> bool:
-    """Whether the interval between checkpoints is over; it grows with the trees: at most a tenth of the time is spent.
+    """Whether the interval is over `since` seconds after the last attempt to write a checkpoint, which `took` seconds.
 
-    Parameters
-    ----------
-    since : seconds since the last attempt to write a checkpoint has ended
-    took : seconds that it took
+    It grows with the trees: at most a tenth of the time is spent.
 
     >>> checkpoint_is_due(since=1.5, took=0.02, interval=1), checkpoint_is_due(since=1.5, took=0.2, interval=1)
     (True, False)
@@ -185,12 +177,8 @@ def checkpoint_is_due(since: float, took: float, interval: float) -> bool:
 def stored(position: Position, seq: int, *, saved: bool, urgent: bool) -> Position:
     """The position after an attempt to write a checkpoint of message `seq`.
 
-    If the disk is full, an urgent checkpoint is acknowledged although it is only in memory: training continues.
-
-    Parameters
-    ----------
-    saved : whether the checkpoint was written
-    urgent : whether the sender waits for it
+    If the disk is full, one that is urgent, as the sender waits for it, is acknowledged although it is only in memory:
+    training continues.
 
     >>> stored(Position(8), 12, saved=False, urgent=True).unsaved
     4

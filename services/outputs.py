@@ -32,14 +32,7 @@ _log = logging.getLogger(__name__)
 
 
 class Outputs:
-    """The sockets that a detector sends on; a context manager.
-
-    Attributes
-    ----------
-    features : sender of the features to the compressor
-    results : sender of the tracks to the owner of the run; None if it has no owner
-    previews : pictures of frames for subscribers
-    """
+    """The sockets that a detector sends on, with `results` only if the run has an owner; a context manager."""
 
     def __init__(self, process: Process) -> None:
         window, endpoint = process.settings.run.unstored_frames, process.endpoint
@@ -79,14 +72,7 @@ class Previews(Publisher[Preview]):
         self._shown = 0.0
 
     def show(self, frame: int, image: np.ndarray, boxes: dict[str, Box]) -> None:
-        """Send a frame, unless a newer one arrives before it is due.
-
-        Parameters
-        ----------
-        frame : number of the frame
-        image : uint8 (h, w, 3) BGR, not to be changed afterwards
-        boxes : the objects in the frame, by name
-        """
+        """Send a frame, uint8 (h, w, 3) BGR that stays unchanged, unless a newer one arrives before it is due."""
         self._waiting = frame, image, boxes
         self.turn()
 
@@ -103,11 +89,7 @@ class Previews(Publisher[Preview]):
 class ModelFiles:
     """The saved models that objects begin with: a restarted detector begins the objects again.
 
-    Each has a name, which is a digest of its content. They are in memory and in a folder.
-
-    Parameters
-    ----------
-    folder : folder of the files; None if they are kept in memory only
+    Each has a name, which is a digest of its content. They are in memory, and in a folder if there is one.
     """
 
     def __init__(self, folder: Path | None) -> None:

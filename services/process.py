@@ -42,18 +42,10 @@ _log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """Four numbers in memory that a process shares with its supervisor.
+    """Four numbers in memory that a process shares with its supervisor; its descriptor is inherited.
 
-    No messages are involved, which could be late or lost: a supervisor that was suspended reads the newest count at
-    once, and the count stops with the loop of the process, even if other threads continue.
-
-    Parameters
-    ----------
-    handle : inherited file descriptor of the memory; None to make a new one
-
-    Attributes
-    ----------
-    limit : seconds that a turn of the loop may take
+    No message can be late or lost: a supervisor that was suspended reads the newest count at once, and the count stops
+    with the loop of the process, even if other threads continue. A turn may take `limit` seconds.
     """
 
     def __init__(self, handle: int | None = None) -> None:
@@ -112,14 +104,10 @@ class Watchdog:
 class Process:
     """The state that every process of the pipeline has.
 
-    Attributes
-    ----------
-    job : the job of the run
-    settings, endpoint : settings and endpoint of the job
-    trouble, source : description of a current problem, and the source; both are published with the health
-    source_failed : whether the stream ended because the source failed
-    has_ended : whether the process has sent or received the end of the stream
-    watchdog : counts the turns of the loop
+    trouble, source  description of a current problem, and the source; both are published with the health
+    source_failed    whether the stream ended because the source failed
+    has_ended        whether the process has sent or received the end of the stream
+    watchdog         counts the turns of the loop
     """
 
     def __init__(self, name: str, job: Job, watchdog: int | None = None) -> None:
@@ -152,12 +140,7 @@ class Process:
         objects: Callable[[], dict[str, dict[str, float]]],
         now: bool = False,
     ) -> None:
-        """Reset the watchdog, and publish the health once a second or `now`; call it in each turn of a loop.
-
-        Parameters
-        ----------
-        counters, objects : return the counters of the process, and those of each object
-        """
+        """Count a turn of the loop, and publish the health once a second or `now`; call it in each turn."""
         self.watchdog.beat()
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
@@ -179,15 +162,8 @@ def run(
 ) -> int:
     """Run the detector, the compressor or the trainer; return its exit code.
 
-    The code is 0 at the end of the stream, or after SIGTERM if the process was started by hand; otherwise one of the
-    constants above.
-
-    Parameters
-    ----------
-    job : the job, or the file that contains it
-    parent : id of the process with which this one ends; None for a process that was started by hand
-    watchdog : descriptor of the memory of its watchdog; None to make a new one
-    restarted : whether it continues the work of a process that died
+    The code is 0 at the end of the stream, or after SIGTERM if the process was started by hand, without a parent;
+    otherwise one of the constants above. `restarted` means that it continues the work of a process that died.
     """
     if parent is not None:
         die_with(parent)

@@ -9,8 +9,9 @@ server; all pipelines of the program share it, and it ends with the program, how
        │ <── exit code ──────────── │ <─────────────────────── exit ─ │
 
 A request is a packet of JSON on a Unix socket, with the descriptors of the log, of the watchdog, and of a socket for
-the two answers. The server has one thread: a fork copies only the thread that calls it. The kernel kills its processes
-if the server ends; they are then restarted like any that died, by a new server.
+the two answers: the process id; then the exit code, or minus the number of the signal. The server has one thread: a
+fork copies only the thread that calls it. The kernel kills its processes if the server ends; they are then restarted
+like any that died, by a new server.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ import os
 import select
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -38,9 +38,8 @@ from catstream.numerics.threads import limit_process
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
 
-_ANSWER = struct.Struct("=i")  # the process id; then the exit code, or minus the number of the signal
 _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
-_LONGEST_REQUEST = 1 << 16  # bytes
+_LONGEST = 1 << 16  # bytes of a request
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
 _MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
@@ -80,7 +79,7 @@ class StartedProcess:
                 return False
             self._answers.settimeout(seconds)
             try:
-                data = self._answers.recv(_ANSWER.size)
+                data = self._answers.recv(_LONGEST)
             except (BlockingIOError, TimeoutError):
                 return False
             except ConnectionError:
@@ -88,9 +87,9 @@ class StartedProcess:
             if not data:  # the server has ended, and the kernel kills the process
                 self._code = -signal.SIGKILL
             elif self._pid:
-                self._code = int(_ANSWER.unpack(data)[0])
+                self._code = int(data)
             else:
-                self._pid = int(_ANSWER.unpack(data)[0])
+                self._pid = int(data)
             return True
 
     def close(self) -> None:
@@ -102,12 +101,7 @@ class StartedProcess:
 
 
 class StartServer:
-    """A start server, as its program sees it; ServiceError if the program is not one that Python runs.
-
-    Attributes
-    ----------
-    pid : its process id
-    """
+    """A start server, as its program sees it; ServiceError if the program is not one that Python runs."""
 
     def __init__(self) -> None:
         if getattr(sys, "frozen", False) or not sys.executable:
@@ -134,15 +128,7 @@ class StartServer:
         return self.program == os.getpid() and self._process.poll() is None
 
     def start(self, name: str, job: Path, log: int, watchdog: int, *, restarted: bool) -> StartedProcess:
-        """Request a process, and return without waiting for its start.
-
-        Parameters
-        ----------
-        name : one of `NAMES`
-        job : file of its job
-        log, watchdog : descriptors of its standard error, and of the memory of its watchdog
-        restarted : whether it continues the work of a process that died
-        """
+        """Request one of the processes `NAMES`, with descriptors of its log and its watchdog; do not wait for it."""
         try:
             folder = str(Path.cwd())
         except FileNotFoundError:  # it was removed
@@ -193,13 +179,7 @@ os.register_at_fork(after_in_child=_unlock)
 
 
 def main(descriptor: int, program: int) -> None:
-    """Start processes until the program ends; return in none of them.
-
-    Parameters
-    ----------
-    descriptor : of the socket of the requests
-    program : process id of the program
-    """
+    """Start processes until the program ends, as the requests on a socket say; return in none of them."""
     limit_process()  # before anything imports numpy
     gc.disable()  # nothing of what is imported is garbage
     requests = socket.socket(fileno=descriptor)
@@ -217,14 +197,11 @@ def main(descriptor: int, program: int) -> None:
             import_module(f"catstream.services.{to_import.pop(0)}_process")
         elif has_ended in ready:
             os.read(has_ended, 4096)
-            while running:
-                pid, status = os.waitpid(-1, os.WNOHANG)
-                if not pid:
-                    break
-                with running.pop(pid) as answers:
-                    _answer(answers, os.waitstatus_to_exitcode(status))
+            while running and (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                with running.pop(ended[0]) as answers, suppress(OSError):  # nobody may wait for it
+                    answers.send(b"%d" % os.waitstatus_to_exitcode(ended[1]))
         elif requests.fileno() in ready:
-            data, descriptors, _, _ = socket.recv_fds(requests, _LONGEST_REQUEST, 3)
+            data, descriptors, _, _ = socket.recv_fds(requests, _LONGEST, 3)
             if not data:
                 return
             log, watchdog, answer_to = descriptors
@@ -237,15 +214,10 @@ def main(descriptor: int, program: int) -> None:
             os.close(log)
             os.close(watchdog)
             running[pid] = socket.socket(fileno=answer_to)
-            _answer(running[pid], pid)
+            with suppress(OSError):
+                running[pid].send(b"%d" % pid)
         else:
             return
-
-
-def _answer(answers: socket.socket, number: int) -> None:
-    """Send an answer, if somebody waits for it."""
-    with suppress(OSError):
-        answers.send(_ANSWER.pack(number))
 
 
 def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
@@ -257,10 +229,9 @@ def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.dup2(log, sys.stderr.fileno())
-        for descriptor in [int(each.name) for each in Path("/proc/self/fd").iterdir()]:
-            if descriptor > sys.stderr.fileno() and descriptor != watchdog:
-                with suppress(OSError):  # the one of the listing
-                    os.close(descriptor)
+        for descriptor in {int(each.name) for each in Path("/proc/self/fd").iterdir()} - {0, 1, 2, watchdog}:
+            with suppress(OSError):  # the one of the listing
+                os.close(descriptor)
         with suppress(OSError):  # it was removed
             os.chdir(request["folder"])
         gc.enable()

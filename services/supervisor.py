@@ -36,7 +36,6 @@ RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and
 APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is started again
 SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end before they are killed
 EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stream was received
-
 ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
 
 _LAST_LINE = 2000  # bytes at the end of a log in which the last line is searched for
@@ -78,18 +77,11 @@ class ProcessLog:
 
 
 class Child:
-    """One process of a run.
+    """One process of a run, the file of whose job is `job`.
 
-    Parameters
-    ----------
-    job : file that contains the job
-    folder : folder for the log
-
-    Attributes
-    ----------
-    process : None if it is to be started when it is `due`
-    silent : seconds since its loop has last turned; or, once it has ended, since then
-    restarts : moments of its restarts
+    process   None if it is to be started when it is `due`
+    silent    seconds since its loop has last turned; or, once it has ended, since then
+    restarts  moments of its restarts
     """
 
     def __init__(self, name: str, job: Path, folder: Path) -> None:
@@ -144,20 +136,13 @@ class Child:
 class Supervisor:
     """The processes of one run, and the thread that receives its tracks, its health and its end.
 
-    A process that died or hangs is restarted: at once, then after a pause that doubles each time, and at most five
-    times a minute.
+    A process that died or hangs is restarted: at once, then after a pause that doubles each time.
 
-    Parameters
-    ----------
-    job : the job of the run, with its endpoint; without a state folder, the state is stored in `folder`
-    folder : folder for the file of the job, and for the logs
-    after : number of the last frame that the program has, which a run that is resumed follows
-    live : whether the source is live; its detector then logs what the user has to know
-
-    Attributes
-    ----------
-    end : the last message of the run; None before it was received
-    health : the newest health report of each process, by its name
+    folder  of the file of the job, of the logs, and of the state if the job has no folder for it
+    after   number of the last frame that the program has, which a run that is resumed follows
+    live    whether the source is live; its detector then logs what the user has to know
+    end     the last message of the run; None before it was received
+    health  the newest health report of each process, by its name
     """
 
     def __init__(self, job: Job, folder: Path, after: int = 0, *, live: bool = False) -> None:
@@ -201,12 +186,8 @@ class Supervisor:
     def next_frame(self, seconds: float = math.inf) -> dict[str, Track] | None:
         """Wait for the next frame: the track of each object by name; none if the time is over, None after the last one.
 
-        Raises
-        ------
-        ServiceError
-            If a process fails repeatedly, or another thread has ended the run.
-        VideoError
-            After the last frame, if the source failed.
+        ServiceError if a process fails repeatedly, or another thread has ended the run; VideoError after the last frame
+        if the source failed.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._frames or self._over, None if seconds == math.inf else seconds)

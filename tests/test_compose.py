@@ -93,13 +93,10 @@ def test_each_process_accepts_its_command_line(name):
     assert parsed(name)[0] == name
 
 
-def test_all_meet_on_the_loopback_of_one_network_that_nobody_else_is_in():
+def test_all_meet_on_the_loopback_of_their_own_network_and_the_page_alone_is_published_on_this_host_alone():
     (endpoint,) = {settings(name).run.endpoint for name in NAMES}
     assert Endpoint.parse(endpoint).host == "127.0.0.1"
     assert {SERVICES[name]["network_mode"] for name in (*NAMES, "view")} == {"service:network"}
-
-
-def test_the_page_alone_is_published_on_this_host_alone():
     assert {name for name, service in SERVICES.items() if "ports" in service} == {"network"}
     assert list(published(SERVICES["network"])) == [("127.0.0.1", 8000)]
 
@@ -109,6 +106,8 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     service = SERVICES["view"]
     assert (service["entrypoint"], service["profiles"]) == (["catstream"], ["view"])
     assert set(service["environment"]) == {"VIEW_TOKEN"}
+    assert filled_in(service["environment"]["VIEW_TOKEN"]) == "", "without one of the user the page makes one"
+    assert "--token" not in service["command"]
     options = group.make_context("catstream", list(service["command"]))
     verb, command, rest = group.resolve_command(options, service["command"])
     page = command.make_context(verb, rest, parent=options).params
@@ -117,12 +116,6 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
     with server.in_background():
         subprocess.run([sys.executable, "-P", "-c", script], check=True)
-
-
-def test_without_a_token_of_the_user_the_page_makes_one():
-    """An empty variable counts as none: tests/web/test_view.py."""
-    assert filled_in(SERVICES["view"]["environment"]["VIEW_TOKEN"]) == ""
-    assert "--token" not in SERVICES["view"]["command"]
 
 
 def test_a_process_that_dies_resumes_from_its_state():
@@ -138,10 +131,6 @@ def test_the_video_is_mounted_read_only_and_named_by_the_user():
     assert [filled_in(volume, VIDEOS="/films") for volume in SERVICES["detector"]["volumes"]] == ["/films:/videos:ro"]
     for name in ("SOURCE", "BOX"):
         assert f"${{{name}:?" in " ".join(SERVICES["detector"]["command"])
-
-
-def test_the_address_of_a_camera_is_used_unchanged():
-    assert filled_in(SERVICES["detector"]["command"][-1], SOURCE="rtsp://10.0.0.7/one") == "rtsp://10.0.0.7/one"
 
 
 @PROCESSES

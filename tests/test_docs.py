@@ -266,17 +266,10 @@ def test_every_extra_that_a_page_names_can_be_installed():
     assert set(re.findall(r"catstream\[(\w+)\]", everything())) <= set(extras), "pyproject.toml: add the extra"
 
 
-def test_the_version_is_the_same_everywhere():
+def test_the_version_is_the_same_everywhere_and_every_name_of_the_library_is_in_its_help_and_in_the_reference():
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
-
-
-def test_every_name_of_the_library_is_completed_and_in_its_help_before_its_first_use():
-    assert set(dir(catstream)) >= {*catstream.__all__, "__doc__"}
-
-
-def test_every_name_of_the_library_is_in_the_reference_of_the_api():
-    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    shown = set(re.findall(r"^::: catstream\.(\w+)", page, re.MULTILINE))
+    assert set(dir(catstream)) >= {*catstream.__all__, "__doc__"}, "before their first use"
+    shown = set(re.findall(r"^::: catstream\.(\w+)", page("docs/api.md"), re.MULTILINE))
     assert shown - {"errors"} == set(catstream.__all__) - {"CatstreamError", "__version__"}
 
 

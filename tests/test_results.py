@@ -53,16 +53,12 @@ def test_every_benchmark_has_a_record_and_every_record_its_place_on_a_page():
 
 
 @EVERY_RECORD
-def test_a_record_has_its_provenance(record):
+def test_a_record_has_its_provenance_and_no_folder_of_the_machine(record):
     assert {"version", "commit", "date", "command", "settings", "machine"} <= record.keys()
     assert re.fullmatch(r"[0-9a-f]{10}", record["commit"]), "measured beside changes that were not committed"
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"])
     assert "--quick" not in record["command"], "the figures of --quick mean nothing"
     assert {"processor", "cores"} <= record["machine"].keys()
-
-
-@EVERY_RECORD
-def test_a_record_has_no_folder_of_the_machine(record):
     assert not re.findall(r'"[^"]*(?:^|[ "=])/\w[^"]*"', json.dumps(record)), "a path of the machine"
 
 

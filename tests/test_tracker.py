@@ -2,10 +2,7 @@
 
 import copy
 import math
-import os
 import pickle
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -88,12 +85,9 @@ def test_the_same_frames_give_the_same_boxes_and_init_forgets_all_before(video, 
     assert [tracker.update(frame)[1] for frame in frames[1:]] == found
 
 
-def test_update_before_init_is_rejected(video):
+def test_a_tracker_says_what_it_is_and_that_it_needs_a_box_first(video):
     with pytest.raises(BoxError, match="call init"):
         Tracker().update(video[0][0])
-
-
-def test_a_tracker_says_what_it_is(video):
     assert repr(Tracker()) == "<catstream.Tracker, before init>"
     assert repr(started(video)) == "<catstream.Tracker, at frame 0: the object bootstrapping>"
 
@@ -122,10 +116,6 @@ def test_a_frame_of_another_size_is_rejected(video):
         FrameError, match="this frame is 160x240 pixels, those before it 320x240: resize it, or call init"
     ):
         started(video).update(video[0][1][:, :160])
-
-
-def test_settings_may_be_given_as_a_mapping():
-    assert Tracker({"coreset.size": 32}).settings == Settings(coreset={"size": 32})
 
 
 def test_trackers_in_two_threads_give_the_same_tracks_as_alone(video, boxes_found):
@@ -171,13 +161,3 @@ for frame in frames:
     tracker.update(frame)
     print(tracker.track)
 """
-
-
-def test_another_process_gives_the_same_tracks_with_any_number_of_threads(video, tmp_path):
-    frames, tracker = video[0], started(video)
-    np.save(tmp_path / "frames.npy", frames)
-    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    command = [sys.executable, "-P", "-c", _FOLLOWS, tmp_path / "frames.npy", ",".join(map(str, video[1][0]))]
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
-    tracks = [(tracker.update(frame), tracker.track)[1] for frame in frames[1:]]
-    assert told.splitlines() == [str(track) for track in tracks]

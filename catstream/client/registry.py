@@ -36,13 +36,10 @@ _PREFIX = "fleet://"
 
 
 class Registry(AbstractContextManager["Registry"]):
-    """Asks the controller of a fleet for its streams and nodes.
+    """Asks the controller of a fleet for its streams and nodes; SilenceError without an answer within the time limit.
 
-    Parameters
-    ----------
-    fleet : address of the fleet: HOST:PORT, the name of a fleet of this user, or empty for the only one
-    keys : folder of the keys of this client, if the fleet requires keys
-    timeout : seconds to wait for an answer; SilenceError if there is none
+    `fleet` is HOST:PORT, the name of a fleet of this user, or empty for the only one; `keys` is the folder of the keys
+    of this client, if the fleet requires keys.
     """
 
     def __init__(self, fleet: str = "", keys: str = "", *, timeout: float = _ANSWER_SECONDS) -> None:

@@ -21,18 +21,10 @@ _log = logging.getLogger(__name__)
 
 
 class CheckpointStore:
-    """A folder with the newest two checkpoints, and one that was found damaged.
+    """A folder with the newest two checkpoints, and one that was found damaged; `trouble` says what is wrong now.
 
     A checkpoint is written atomically, and is on disk before `save` returns. No file is overwritten: an older
     checkpoint is removed after a newer one is complete.
-
-    Parameters
-    ----------
-    folder : folder that holds only the checkpoints
-
-    Attributes
-    ----------
-    trouble : description of what is wrong now, empty if nothing is
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -48,12 +40,8 @@ class CheckpointStore:
     def load(self, settings: Settings) -> Forest:
         """A forest from the newest undamaged checkpoint, a new one if there is none.
 
-        Raises
-        ------
-        ServiceError
-            If the newest undamaged file is not a checkpoint, or one of another version of catstream.
-        SettingsError
-            If it was made with another coreset size.
+        ServiceError if that file is not a checkpoint, or one of another version of catstream; SettingsError if it was
+        made with another coreset size.
         """
         forest = self._newest(lambda path: Forest.load(path, settings))
         if self._damaged:
@@ -65,10 +53,7 @@ class CheckpointStore:
     def seq(self) -> int:
         """Number of the newest message in the newest undamaged checkpoint, read without its trees; 0 if there is none.
 
-        Raises
-        ------
-        ServiceError
-            As `load`.
+        ServiceError as of `load`.
         """
         return self._newest(Forest.seq_in) or 0
 

@@ -30,17 +30,11 @@ class Compressor:
     Constant time a frame on average, logarithmic memory. The same features make the same samples, bit for bit, also
     across `state` and `from_state`.
 
-    Parameters
-    ----------
-    name : name of the object
-
-    Attributes
-    ----------
-    began : number of the object's first frame in this stream
-    frame : number of the newest frame
-    box : box in which the object was last found
-    detector : the detector state after the newest frame: a restarted detector continues from it
-    last_sample : the newest sample, None before the first
+    began        number of the object's first frame in this stream
+    frame        number of the newest frame
+    box          box in which the object was last found
+    detector     the detector state after the newest frame: a restarted detector continues from it
+    last_sample  the newest sample, None before the first
     """
 
     def __init__(self, settings: Settings, name: str = "") -> None:
@@ -79,12 +73,9 @@ class Compressor:
         return self
 
     def begin(self, frame: int, version: int) -> Sample | None:
-        """Begin the object's stream; returns the sample that the trees of an earlier stream begin it with, or None.
+        """Begin the object's stream at a frame; returns the sample of the trees of an earlier stream, or None.
 
-        Parameters
-        ----------
-        frame : number of the first frame in this stream
-        version : the smallest that is free in this stream; a higher one of the sample is kept
+        The version is the smallest that is free in this stream; a higher one of the sample is kept.
         """
         self.began = frame
         if self.last_sample is not None:
@@ -98,12 +89,7 @@ class Compressor:
         return max(widths, default=0)
 
     def take(self, frame: int, features: ObjectFeatures, version: int) -> Sample | None:
-        """Insert the features of one frame; returns a sample if the trees have grown enough since the last one.
-
-        Parameters
-        ----------
-        version : of the sample, if there is one
-        """
+        """Insert the features of one frame; returns a sample if the trees have grown enough since the last one."""
         if not self._origin and APPEARANCE in features.training:
             self._origin = blake2b(features.training[APPEARANCE].rows.tobytes(), digest_size=8).hexdigest()
         for name, tree in TREES.items():

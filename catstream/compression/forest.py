@@ -29,11 +29,9 @@ class Forest:
     part for it, its trees are dropped. The same messages make the same samples, bit for bit, also across `save` and
     `load`.
 
-    Attributes
-    ----------
-    seq, frame : number of the newest message, and of its frame
-    version : of the newest sample. All objects share one count, so that no version is ever used twice
-    compressors : the compressor of each object, by name
+    seq, frame   number of the newest message, and of its frame
+    version      of the newest sample. All objects share one count, so that no version is ever used twice
+    compressors  the compressor of each object, by name
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -61,20 +59,11 @@ class Forest:
         learned: Mapping[str, Compressor] = MappingProxyType({}),
         after_each: Callable[[], object] = lambda: None,
     ) -> list[Sample]:
-        """Insert the features of one frame; returns the samples that are due.
+        """Insert the features of one frame, and call `after_each` after each object; returns the samples that are due.
 
-        A message whose `seq` was processed before is ignored.
-
-        Parameters
-        ----------
-        learned : compressors of the objects that begin in this message with a saved model
-        after_each : is called after each object
-
-        Raises
-        ------
-        ProtocolError
-            If a message before this one is missing, or its rows have another length than those before. Nothing of it
-            is inserted.
+        A message whose `seq` was processed before is ignored. `learned` are the compressors of the objects that begin
+        in it with a saved model. ProtocolError if a message before it is missing, or its rows have another length than
+        those before; nothing of it is inserted then.
         """
         if features.seq <= self.seq:
             return []
@@ -151,14 +140,8 @@ class Forest:
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Forest:
         """Restore what `save` wrote.
 
-        Raises
-        ------
-        ProtocolError
-            If the file is damaged.
-        ServiceError
-            If it is not a checkpoint, or one of another version of catstream.
-        SettingsError
-            If it was made with another coreset size.
+        ProtocolError if the file is damaged; ServiceError if it is not a checkpoint, or one of another version of
+        catstream; SettingsError if it was made with another coreset size.
         """
         arrays, metadata = storage.read(path)
         _check_kind(path, metadata)

@@ -86,16 +86,9 @@ def share(level: int, top: int, size: int) -> int:
 def sample(nodes: Sequence[Node], size: int, sampled: Sequence[Node] = (), known: np.ndarray = _NOTHING) -> np.ndarray:
     """The first n w rows of each node, reflected and rescaled so that each has the weight of one original row.
 
-    Parameters
-    ----------
-    nodes : oldest first, levels strictly falling
-    size : n
-    sampled, known : nodes of an earlier sample, and its rows: those of the nodes that both begin with are not computed
-        again
-
-    Returns
-    -------
-    float32 (r, d), r <= 2n; (0, 0) for no nodes
+    The nodes are oldest first, with strictly falling levels. The rows of those that an earlier sample begins with are
+    not computed again: `sampled` are its nodes, and `known` its rows. Returns float32 (r, d), r <= 2n; (0, 0) for no
+    nodes.
     """
     if not nodes:
         return _NOTHING

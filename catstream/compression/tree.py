@@ -97,10 +97,7 @@ class CoresetTree:
     def insert(self, rows: np.ndarray) -> None:
         """Add rows, float32 (k, d), in the order of the stream.
 
-        Raises
-        ------
-        ProtocolError
-            If the rows have another length than those before, or numbers that are not finite.
+        ProtocolError if they have another length than those before, or numbers that are not finite.
         """
         rows = self._checked(rows)
         while len(rows):

@@ -36,13 +36,9 @@ class Detector:
     Call `init` with the first frame, or `seek` before it. For every other frame call `look`, then `settle`; `adopt`
     models as they arrive.
 
-    Attributes
-    ----------
-    name : name of the object
-    state : after the last frame, None before there is an object; with the model, and SCM if it is in use, all there is
-    model : the one in use
-    newest_version : of the models that arrived, in use or not
-    likeness : to the object of a saved model, used until that is found; None without a saved model
+    state           after the last frame, None before there is an object; with the model, and SCM if in use, all there
+    is newest_version  of the models that arrived, in use or not
+    likeness        to the object of a saved model, used until that is found; None without a saved model
     """
 
     def __init__(self, settings: Settings, name: str = "") -> None:
@@ -59,18 +55,10 @@ class Detector:
         return self.state.window.box(self.settings.search.context) if self.state else None
 
     def init(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
-        """Start with the box of an object; another one before it is forgotten.
+        """Start with the box of an object in pixels of the frame; another one before it is forgotten.
 
-        Parameters
-        ----------
-        seq, time : of the frame's messages
-        box : the object, in pixels of the frame
-
-        Raises
-        ------
-        BoxError
-            If tracking cannot start with the box in this frame (see `Box.validated`), or if the object looks like
-            what is around it. The detector stays as it was.
+        BoxError if tracking cannot start with the box in this frame (see `Box.validated`), or if the object looks like
+        what is around it. The detector stays as it was.
         """
         scm = None
         box = Box(*map(float, box)).validated(*frame.size)
@@ -86,21 +74,10 @@ class Detector:
     def seek(self, model: Model, box: Box, likeness: Likeness, frame: int = 0) -> None:
         """Start with a saved model: the object is absent until it is found, in whichever frame and size that is.
 
-        Another object before it is forgotten.
-
-        It is found at a window that looks like the object and scores higher than the rest of the frame, in several
-        successive frames. Of two objects that look alike, neither is found.
-
-        Parameters
-        ----------
-        box : in pixels, about as large as the object may be
-        likeness : to the object
-        frame : number of the first frame that is searched
-
-        Raises
-        ------
-        ProtocolError
-            If the model is of other features.
+        Another object before it is forgotten. `box` in pixels is about as large as the object may be, and `frame` is
+        the number of the first one that is searched. It is found at a window that looks like the object and scores
+        higher than the rest of the frame, in several successive frames. Of two objects that look alike, neither is
+        found. ProtocolError if the model is of other features.
         """
         if len(model.weights) != row_length():
             raise ProtocolError(
@@ -113,12 +90,7 @@ class Detector:
         self.newest_version = max(self.newest_version, model.version)
 
     def look(self, frame: Pyramid, seq: int) -> Detection:
-        """Search the object in the next frame. The state then has the place that was expected.
-
-        Parameters
-        ----------
-        seq : of the frame's messages
-        """
+        """Search the object in the next frame. The state then has the place that was expected."""
         if self._scm is not None:
             score, box = self._scm.follow(frame.image)
             return Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
@@ -138,10 +110,7 @@ class Detector:
     def correct(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
         """Continue with the same object at another box, whatever a search would have found.
 
-        Raises
-        ------
-        BoxError
-            If there is no object yet, or as `init` does.
+        BoxError if there is no object yet, or as `init` does.
         """
         state = self._known()
         window = Window.around(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
@@ -178,14 +147,10 @@ class Detector:
                 self.state = replace(self.state, motion=model.motion)
 
     def resume(self, state: DetectorState, model: Model) -> None:
-        """Continue after a frame of a stream that another detector began.
+        """Continue after a frame of a stream that another detector began, with the state after it and the newest model.
 
-        With the model that the other one had by then, it continues as that would have, bit for bit.
-
-        Parameters
-        ----------
-        state : after that frame, or `state_at` the box where the object was last
-        model : the newest there is
+        With the model that the other one had by then, it continues as that would have, bit for bit. `state_at` is for
+        an object of which only the last box is known.
         """
         self.model, self.newest_version = model, model.version
         self.state = state if model.motion is None else replace(state, motion=model.motion)
@@ -216,18 +181,10 @@ class Detector:
 def looked(
     state: DetectorState, frame: Pyramid, seq: int, model: Model, likeness: Likeness | None, settings: Settings
 ) -> tuple[DetectorState, Detection]:
-    """Search the object in the next frame.
+    """Search the object in the next frame; returns the state with the place that was expected, and the detection.
 
     Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
-    always, if `search.mode` is "full").
-
-    Parameters
-    ----------
-    likeness : to the object of a saved model, which is sought in the whole frame as long as it has not been found
-
-    Returns
-    -------
-    the state with the place that was expected, and the detection
+    always, if `search.mode` is "full"), or as long as the object of a saved model with this likeness is sought.
     """
     state = belief.expected(state)
     if state.first_window is None and likeness is not None:
@@ -236,12 +193,7 @@ def looked(
 
 
 def settled(state: DetectorState, found: Detection, size: tuple[int, int], settings: Settings) -> DetectorState:
-    """The state after a detection: its belief in it, and the window moved as far as the belief allows.
-
-    Parameters
-    ----------
-    size : width and height of the frame
-    """
+    """The state after a detection: its belief in it, and the window moved as far as the belief allows."""
     state = belief.updated(state, found.score, found.redetected, settings.belief)
     policy = _policy(state, settings)
     if not policy.report:

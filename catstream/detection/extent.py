@@ -74,12 +74,8 @@ def offset_label(steps: int) -> float:
 def offset_cost(row: np.ndarray, head: np.ndarray, bias: float) -> float:
     """Cost of the steps by which a window is too large or too wide as the size or the aspect head predicts it.
 
-    It is Huber's function, because the prediction for an object that looks new may be wrong by many steps.
-
-    Parameters
-    ----------
-    row : float32 (d,), features of the window
-    head, bias : of the regression of the label, float32 (d,) and a number
+    It is Huber's function, because the prediction for an object that looks new may be wrong by many steps. The features
+    of the window and the head are float32 (d,).
     """
     off = abs(float(row @ head) + bias - 0.5) * _LABEL_STEPS
     return _OFFSET_WEIGHT * (off**2 if off < _LARGE_OFFSET else _LARGE_OFFSET * (2 * off - _LARGE_OFFSET))

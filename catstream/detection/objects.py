@@ -27,14 +27,9 @@ _SHARED = 0.2  # above this overlap of their first boxes, two objects may be at 
 
 
 class Detectors:
-    """Follows the objects of one stream, each with a detector of its own.
+    """Follows the objects of one stream, each with a detector of its own, by name in the order in which they began.
 
     For a frame, `begin` or `correct` the objects whose box is given, and `seek` those of saved models; then `step`.
-
-    Attributes
-    ----------
-    seq : of the last messages
-    detectors : the detector of each object, by name, in the order in which they began
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -45,12 +40,9 @@ class Detectors:
         self.detectors: dict[str, Detector] = {}
 
     def add(self, name: str) -> Detector:
-        """Return the detector of an object; a new one if there is none yet.
+        """Return the detector of an object, a new one if there is none yet.
 
-        Raises
-        ------
-        ObjectError
-            If the name is not valid, or there are too many objects.
+        ObjectError if the name is not valid, or there are too many objects.
         """
         if name not in self.detectors:
             self.detectors[name] = self._made(name)
@@ -64,12 +56,7 @@ class Detectors:
     def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
         """Start an object with its box in the next frame; another one of this name is forgotten.
 
-        Raises
-        ------
-        BoxError
-            As `Detector.init` does. Nothing changes.
-        ObjectError
-            If the name is not valid, or there are too many objects. Nothing changes.
+        Nothing changes after a BoxError, as of `Detector.init`, or an ObjectError, as of `add`.
         """
         detector = self.detectors.get(name) or self._made(name)
         with errors_about(name):
@@ -81,12 +68,7 @@ class Detectors:
     def seek(self, name: str, model: Model, box: Box, likeness: Likeness) -> None:
         """Search for the object of a saved model from the next frame on; another one of this name is forgotten.
 
-        Raises
-        ------
-        ObjectError
-            If the name is not valid, or there are too many objects. Nothing changes.
-        ProtocolError
-            As `Detector.seek` does. Nothing changes.
+        Nothing changes after a ProtocolError, as of `Detector.seek`, or an ObjectError, as of `add`.
         """
         detector = self.detectors.get(name) or self._made(name)
         detector.seek(model, box, likeness, self.seq)
@@ -94,13 +76,7 @@ class Detectors:
         self.detectors[name] = detector  # the last one, as in `begin`
 
     def begin_all(self, boxes: Mapping[str, Box], frame: Pyramid, time: float = 0.0) -> dict[str, Result]:
-        """Start several objects with their boxes in the next frame, by name; if one is refused, none of them.
-
-        Raises
-        ------
-        BoxError, ObjectError
-            As `begin` does. Nothing changes.
-        """
+        """Start several objects with their boxes in the next frame, by name; if `begin` refuses one, none of them."""
         trial = copy(self)
         trial.detectors = {name: copy(each) if name in boxes else each for name, each in self.detectors.items()}
         results = {name: trial.begin(name, frame, box, time) for name, box in boxes.items()}
@@ -114,12 +90,7 @@ class Detectors:
     def step(
         self, frame: Pyramid, time: float = 0.0, given: Mapping[str, Result] | None = None
     ) -> tuple[Tracks, Features]:
-        """Find the objects in the next frame.
-
-        Parameters
-        ----------
-        given : results of the objects that are not searched, by name: those of `begin` and `correct`
-        """
+        """Find the objects in the next frame, but those whose results `begin` and `correct` have `given`."""
         self.seq += 1
         results = dict(given or {})
         searched = {name: detector for name, detector in self.detectors.items() if name not in results}
@@ -134,13 +105,7 @@ class Detectors:
         return Tracks(self.seq, self.seq - 1, tracks), Features(self.seq, self.seq - 1, time, parts)
 
     def forget(self, name: str) -> None:
-        """Stop tracking an object.
-
-        Raises
-        ------
-        ObjectError
-            If there is no object of this name.
-        """
+        """Stop tracking an object; ObjectError if there is none of this name."""
         if name not in self.detectors:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.detectors)}")
         del self.detectors[name]
@@ -154,20 +119,11 @@ class Detectors:
 def assigned(
     found: Mapping[str, Detection], states: Mapping[str, DetectorState], context: float
 ) -> dict[str, Detection]:
-    """Give each place to one object: first to the one whose score would fall most without it.
+    """Give each place to one object, by name: first to the one whose score would fall most without it.
 
-    An object that loses its place takes the best other window near it; its score is 0 if there is none.
-
-    Parameters
-    ----------
-    found : detection of each object of a frame, by name
-    states : detector state of each object; objects whose first boxes overlapped may stay at the same place, and one
-        that is still sought claims none
-    context : setting `search.context`, by which a window is larger than the object's box
-
-    Returns
-    -------
-    the detection of each object; the same one if no other object claims its place
+    An object that loses its place takes the best other window near it; its score is 0 if there is none. Objects whose
+    first boxes overlapped may stay at the same place, and one that is still sought claims none. If no other object
+    claims its place, a detection stays the same one.
     """
     firsts = {
         name: (state.first_frame, state.first_window.box(context))

@@ -54,11 +54,9 @@ class Detection:
 
 
 def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings: Settings) -> Detection:
-    """The best window near the expected one; of the whole frame, if the belief in it is low and another leads clearly.
+    """The best window near the expected one; of the whole frame, if belief is low and another leads clearly.
 
-    Parameters
-    ----------
-    seq : of the frame, which says whether a search of the whole frame is due
+    `seq` of the frame says whether a search of the whole frame is due.
     """
     confident = state.confident_window.centred(*state.window.centre)  # as large as in the last confident detection
     if settings.search.mode == "full":
@@ -148,14 +146,10 @@ def due(seq: int, interval: int, count: int) -> int | None:
 
 
 def _elsewhere(frame: Pyramid, window: Window, seq: int, interval: int, model: Model) -> Detection | None:
-    """The best window of the parts of a frame that are due, at the size of a window, 0.8 or 1.25 times it.
+    """The best window of the parts of a frame that are due, at 0.8, 1 or 1.25 times its size; None if none is due.
 
     At most `_MOST_CELLS` cells are searched in a frame. If the frame has more at the three sizes, its parts take turns;
     every other turn is one around the window, if the window is tiny.
-
-    Returns
-    -------
-    None if no part is due
     """
     sizes = [window.scaled(factor) for factor in _WHOLE_FACTORS]
     around = _turns(window.w, window.h, tuple(map(frame.region_around, sizes)))
@@ -172,13 +166,7 @@ def _elsewhere(frame: Pyramid, window: Window, seq: int, interval: int, model: M
 
 @lru_cache(maxsize=8)  # a 4K frame has thousands of parts for a tiny window
 def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[list[_Part]]:
-    """The parts of regions that are searched, in groups of at most `_MOST_CELLS` cells.
-
-    Parameters
-    ----------
-    width, height : of the window in pixels
-    regions : the region that is searched at each of `_WHOLE_FACTORS`
-    """
+    """The parts of the region of each size that are searched, in groups of at most `_MOST_CELLS` cells."""
     turns: list[list[_Part]] = []
     left = 0.0
     for factor, region in zip(_WHOLE_FACTORS, regions, strict=True):
@@ -242,11 +230,8 @@ def fitted(frame: Pyramid, found: Detection, first: Window | None, model: Model,
     """A detection moved by at most a cell, at the size and then the aspect ratio with the highest value.
 
     The value is the score, plus `weight` times the value of the extent head, less the cost of the change, and less the
-    cost of the error that the size head or the aspect head predicts.
-
-    Parameters
-    ----------
-    first : the window of the first frame, whose size and aspect ratio are likelier than others
+    cost of the error that the size head or the aspect head predicts. Size and aspect ratio of the `first` window are
+    likelier than others.
     """
     first = first or found.window
     resized = _at_best_size(frame, found, first, model, settings)
@@ -282,13 +267,7 @@ def _at_best_aspect(
 
 
 def _fit(row: np.ndarray, model: Model, name: str, settings: ExtentSettings) -> float:
-    """The value of the extent head, less the cost of the error that the head `name` predicts; 0 if `weight` is 0.
-
-    Parameters
-    ----------
-    row : float32 (d,), features of the window
-    name : "size" or "aspect"
-    """
+    """The value of the extent head, less the cost of the error that the head `name` predicts; 0 if `weight` is 0."""
     if not settings.weight:  # a saved model may have the heads
         return 0.0
     fit = settings.weight * float(row @ model.heads[EXTENT]) if EXTENT in model.heads else 0.0
@@ -300,9 +279,8 @@ def _fit(row: np.ndarray, model: Model, name: str, settings: ExtentSettings) -> 
 def _climb(tried: Callable[[int], tuple[float, Detection]], most: int) -> tuple[Detection, int, float]:
     """Hill climbing: from step 0 up or down for as long as the value rises, at most `most` steps either way.
 
-    Returns
-    -------
-    the detection at the best step, the step, and the offset of the vertex of the parabola through its neighbours
+    Returns the detection at the best step, the step, and the offset of the vertex of the parabola through its
+    neighbours.
     """
     trials = {step: tried(step) for step in range(-min(most, 1), min(most, 1) + 1)}
     best = way = max(trials, key=lambda step: trials[step][0])

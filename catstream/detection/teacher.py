@@ -55,12 +55,8 @@ def first_training(
 ) -> tuple[Model, Training]:
     """The initial model and the rows of the first frame, which fill a leaf of each tree.
 
-    If SCM follows the object first, group "appearance" has only the rows of an ordinary frame.
-
-    Raises
-    ------
-    BoxError
-        If object and background look the same.
+    If SCM follows the object first, group "appearance" has only the rows of an ordinary frame. BoxError if object and
+    background look the same.
     """
     teaching, count = settings.teaching, settings.coreset.size
     if teaching.bootstrap == "scm":
@@ -78,13 +74,9 @@ def first_training(
 def training_of(
     frame: Pyramid, window: Window, around: ScoreMap | None, seq: int, model: Model, settings: Settings
 ) -> Training:
-    """The rows of a frame in which the object was detected.
+    """The rows of a frame in which the object was detected, cut around its window.
 
-    Parameters
-    ----------
-    window : of the detection; the rows are cut around it
-    around : as for `training_at`
-    seq : of the frame: windows of wrong extents are not cut in each, and hard negatives in a part of the frame
+    Windows of wrong extents are not cut in each frame, and hard negatives in a part of it, as `seq` says.
     """
     training = training_at(frame, window, seq, model, settings, around, extents=seq % _EXTENT_INTERVAL == 0)
     if (mined := _mined(frame, window, seq, model, settings.teaching)) is not None:
@@ -102,13 +94,9 @@ def training_at(
     *,
     extents: bool = True,
 ) -> Training:
-    """The rows of an object that is known to be at a window.
+    """The rows of an object that is known to be at a window, and of group "extent" if `extents`.
 
-    Parameters
-    ----------
-    around : scores of the windows around it, if a search left them: near misses and background are taken from these,
-        if they reach far enough
-    extents : whether to cut rows of group "extent", too
+    Near misses and background are taken from the windows around it that a search scored, if they reach far enough.
     """
     rng = np.random.default_rng((settings.run.seed, seq))  # of this frame alone: no frame depends on those before
     rows = _appearance(frame, window, around, model, rng, settings.teaching)
@@ -161,10 +149,7 @@ def _strongest(scores: ScoreMap, window: Window, most: int, least: float = -math
 def initial_model(rows: TrainingRows) -> Model:
     """A model of version 0, by least squares of the object's mean against the background's mean and covariance.
 
-    Raises
-    ------
-    BoxError
-        If the two look the same.
+    BoxError if the two look the same.
     """
     background = rows.rows[rows.labels == 0]
     mean, background_mean = rows.rows[rows.labels == 1].mean(axis=0), background.mean(axis=0)
@@ -188,20 +173,10 @@ def affine_copies(
 ) -> np.ndarray:
     """Features of a window and of copies of it, slightly scaled, shifted and rotated (paper, "System Implementation").
 
-    All copies of one frame agree on the corners of the window, which are not the object: some copies are put on another
-    background. An object that turns shows another side, which often is the mirror image.
-
-    Parameters
-    ----------
-    count : rows in all; the first is that of the window itself
-    rng : source of scales, shifts and rotations
-    context : size of the window as a multiple of the object's box
-    moved : share of the copies that are put on another background of the frame
-    mirrored : how many of them, the last ones, are mirrored left to right
-
-    Returns
-    -------
-    float32 (count, d)
+    All copies of one frame agree on the corners of the window, which are not the object: the share `moved` of the
+    copies is put on another background of the frame. An object that turns shows another side, which often is the mirror
+    image: the last copies, `mirrored` in number, are mirrored left to right. Returns float32 (count, d); the first row
+    is that of the window itself, which is `context` times as large as the object's box.
     """
     change = rng.normal(size=(count, 4))
     if count:
@@ -237,17 +212,10 @@ def _elsewhere(window: Window, rng: np.random.Generator) -> tuple[float, float]:
 def _patch(
     frame: Pyramid, window: Window, turn: float, box: Box, offset: tuple[float, float] | None = None
 ) -> np.ndarray:
-    """A window and its margin, cut from a frame and resized.
+    """A window and its margin, cut from a frame, rotated by `turn` radians and resized, uint8 (3, 96, 96).
 
-    Parameters
-    ----------
-    turn : radians by which the window is rotated
-    box : the object, which has the centre of the window
-    offset : pixels from the object to another background that it is put on; None to leave it on its own
-
-    Returns
-    -------
-    uint8 (3, 96, 96)
+    The object, whose box has the centre of the window, is put on another background `offset` pixels away; None leaves
+    it.
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
     x, y = window.centre
@@ -262,9 +230,7 @@ def _patch(
 def _ellipse(across: float, down: float) -> np.ndarray:
     """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it.
 
-    Parameters
-    ----------
-    across, down : width and height of the window as multiples of the object's
+    The window is `across` times as wide, and `down` times as high as the object.
     """
     place = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
     out = np.hypot((place * down)[:, None], place * across)

@@ -69,12 +69,7 @@ class Cells:
         return features
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
-        """Score of every window, float32 (rows - 7, columns - 7).
-
-        Parameters
-        ----------
-        weights : float32 (d,)
-        """
+        """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7)."""
         scores = self._places(weights, bias)
         add_colour_scores(self.shades, weights[COLOURS], scores)
         return scores
@@ -154,15 +149,7 @@ _SHARES = _shares()
 
 
 def shades(planes: np.ndarray) -> np.ndarray:
-    """The shade of every 2 x 2 pixels, whose mean is taken.
-
-    Parameters
-    ----------
-    planes : uint8 (3, h, w), blue, green and red; h and w are even
-
-    Returns
-    -------
-    uint16 (h // 2, w // 2), below `SHADES`
+    """The shade, uint16 below `SHADES`, of every 2 x 2 pixels of planes of even size, whose mean is taken.
 
     >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[None].repeat(3, axis=0)).ravel()))
     2

@@ -117,17 +117,10 @@ class Pyramid:
         return Pyramid(self.image[region.top :, region.left :][: region.height, : region.width])
 
     def resized(self, window: Window, *, averaged: bool = True) -> tuple[np.ndarray, tuple[float, float]]:
-        """The frame, resized until a window is 64 x 64 pixels.
+        """The frame, resized until a window is 64 x 64 pixels; also width and height of a cell in pixels of the frame.
 
-        Parameters
-        ----------
-        window : only its width and height count
-        averaged : average the pixels of a frame that is reduced; without it, they are interpolated as in `cut`, in a
-            fifth of the time
-
-        Returns
-        -------
-        the image, and width and height of a cell in pixels of the frame
+        Of the window, only the size counts. If `averaged`, the pixels of a frame that is reduced are averaged;
+        otherwise they are interpolated as in `cut`, in a fifth of the time.
         """
         width, height = self.size
         columns = max(WINDOW, round(width / window.w * WINDOW))
@@ -140,16 +133,10 @@ class Pyramid:
         return resized, (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
     def cut(self, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
-        """A square of `size` pixels, centred at (x, y); beyond the edge the last pixel is repeated.
+        """A square of `size` pixels, centred at (x, y) and rotated by `turn` radians; beyond the edge the last repeats.
 
-        Parameters
-        ----------
-        across, down : pixels of the frame a pixel of the cut is wide and high
-        turn : radians by which the cut is rotated in the frame
-
-        Returns
-        -------
-        uint8 (3, size, size), blue, green and red, or (1, size, size) of a grey frame
+        A pixel of the cut is `across` pixels of the frame wide and `down` high. Returns uint8 (3, size, size), blue,
+        green and red, or (1, size, size) of a grey frame.
         """
         image, wide = self.near(min(across, down))
         x, y, across, down = x / wide - 0.5, y / wide - 0.5, across / wide, down / wide

@@ -87,11 +87,9 @@ class ScoreMap:
 
 
 def non_maximum_suppression(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
-    """The highest windows, each more than `apart` cells from any higher one.
+    """The highest windows with a score above `least`, each more than `apart` cells from any higher one.
 
-    Returns
-    -------
-    up to `most` pairs (row, column) with a score above `least`, highest first
+    Returns up to `most` pairs (row, column), highest first.
     """
     left = scores.copy()
     maxima = []

@@ -93,11 +93,6 @@ class Fleet:
         HOST:PORT of the head of a cluster of Ray, of which this machine is a node; by default RAY_ADDRESS. If both are
         empty, the fleet runs on this machine alone.
 
-    Attributes
-    ----------
-    is_owner : bool
-        Whether the fleet ends with this object, because `up` started Ray for it.
-
     Raises
     ------
     FleetError
@@ -122,7 +117,7 @@ class Fleet:
 
     @property
     def is_owner(self) -> bool:
-        """Whether the fleet ends with this object."""
+        """Whether the fleet ends with this object, because `up` started Ray for it."""
         return self._owned is not None
 
     def up(self) -> list[str]:

@@ -70,9 +70,10 @@ _NUMBER = re.compile(r"\(os error ([0-9]+)\)")  # in an error of obstore
 _ROLE = "/latest/"  # in the address at which a machine asks for the credentials of its role
 
 
-class Objects:
-    """The objects below a folder or a prefix of a bucket: created exclusively and never changed.
+class Store:
+    """The store of a fleet: objects below a folder or a prefix of a bucket, created exclusively and never changed.
 
+    The URL is a folder, file:///folder or s3://bucket/prefix; FleetError if it is not valid, or contains credentials.
     Every method raises StoreError if the store cannot be reached or is full; a call that creates an object may
     nevertheless have created it. No message contains a credential.
     """
@@ -85,10 +86,24 @@ class Objects:
         self._checked = False
 
     def __repr__(self) -> str:
-        return f"Objects({self._url!r})"
+        return f"Store({self._url!r})"
 
-    def make(self) -> None:
-        """Create the folder of the store, and check it. A bucket has to exist."""
+    @property
+    def fleet(self) -> States:
+        """The desired states of the fleet, each as the file `fleet`."""
+        return States(self, "fleet")
+
+    def stream(self, name: str) -> States:
+        """The states of a stream."""
+        check_fleet_name(name, "stream")
+        return States(self, f"streams/{name}")
+
+    def model(self, name: str) -> States:
+        """The merged models of an object, each as the file `model`."""
+        return States(self, f"models/{_NO_NAME if name == UNNAMED else check_name(name)}")
+
+    def check(self) -> None:
+        """Create the folder of the store, and raise StoreError if it cannot be used. A bucket has to exist."""
         if self._folder is not None:
             with self._errors("", "created"):
                 self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -282,7 +297,7 @@ class Generation:
 class States:
     """The states below a folder of the store. Every method raises StoreError if the store fails; it may be repeated."""
 
-    def __init__(self, objects: Objects, folder: str) -> None:
+    def __init__(self, objects: Store, folder: str) -> None:
         self._objects = objects
         self.folder = folder
 
@@ -402,38 +417,6 @@ class Claim:
             f"{self._holder} may not write it any more, and has to stop"
         )
         raise self._fenced
-
-
-class Store:
-    """The store of a fleet: the states of its streams, its desired state, and its merged models.
-
-    The URL is a folder, file:///folder or s3://bucket/prefix. The folder has to exist, or is made by `check`. It raises
-    FleetError if the URL is not valid, or contains credentials.
-    """
-
-    def __init__(self, url: str) -> None:
-        self._objects = Objects(url)
-
-    def __repr__(self) -> str:
-        return repr(self._objects).replace("Objects", "Store")
-
-    def check(self) -> None:
-        """Create the folder, if it does not exist, and raise StoreError if the store cannot be used."""
-        self._objects.make()
-
-    @property
-    def fleet(self) -> States:
-        """The desired states of the fleet, each as the file `fleet`."""
-        return States(self._objects, "fleet")
-
-    def stream(self, name: str) -> States:
-        """The states of a stream."""
-        check_fleet_name(name, "stream")
-        return States(self._objects, f"streams/{name}")
-
-    def model(self, name: str) -> States:
-        """The merged models of an object, each as the file `model`."""
-        return States(self._objects, f"models/{_NO_NAME if name == UNNAMED else check_name(name)}")
 
 
 def _this_process() -> str:

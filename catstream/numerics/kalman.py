@@ -19,12 +19,7 @@ def constant_velocity(
 ) -> KalmanFilter:
     """A Kalman filter of a centre that moves at constant velocity, but for random changes of its state.
 
-    Parameters
-    ----------
-    mean : float64 (4,), the state
-    covariance : float64 (4, 4), of the state
-    process : float64 (4, 4), covariance of the change of the state in a frame
-    observation : float64 (2, 2), covariance of the error of a measured centre
+    The covariances are of the state, of its change in a frame, and of the error of a measured centre.
 
     >>> kalman = constant_velocity(np.array([10.0, 20, 3, 0]), np.eye(4), np.eye(4), np.eye(2))
     >>> kalman.predict()

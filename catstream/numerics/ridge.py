@@ -13,19 +13,10 @@ import scipy.linalg
 
 
 def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.ndarray:
-    """The least-squares direction between two classes: w = (S + penalty I)^-1 towards.
+    """The least-squares direction between two classes: w = (S + penalty I)^-1 towards, float32 (d,).
 
-    S is the covariance of the background.
-
-    Parameters
-    ----------
-    background : float32 (r, d)
-    towards : float32 (d,), mean of the object minus mean of the background
-    penalty : lambda, in units of a feature's variance
-
-    Returns
-    -------
-    float32 (d,)
+    S is the covariance of the background, float32 (r, d); `towards` is the mean of the object minus that of the
+    background.
     """
     centred = background - background.mean(axis=0)
     solve = _solver(centred @ centred.T, penalty * len(centred))
@@ -36,11 +27,8 @@ def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.n
 class Regression:
     """The weights and biases that minimise ||A [w; b] - y||^2 / r + penalty ||w||^2, for labels y and penalties.
 
-    The products of the rows are computed once, and factored once for each penalty; then a label costs O(r d).
-
-    Parameters
-    ----------
-    rows : float32 (r, d + 1), A: rows [x, 1], or any left rotation of them and the labels
+    The products of the rows A are computed once, and factored once for each penalty; then a label costs O(r d). They
+    are float32 (r, d + 1): [x, 1], or any left rotation of them and the labels.
     """
 
     def __init__(self, rows: np.ndarray) -> None:

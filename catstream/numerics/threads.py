@@ -148,14 +148,10 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive 
 
 
 class Scratch(threading.local):
-    """The arrays for intermediate results of a kernel, which a function makes for some sizes.
+    """The arrays for intermediate results of a kernel, which the function `made` makes for some sizes.
 
     Each thread keeps those of the last sizes: to make them for a small image takes a third as long as the kernel.
-
-    Attributes
-    ----------
-    made : the function
-    kept : the same, but arrays that this thread made before are used again
+    `kept` is the function, but arrays that this thread made before are used again.
     """
 
     def __init__(self, made: Callable[..., tuple[np.ndarray, ...]]) -> None:

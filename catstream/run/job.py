@@ -104,16 +104,9 @@ class Job:
         check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
 
     def save(self, folder: Path) -> Path:
-        """Write the job to a folder, readable by its owner only: the source may contain a password.
+        """Write the job to a folder, readable by its owner only: the source may contain a password. Returns the file.
 
-        Returns
-        -------
-        the file
-
-        Raises
-        ------
-        ServiceError
-            If the file cannot be written.
+        ServiceError if it cannot be written.
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
@@ -125,12 +118,8 @@ class Job:
     def load(cls, path: Path) -> Job:
         """Read the job from the file that `save` wrote, or from the folder that it is in.
 
-        Raises
-        ------
-        ServiceError
-            If there is no such file.
-        ProtocolError, SettingsError
-            If the file is damaged, or was written by another version of catstream.
+        ServiceError if there is no such file; ProtocolError or SettingsError if it is damaged, or was written by
+        another version of catstream.
         """
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
@@ -142,11 +131,6 @@ class Job:
             return cls(**(metadata | read), settings=settings)
         except (AttributeError, KeyError, TypeError, msgspec.ValidationError) as error:
             raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
-
-    @staticmethod
-    def is_in(folder: Path) -> bool:
-        """Whether a folder contains a job."""
-        return (folder / _NAME).exists()
 
     def check_fits(self, other: Job, folder: Path) -> None:
         """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""

@@ -67,10 +67,7 @@ class Learned:
     def of(cls, compressor: Compressor, settings: Settings) -> Self:
         """Everything that a compressor knows of its object, with a model trained from it.
 
-        Raises
-        ------
-        ServiceError
-            If the trees have no leaf yet, or the object was not found yet.
+        ServiceError if the trees have no leaf yet, or the object was not found yet.
         """
         state = compressor.detector
         if state is not None and state.is_sought:
@@ -85,14 +82,7 @@ class Learned:
     def compressor(self, settings: Settings, name: str = "") -> Compressor:
         """A compressor that inserts the frames of another stream into copies of the trees; versions continue.
 
-        Parameters
-        ----------
-        name : name of the object in that stream
-
-        Raises
-        ------
-        SettingsError
-            If the settings do not suit the trees.
+        The object has this name in that stream. SettingsError if the settings do not suit the trees.
         """
         self.check_fits(settings)
         return Compressor.continuing(self.trees, self.model.version, self.centres, self.origins, settings, name)
@@ -207,12 +197,8 @@ class Learned:
 def check_files(files: Mapping[str, Path], settings: Settings) -> None:
     """Raise an error unless objects can begin with the saved models in these files, by name, in the first frame.
 
-    Raises
-    ------
-    ServiceError, ProtocolError
-        If one of them cannot be read.
-    SettingsError
-        If one of them was learned with other settings, or they are too large.
+    ServiceError or ProtocolError if one cannot be read; SettingsError if one was learned with other settings, or they
+    are too large.
     """
     for file in files.values():
         Learned.load(file).check_fits(settings)
@@ -220,12 +206,7 @@ def check_files(files: Mapping[str, Path], settings: Settings) -> None:
 
 
 def check_sizes(sizes: Mapping[str, int]) -> None:
-    """Raise SettingsError if the saved models that objects begin with in one frame are too large for a message.
-
-    Parameters
-    ----------
-    sizes : bytes of each, by the object's name
-    """
+    """Raise SettingsError if the saved models of objects, by name, have too many bytes to begin in one frame."""
     advice = "track fewer at once, or learn them again with a smaller coreset.size"
     for name, size in sizes.items():
         if size > LARGEST_GIVEN_MODEL:
@@ -243,12 +224,7 @@ def check_sizes(sizes: Mapping[str, int]) -> None:
 def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
     """The compressors of the objects that begin with a saved model in a message, by name.
 
-    Raises
-    ------
-    ProtocolError
-        If a saved model is damaged, or one of other features.
-    SettingsError
-        If the settings do not suit its trees.
+    ProtocolError if a saved model is damaged, or one of other features; SettingsError if the settings do not suit it.
     """
     models = {name: part.model for name, part in features.objects.items() if part.model}
     return {

@@ -42,29 +42,15 @@ _ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 _log = logging.getLogger(__name__)
 
 
-def began(folder: Path) -> bool:
-    """Whether a pipeline was started in this folder."""
-    return Job.is_in(folder) or (folder / TREES).exists()
-
-
 def last_seq(folder: Path) -> int:
     """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
     return CheckpointStore(folder / TREES).seq()
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
-    """Everything that was learned of an object up to the newest valid checkpoint.
+    """Everything that was learned of an object up to the newest valid checkpoint; "" is also the only object.
 
-    Parameters
-    ----------
-    name : the name of the object; "" also means the only object, if it has a name
-
-    Raises
-    ------
-    ObjectError
-        If there is no such object.
-    ServiceError
-        If there is no checkpoint, or nothing was learned before the newest one.
+    ObjectError if there is no such object; ServiceError if nothing was learned before a checkpoint.
     """
     forest = CheckpointStore(folder / TREES).load(settings)
     if name == UNNAMED and len(forest.compressors) == 1:
@@ -94,10 +80,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def restore(folder: Path, content: Mapping[str, bytes]) -> None:
     """Write what `files` returned to a new folder, from which a pipeline can be resumed.
 
-    Raises
-    ------
-    ServiceError
-        If a name is not one that `files` returns, or a file cannot be written.
+    ServiceError if a name is not one that `files` returns, or a file cannot be written.
     """
     for name, data in content.items():
         if not _NAMES.fullmatch(name):
@@ -111,16 +94,9 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
-    """Lock a folder for this process alone; the folder is made if it does not exist.
+    """Lock a folder for this process alone, and make it if it does not exist; wait so many seconds for another process.
 
-    Parameters
-    ----------
-    seconds : how long to wait if another process has locked it
-
-    Raises
-    ------
-    ServiceError
-        If another process keeps it locked, or it cannot be made.
+    ServiceError if another process keeps it locked, or it cannot be made.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -139,7 +115,7 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
 def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
     """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
-        if resumed is None and began(folder):
+        if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
             raise ServiceError(
                 f"{str(folder)!r} already contains a run: continue it (--resume {folder}), or give another folder"
             )
@@ -152,9 +128,7 @@ def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
 def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[list[Path]]:
     """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving.
 
-    Yields
-    ------
-    the list of the files that were saved, filled afterwards
+    Yields the list of the files that were saved, filled afterwards.
     """
     done: list[Path] = []
     try:

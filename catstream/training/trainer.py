@@ -34,12 +34,7 @@ class Trainer:
         """Train a model on a sample, in time that depends on n only.
 
         The score is scaled to 0 at the mean of the background and 1 at the mean of the object, so that the scores of
-        all models are comparable.
-
-        Raises
-        ------
-        ProtocolError
-            If object and background are the same in the sample.
+        all models are comparable. ProtocolError if object and background are the same in the sample.
         """
         self._regressions[sample.object] = self._regressions.pop(sample.object, {})
         if len(self._regressions) > self.settings.run.objects_most:  # the longest ago: it was forgotten

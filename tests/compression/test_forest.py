@@ -131,27 +131,15 @@ def test_an_object_that_begins_again_has_new_trees(settings, messages):
     assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
 
 
-def test_a_message_stored_already_is_ignored(settings, messages):
-    forest, message = Forest(settings), next(messages)
-    forest.take(message)
-    before = forest.counters()
-    assert forest.take(message) == []
-    assert forest.counters() == before
-
-
-def test_a_missing_message_is_an_error_and_is_still_accepted_later(settings, messages):
+def test_a_missing_message_is_an_error_and_is_still_accepted_later_and_a_stored_one_is_ignored(settings, messages):
     forest, (first, second) = Forest(settings), (next(messages), next(messages))
     with pytest.raises(ProtocolError, match="features 2 came after 0: 1 are missing"):
         forest.take(second)
     forest.take(first)
     forest.take(second)
-    assert forest.seq == 2
-
-
-def test_frames_that_teach_nothing_count_as_seen(settings, messages):
-    forest, message = Forest(settings), next(messages)
-    forest.take(changed(message, training={}))
-    assert (forest.seq, forest.frame, forest.counters()["rows"]) == (1, 0, 0)
+    before = forest.counters()
+    assert forest.take(second) == forest.take(first) == []
+    assert (forest.seq, forest.counters()) == (2, before)
 
 
 def test_versions_count_up_and_samples_keep_their_distance(settings, messages):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -74,10 +73,3 @@ def test_a_sample_after_many_others_is_that_of_a_tree_that_made_none(cuts, seed)
         tree.insert(rows[start : start + count])
         start += count
         assert_array_equal(tree.sample().rows, grown(rows[:start], size=4).sample().rows)
-
-
-@pytest.mark.parametrize("count", [0, SIZE - 1])
-def test_before_the_first_leaf_there_is_nothing_to_sample(count):
-    summary = grown(np.ones((count, 3))).sample()
-    assert summary.rows.shape[0] == 0
-    assert summary.levels == ()

@@ -45,13 +45,10 @@ def test_on_another_background_the_object_keeps_its_centre(rng):
     np.testing.assert_allclose(grids[0][3:5, 3:5], grids[1][3:5, 3:5], atol=1e-3)
 
 
-def test_the_last_copies_are_mirrored(image):
+def test_the_last_copies_are_mirrored_and_never_the_window_itself(image):
     plain, some = (copies(image, WINDOW, 6, mirrored=count) for count in (0, 2))
     np.testing.assert_array_equal(some[:4], plain[:4])
     np.testing.assert_allclose(some[4:, COLOURS], plain[4:, COLOURS], atol=1e-6)
     ours, theirs = (rows[4:, : COLOURS.start].reshape(2, 8, 8, 34)[..., 31:] for rows in (some, plain))
     np.testing.assert_allclose(ours, theirs[:, :, ::-1], atol=1e-5)
-
-
-def test_the_window_itself_is_never_mirrored(image):
     np.testing.assert_array_equal(copies(image, WINDOW, 2, mirrored=9)[0], copies(image, WINDOW, 1)[0])

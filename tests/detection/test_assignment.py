@@ -47,13 +47,6 @@ def test_of_two_objects_at_one_place_the_one_with_the_higher_score_keeps_it(orde
     assert list(result) == list(order)
 
 
-def test_only_one_of_several_objects_keeps_a_place():
-    found = {f"object-{i}": detection(0.5 + i / 10, 100 + i) for i in range(4)}
-    states = {f"object-{i}": state(100 * i) for i in range(4)}
-    scores = {name: each.score for name, each in assigned(found, states, CONTEXT).items()}
-    assert scores == {"object-0": 0, "object-1": 0, "object-2": 0, "object-3": 0.8}
-
-
 def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
     """The one in the middle is at the place of both; in another order, it keeps its place, and they lose theirs."""
     states = {name: state(100 * i) for i, name in enumerate(("left", "right", "middle"))}

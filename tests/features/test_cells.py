@@ -31,12 +31,6 @@ def test_a_row_is_the_windows_cells_and_then_its_colours(cells):
     assert np.linalg.norm(row[COLOURS]) == pytest.approx(3, abs=1e-5)
 
 
-def test_cells_within_a_margin_are_those_of_the_larger_image(rng):
-    image = rng.integers(0, 256, (128, 160, 3), np.uint8)
-    whole, inner = Cells.of(image), Cells.within(planes_of(image[16:112, 24:120]))
-    np.testing.assert_array_equal(inner.row(0, 0), whole.row(4, 5))
-
-
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 0.9, 1.0])
 def test_the_scores_from_a_threshold_on_are_those_of_all_windows(cells, rng, quantile):
     weights = rng.normal(size=row_length()).astype(np.float32)

@@ -7,7 +7,6 @@ import queue
 import threading
 
 import hypothesis.strategies as st
-import pytest
 from hypothesis import settings
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -284,22 +283,6 @@ def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_fr
     history.resume(0, "done")
     history.write(1, 1)
     assert history.processes[1].result is None
-    history.the_newest_state_has_all_durable_writes_and_continues_the_last_of_them()
-
-
-@pytest.mark.parametrize("fault", ["lost", "failed", "half", "late", "repeated"])
-def test_a_holder_whose_write_was_not_answered_writes_on_and_a_superseded_one_is_told(fault):
-    history = Fencing()
-    history.there_is_a_holder()
-    history.act(0, "write", fault)
-    history.write(0, 1)
-    assert history.processes[0].result is None
-    history.act(0, "write", fault)
-    history.claim_and_write(1)
-    history.write(0, 1)
-    assert isinstance(history.processes[0].result, FencedError)
-    while history.memory.late:
-        history.memory.land(0)
     history.the_newest_state_has_all_durable_writes_and_continues_the_last_of_them()
 
 

@@ -27,13 +27,3 @@ def test_fit_is_the_same_for_every_left_rotation(rng):
         ridge.Regression(each[:, :-1]).fit(each[:, -1], 0.2) for each in (rotation @ rows, rows)
     )
     np.testing.assert_allclose(turned, expected, rtol=1e-2, atol=1e-4)
-
-
-def test_a_regression_fits_several_labels_with_several_penalties(rng):
-    rows, labels = rng.normal(size=(25, 8)).astype(np.float32), rng.normal(size=(2, 25)).astype(np.float32)
-    regression = ridge.Regression(rows)
-    for label in labels:
-        for penalty in (0.2, 0.03, 0.2):
-            expected = ridge.Regression(rows).fit(label, penalty)
-            np.testing.assert_array_equal(regression.fit(label, penalty)[0], expected[0])
-            assert regression.fit(label, penalty)[1] == expected[1]

@@ -51,16 +51,11 @@ def test_a_library_that_is_imported_inside_is_on_one_thread_too():
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_all_libraries_are_on_one_thread_inside_and_as_before_outside():
+def test_all_libraries_are_on_one_thread_inside_and_as_before_outside_also_after_an_exception():
     before = counts()
     with one_thread(), one_thread():
         assert set(counts().values()) == {1}
     assert counts() == before
-
-
-@pytest.mark.usefixtures("two_threads")
-def test_an_exception_restores_the_number_of_threads():
-    before = counts()
     with pytest.raises(ZeroDivisionError), one_thread():
         _ = 1 / 0
     assert counts() == before

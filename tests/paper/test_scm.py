@@ -34,12 +34,6 @@ def test_codes_are_those_of_scikit_learn(rng, centre):
     np.testing.assert_allclose(codes, expected, atol=1e-3)
 
 
-def test_codes_of_equal_atoms_rebuild_the_row(rng):
-    atoms = np.repeat(scm._unit(rng.random((3, 36))), 4, axis=0)
-    codes = scm._codes(atoms[:1], atoms)
-    np.testing.assert_allclose(codes @ atoms, (1 - scm._PENALTY) * atoms[:1], atol=1e-4)
-
-
 def test_the_demos_object_is_followed():
     frames, truth = zip(*rendered.render(40, (320, 240)), strict=True)
     found = followed(frames, truth[0])
@@ -56,13 +50,6 @@ def test_a_half_covered_object_is_tracked(scene):
 def test_the_score_falls_if_the_object_is_absent(scene):
     (there, _), (gone, _) = followed([scene((60, 50)), scene((62, 51)), scene((250, 180))], START)
     assert there > 0.6 > 0.5 > gone
-
-
-def test_a_covered_object_teaches_nothing(scene, rng):
-    model = SparseCollaborativeModel(scene((60, 50)), START, rng)._generative
-    before = model.histogram
-    model.update(rng.integers(0, 256, (32, 32), np.uint8))
-    assert model.histogram is before
 
 
 def test_warnings_have_the_same_filters_after_several_threads_have_trained(rng):

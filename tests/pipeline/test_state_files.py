@@ -23,6 +23,7 @@ def state(video, tmp_path):
 
 
 def test_a_restored_state_is_at_the_same_position(state, tmp_path):
+    assert files(tmp_path) == {}, "there is no checkpoint"
     content = files(state)
     restore(tmp_path / "there", content)
     assert Pipeline(resume=tmp_path / "there").frames == 12
@@ -37,11 +38,7 @@ def test_a_run_is_resumed_with_all_settings_that_are_given_also_if_they_are_the_
     assert Pipeline(resume=state, settings=Settings()).settings == Settings()
 
 
-def test_a_folder_without_a_checkpoint_has_no_files(tmp_path):
-    assert files(tmp_path) == {}
-
-
-@pytest.mark.parametrize("name", ["../other", "trees/../../other", "/etc/passwd", "trees/1.safetensors.part"])
+@pytest.mark.parametrize("name", ["../other", "searched_models/../x", "/etc/passwd", "trees/1.safetensors.part"])
 def test_a_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
     with pytest.raises(ServiceError, match="not a file of the state"):
         restore(tmp_path, {name: b""})

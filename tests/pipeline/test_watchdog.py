@@ -30,15 +30,6 @@ def test_a_watchdog_counts_turns_and_only_an_announced_long_step_may_take_long()
         assert watchdog.patience == RUNNING_SECONDS + 6
 
 
-def test_a_process_knows_what_the_owner_of_its_run_has():
-    with closing(Watchdog()) as watchdog:
-        loop = Watchdog(watchdog.handle)
-        watchdog.after = 7
-        assert (loop.after, loop.read) == (7, 7)
-        watchdog.read = 9
-        assert (loop.after, loop.read) == (7, 9)
-
-
 def test_a_compressor_counts_an_iteration_after_each_object_of_a_message(folder, rng, monkeypatch):
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
     turns, take = [], Compressor.take

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from contextlib import nullcontext
-from itertools import islice
 
 import numpy as np
 import pytest
@@ -20,8 +19,6 @@ from catstream.messages.heads import APPEARANCE, EXTENT, TREES
 from catstream.messages.kinds import DetectorState, ObjectFeatures, TrainingRows
 from catstream.run.learned import Learned, check_sizes, merge
 from catstream.settings import Settings
-from catstream.tracker import Tracker
-from catstream.video.source import open_source
 
 SIZE, WIDTH, FRAMES = 8, row_length(), 60
 SETTINGS = Settings(coreset={"size": SIZE})
@@ -101,18 +98,13 @@ def test_the_energy_lost_before_saving_stays_in_the_bound(messages, tmp_path):
 
 
 def test_samples_continue_after_the_version_of_the_saved_model(learned, messages):
-    compressor, version = learned.compressor(SETTINGS), learned.model.version
+    compressor, version, before = learned.compressor(SETTINGS), learned.model.version, bits(learned.trees)
     assert compressor.version == compressor.last_sample.version == version
     samples = [compressor.take(frame, message, compressor.version + 1) for frame, message in enumerate(messages)]
     versions = [sample.version for sample in samples if sample]
     assert versions == list(range(version + 1, version + 1 + len(versions)))
     assert versions
-
-
-def test_a_saved_model_is_not_changed_by_a_run_that_continues_from_it(learned, messages):
-    before = bits(learned.trees)
-    compressed(messages, learned.compressor(SETTINGS))
-    assert bits(learned.trees) == before
+    assert bits(learned.trees) == before, "the run has trees of its own"
 
 
 def test_settings_that_do_not_suit_the_trees_are_an_error(learned):
@@ -120,23 +112,14 @@ def test_settings_that_do_not_suit_the_trees_are_an_error(learned):
         learned.compressor(Settings(coreset={"size": 16}))
 
 
-def test_before_the_first_sample_there_is_nothing_to_save():
+def test_before_the_first_sample_or_while_its_object_is_searched_for_a_run_has_nothing_to_save(learned):
     with pytest.raises(ServiceError, match="nothing was learned"):
         learn(stream(1, 1))
-
-
-def test_a_run_that_has_only_searched_for_its_object_has_nothing_new_to_save(learned):
     (message,) = stream(2, 1)
     sought = dataclasses.replace(message, box=None, detector=dataclasses.replace(message.detector, first_window=None))
     compressor = compressed([sought], learned.compressor(SETTINGS))
     with pytest.raises(ServiceError, match="the object of the saved model was not found yet"):
         Learned.of(compressor, SETTINGS)
-
-
-def test_a_file_of_another_kind_is_an_error(messages, tmp_path):
-    storage.write(tmp_path / "one", *compressed(messages).trees["object"].state())
-    with pytest.raises(ProtocolError, match="not a saved model"):
-        Learned.load(tmp_path / "one")
 
 
 def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
@@ -246,21 +229,6 @@ def test_views_of_an_object_need_to_look_like_one_of_the_others_only():
 
 def test_a_model_with_a_name_and_one_without_are_of_the_same_object(learned):
     assert merge([learned, learn(stream(2), name="anna")]).object == "anna"
-
-
-def test_a_tracker_gives_what_its_trees_have_learned(demo_video):
-    path, boxes = demo_video(60)
-    tracker = Tracker({"coreset.size": 16})
-    with open_source(str(path)) as source:
-        for frame in islice(source, 12):
-            if frame.number:
-                tracker.update(frame.image)
-            else:
-                tracker.init(frame.image, boxes[0])
-    learned = tracker.learned()
-    assert learned.object == ""
-    assert learned.box.overlap(Box(*boxes[11])) > 0.5
-    assert learned.likeness()(learned.trees["object"].nodes[0].rows[0]) > 0.5
 
 
 def test_a_file_without_any_of_its_parts_is_an_error(learned):
