@@ -43,7 +43,6 @@ svg .grid { stroke: var(--line); }
 .pictures figure { margin: 0; min-width: 0; } .pictures img { display: block; width: 100%; border-radius: 6px; }
 .pictures figcaption { font-size: 13px; margin-top: .35rem; line-height: 1.35; font-variant-numeric: tabular-nums; }
 .pictures b { display: block; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; font-weight: 600; }
-.missing { display: grid; place-items: center; aspect-ratio: 4 / 3; border-radius: 6px; background: var(--soft); }
 .timeline { margin: .2rem 0 .9rem; }
 .lane { position: relative; height: 12px; margin: 3px 0; border-radius: 3px; overflow: hidden;
   background: var(--soft); }
@@ -74,16 +73,10 @@ def table(heads: Iterable[str], rows: Iterable[Iterable[object]], *, texts: int 
     )
 
 
-def figure(jpeg: bytes | None, title: str, caption: str = "", tooltip: str = "") -> str:
-    """Return a picture with a title and a caption below it; without a JPEG file, the title stands below a blank one.
-
-    tooltip : shown if the pointer is over the title, by default the title itself
-    """
-    title, caption, tooltip = escape(title), escape(caption), escape(tooltip or title)
-    shown = '<div class="missing">no picture</div>'
-    if jpeg is not None:
-        data = base64.b64encode(jpeg).decode("ascii")
-        shown = f'<img src="data:image/jpeg;base64,{data}" alt="{title}">'
+def figure(jpeg: bytes, title: str, caption: str, tooltip: str) -> str:
+    """A picture with a title and a caption below it; the tooltip is shown if the pointer is over the title."""
+    title, caption, tooltip = escape(title), escape(caption), escape(tooltip)
+    shown = f'<img src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode("ascii")}" alt="{title}">'
     return f'<figure>{shown}<figcaption><b title="{tooltip}">{title}</b>{caption}</figcaption></figure>'
 
 

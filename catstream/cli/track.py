@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -247,17 +247,10 @@ class _Run:
             # The files are closed after the processes, which would track on meanwhile, for none of them.
             with ExitStack() as closed_last, pipeline, ExitStack() as stack:
                 files.make_folder()
-                place = f"--endpoint {pipeline.endpoint}"
                 if self.view is not None:
                     self._serve(pipeline, self.view, stack, console)
-                if pipeline.holding == "waiting":
-                    page = "the page" if self.view is not None else f"the page of catstream view {place}"
-                    ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
-                    console.print(f"waiting for a box: {ways}")
-                elif pipeline.holding:
-                    console.print(f"paused: to continue, catstream resume {place}")
                 with progress.line(console) as line:
-                    self._write_tracks(pipeline, files, lambda tracks: progress.show(line, tracks), closed_last)
+                    self._write_tracks(pipeline, files, progress, line, closed_last)
         except KeyboardInterrupt:
             return True
         return False
@@ -273,18 +266,35 @@ class _Run:
         for url in server.urls:
             console.print(f"page: {url}")
 
-    def _write_tracks(self, pipeline: Pipeline, files: RunFiles, show: Callable[..., None], stack: ExitStack) -> None:
+    def _say_what_holds(self, pipeline: Pipeline, console: Console) -> None:
+        """Say how a run goes on that is paused or has no object."""
+        place = f"--endpoint {pipeline.endpoint}"
+        if pipeline.holding == "waiting":
+            page = "the page" if self.view is not None else f"the page of catstream view {place}"
+            ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
+            console.print(f"waiting for a box: {ways}")
+        elif pipeline.holding:
+            console.print(f"paused: to continue, catstream resume {place}")
+
+    def _write_tracks(
+        self, pipeline: Pipeline, files: RunFiles, progress: RunProgress, line: Progress, stack: ExitStack
+    ) -> None:
         """Write every track to all files, which the stack closes, and show it."""
-        endpoint = pipeline.endpoint
+        endpoint, held = pipeline.endpoint, bool(pipeline.holding)
         write = stack.enter_context(files.opened(endpoint, resume=True)) if self.resume is not None else None
         moment = time.perf_counter()
-        for tracks in pipeline.by_frame():
+        for tracks in pipeline.by_frame(_REFRESH_SECONDS) if held else pipeline.by_frame():
+            if held and "detector" in pipeline.health:  # it answers commands from now on
+                held = False
+                self._say_what_holds(pipeline, line.console)
+            if not tracks:
+                continue
             # New files are opened with the first track: a run that cannot start does not change older results.
             write = write or stack.enter_context(files.opened(endpoint))
             before, moment = moment, time.perf_counter()
             with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                 write(TrackedFrame([*tracks.values()], moment - before))
-                show(tracks)
+                progress.show(line, tracks)
 
 
 @dataclass(slots=True)

@@ -27,7 +27,6 @@ _Colour = tuple[int, int, int]
 
 _COLOURS: dict[str, _Colour] = {"present": (110, 220, 60), "bootstrapping": (40, 180, 250), "absent": (90, 90, 240)}
 _WHITE, _DARK, _BLACK = (245, 245, 245), (32, 32, 32), (17, 17, 17)
-_ORANGE = (40, 140, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 #: Height of the line of text below an image that is 640 pixels wide, and the smallest factor by which it is scaled.
@@ -71,15 +70,8 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
     An object that is alone and has no name is drawn in the colour of its state. Other objects have a colour each and
     their names at their boxes. Their scores are below the frame.
 
-    Parameters
-    ----------
-    image : uint8 (h, w, 3), blue green red
-    tracks : the tracks of this frame, at least one
-    colours : the colours of the objects, which are kept from frame to frame
-
-    Returns
-    -------
-    uint8 (h + k, w, 3): the frame, and k rows of pixels with the text below it
+    The image is uint8 (h, w, 3), blue green red, the result uint8 (h + k, w, 3) with k rows for the text. There is at
+    least one track; the colours are kept from frame to frame.
     """
     height, width = image.shape[:2]
     unit = max(width / 640, _MIN_UNIT)
@@ -106,12 +98,7 @@ def drawn_size(size: tuple[int, int]) -> tuple[int, int]:
 
 
 def draw_preview(preview: Preview, tracks: Sequence[Track], colours: Colours) -> bytes:
-    """Draw the tracks of its frame into a preview, with a line of text below; the line is empty without tracks.
-
-    Returns
-    -------
-    JPEG file, of the same size with and without tracks
-    """
+    """Draw the tracks of its frame into a preview, with a line of text below, empty without tracks: a JPEG file."""
     image = preview_image(preview, tracks, colours)
     return preview.jpeg if image is None else jpeg(image)
 
@@ -125,30 +112,6 @@ def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -
         return np.vstack([image, np.full((_text_height(image.shape[1]), image.shape[1], 3), _DARK, np.uint8)])
     scale = image.shape[1] / preview.width
     return draw(image, [_scaled(track, scale) for track in tracks], colours)
-
-
-def thumbnail(image: np.ndarray, truth: np.ndarray, box: np.ndarray, width: int) -> bytes:
-    """Return a small image of a frame with the ground truth box in white and the tracker's box in orange.
-
-    Parameters
-    ----------
-    image : uint8 (h, w, 3), blue green red
-    truth, box : float64 (4,), x, y, w, h; a box with NaN is not drawn
-    width : width of the small image in pixels
-
-    Returns
-    -------
-    JPEG file
-    """
-    boxes = [(one, colour) for one, colour in ((truth, _WHITE), (box, _ORANGE)) if np.isfinite(one).all()]
-    scale = width / image.shape[1]
-    small = cv2.resize(image, (width, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
-    for box, colour in boxes:
-        x, y, w, h = (float(value) * scale for value in box)
-        corners = (round(x), round(y)), (round(x + w), round(y + h))
-        cv2.rectangle(small, *corners, (0, 0, 0), 3, cv2.LINE_AA)
-        cv2.rectangle(small, *corners, colour, 1, cv2.LINE_AA)
-    return jpeg(small)
 
 
 def _scaled(track: Track, scale: float) -> Track:

@@ -149,16 +149,9 @@ def without_password(source: str) -> str:
 def as_bgr(image: object) -> np.ndarray:
     """Return an image as a writable, contiguous uint8 array (h, w, 3), blue green red; no copy is made if it is one.
 
-    Parameters
-    ----------
-    image : array of shape (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 stays as it is; uint16 is
-        reduced to its upper 8 bits; floats from 0 to 1 are scaled to 255 and rounded. An alpha channel is dropped. The
-        array may be read-only and not contiguous
-
-    Raises
-    ------
-    FrameError
-        For any other array.
+    It is of shape (h, w, 3) BGR, (h, w, 4) BGRA, (h, w) or (h, w, 1) grey. uint8 stays as it is; uint16 is reduced to
+    its upper 8 bits; floats from 0 to 1 are scaled to 255 and rounded. An alpha channel is dropped. The array may be
+    read-only and not contiguous. FrameError for any other array.
 
     >>> as_bgr(np.full((2, 2, 1), 0.5))[0, 0]
     array([128, 128, 128], dtype=uint8)
@@ -218,11 +211,7 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
 
 
 def jpeg(image: np.ndarray, side: int | None = None, quality: int = 80) -> bytes:
-    """Return an image as JPEG, scaled down if its longer side exceeds `side` pixels.
-
-    Parameters
-    ----------
-    image : uint8 (h, w, 3) BGR, or (h, w) grey
+    """An image, uint8 (h, w, 3) BGR or (h, w) grey, as JPEG, scaled down if its longer side exceeds `side` pixels.
 
     >>> jpeg(np.zeros((480, 1280, 3), np.uint8), side=640)[:3].hex()
     'ffd8ff'

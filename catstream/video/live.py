@@ -51,12 +51,8 @@ class LiveSource(Source):
     """A camera or a stream; each iteration gives its newest frame. `catstream.video.source.open_source` opens one.
 
     Iteration waits for a frame that was not returned yet. If the source reconnects with another image size, its frames
-    are scaled to the size of the first one.
-
-    Raises
-    ------
-    VideoError
-        From the constructor, if the source cannot be opened and no `idle` was given; never later.
+    are scaled to the size of the first one. VideoError from the constructor, if the source cannot be opened and no
+    `idle` was given; never later.
     """
 
     live = True

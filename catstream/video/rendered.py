@@ -119,10 +119,7 @@ class Demo:
 
     After `FRAMES` images the sequence runs backwards, then forwards again, so that a video of any length has no jump.
 
-    Parameters
-    ----------
-    size : (width, height) of the images; if it is not 4:3, the images are stretched
-    seed : seed of the sensor noise
+    If their size is not 4:3, the images are stretched. The seed is that of the sensor noise.
     """
 
     def __init__(self, size: tuple[int, int] = SIZE, seed: int = 0) -> None:
@@ -136,13 +133,9 @@ class Demo:
         self.flight, self.away, self.camera = (_interpolate(keys) for keys in (_FLIGHT, _DECOY, _CAMERA))
 
     def image(self, number: int) -> tuple[np.ndarray, Box | None]:
-        """Return an image, and the box of the dahlia.
+        """An image, uint8 (height, width, 3), blue green red, and the box of the whole dahlia.
 
-        Returns
-        -------
-        image : uint8 (height, width, 3), blue green red
-        box : box of the whole dahlia, including parts that are occluded or outside the image; None if less than a tenth
-            of it is visible
+        The box includes parts that are occluded or outside the image; it is None if less than a tenth is visible.
         """
         frame = FRAMES - 1 - abs(number % (2 * FRAMES - 2) - (FRAMES - 1))
         left, top, light = self.camera[frame]

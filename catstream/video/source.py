@@ -125,24 +125,18 @@ def open_source(
 ) -> Source:
     """Open the source that `text` names; the docstring of the module lists the kinds.
 
-    Parameters
-    ----------
-    text : name of the source
-    start : number of the first frame to return, counted within the part. The frames before it in a file are decoded
-        and dropped; a live source numbers its first frame `start`
-    part : the frames of a file or folder that are read, for example `slice(100, 200, 2)` for 100, 102 ... 198
-    since : zero of the time stamps of a live source, as `time.monotonic` gives it; None for its first frame
-    idle : function that is called ten times a second while a live source gives no frame; if it returns True, iteration
-        ends. With it, opening a live source never fails: iteration waits for the first frame for any length of time,
-        and the size is known with that frame
-    settings : the settings of a run, of which `image_rate`, `skip_damaged` and `resize` are used
-    single : single ones of them by name, in the place of those in `settings`
+    start     number of the first frame to return, counted within the part. The frames before it in a file are decoded
+              and dropped; a live source numbers its first frame `start`
+    part      the frames of a file or folder that are read, for example `slice(100, 200, 2)` for 100, 102 ... 198
+    since     zero of the time stamps of a live source, as `time.monotonic` gives it; None for its first frame
+    idle      is called ten times a second while a live source gives no frame; if it returns True, iteration ends. With
+              it, opening a live source never fails: iteration waits for the first frame for any length of time, and the
+              size is known with that frame
+    settings  the settings of a run, of which `image_rate`, `skip_damaged` and `resize` are used
+    single    single ones of them by name, in the place of those in `settings`
 
-    Raises
-    ------
-    VideoError
-        If the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the frames
-        before it.
+    VideoError if the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the
+    frames before it.
     """
     settings = replace(settings or RunSettings(), **single)
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):

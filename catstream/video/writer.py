@@ -26,17 +26,7 @@ class VideoWriter:
     The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed. If no frame was
     written, or writing failed, no file is left: an MP4 without its index cannot be read.
 
-    Parameters
-    ----------
-    path : file to write
-    rate : frames per second, on average
-    size : (width, height) of the frames in pixels
-    pixel_aspect : width of a pixel divided by its height
-
-    Raises
-    ------
-    VideoError
-        From the constructor if the file cannot be written; later if a write fails.
+    The rate is the average of frames per second. VideoError, also from the constructor, if the file cannot be written.
     """
 
     def __init__(
@@ -73,13 +63,9 @@ class VideoWriter:
         self._stream.codec_context.sample_aspect_ratio = pixel_aspect
 
     def write(self, image: np.ndarray, time: float | None = None) -> None:
-        """Add a frame.
+        """Add a frame, uint8 (h, w, 3), blue green red, of the size given to the constructor.
 
-        Parameters
-        ----------
-        image : uint8 (h, w, 3), blue green red, of the size given to the constructor
-        time : time stamp in seconds of the source; the first one is the start of the video. If None, frames have the
-            constant rate given to the constructor
+        The first time stamp, in seconds of the source, is the start of the video. Without them, the rate is constant.
         """
         import av
 

@@ -36,15 +36,9 @@ Message = TypeVar("Message", bound=_Numbered)
 
 
 class Sender(ChannelSocket[Message]):
-    """The sending side of an acknowledged channel.
+    """The sending side of an acknowledged channel; at most `size` messages, fewer large ones, wait for their reply.
 
-    Parameters
-    ----------
-    size : messages that may be sent and not acknowledged; fewer if they are large
-
-    Attributes
-    ----------
-    window : the messages that were sent, acknowledged and stored
+    window  the messages that were sent, acknowledged and stored
     """
 
     def __init__(self, channel: Channel[Message], endpoint: Endpoint, size: int) -> None:
@@ -62,14 +56,9 @@ class Sender(ChannelSocket[Message]):
         return None
 
     def send(self, message: Message) -> None:
-        """Send the message with the next seq, without waiting.
+        """Send the message with the next seq, without waiting; ValueError if the window is full.
 
-        Raises
-        ------
-        ValueError
-            If the window is full.
-        ServiceError
-            If the message is larger than the channel takes: it would never arrive.
+        ServiceError if the message is larger than the channel takes: it would never arrive.
         """
         self.poll(0)
         data = self._encode(message)
@@ -84,10 +73,7 @@ class Sender(ChannelSocket[Message]):
     def poll(self, seconds: float) -> None:
         """Process acknowledgements, waiting at most this long for the first; retransmit what is missing.
 
-        Raises
-        ------
-        ProtocolError, StreamRewoundError
-            As `SendWindow.receive`.
+        Errors are those of `SendWindow.receive`.
         """
         while self._wait(seconds):
             position = self._decode(self._socket.recv(), Position)
@@ -118,17 +104,12 @@ class Receiver(ChannelSocket[Message]):
     Each message that `receive` returns is processed, and then acknowledged. Senders that were restarted wait for
     `answer`: what they have not sent themselves should be stored by then, as they cannot repeat it without the source.
 
-    Parameters
-    ----------
-    position : where the stream continues; the next message received is the one after `position.taken`
-    size : as the sender's
-    check : raises ProtocolError if a message does not belong to this stream; it then does not count as received
-    states : returns the states of the detectors after a message, for a sender that was restarted
-
-    Attributes
-    ----------
-    window : the messages that were received and stored
-    asking : the senders that were restarted and wait for `answer`, and the message whose states they ask for
+    position  where the stream continues; the next message received is the one after `position.taken`
+    size      as the sender's
+    check     raises ProtocolError if a message does not belong to this stream; it then does not count as received
+    states    returns the states of the detectors after a message, for a sender that was restarted
+    window    the messages that were received and stored
+    asking    the senders that were restarted and wait for `answer`, and the message whose states they ask for
     """
 
     def __init__(

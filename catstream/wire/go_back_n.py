@@ -38,20 +38,12 @@ _MOST_SAMPLES = 65536  # changes of the newest samples that a sender remembers u
 
 
 class SendWindow:
-    """The sender's side.
+    """The sender's side; `size` unacknowledged messages are kept at most, fewer if they are large.
 
-    Parameters
-    ----------
-    channel : name of the channel, for errors
-    size : unacknowledged messages that are kept at most; fewer if they are large
-    now : the time
-
-    Attributes
-    ----------
-    sent : newest seq that was pushed
-    acknowledged : newest seq that the receiver will not ask for again while it lives
-    stored : newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written
-    taken : newest seq that the receiver has processed
+    sent          newest seq that was pushed
+    acknowledged  newest seq that the receiver will not ask for again while it lives
+    stored        newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written
+    taken         newest seq that the receiver has processed
     """
 
     def __init__(self, channel: str, size: int, now: float) -> None:
@@ -104,12 +96,8 @@ class SendWindow:
     def receive(self, position: Position, now: float) -> bool:
         """Process a reply; returns False for one that is older than the last one, which changes nothing.
 
-        Raises
-        ------
-        ProtocolError
-            If the receiver has stored messages that were never sent: it holds another stream.
-        StreamRewoundError
-            If the receiver needs messages that it had acknowledged before, and that were dropped here.
+        ProtocolError if the receiver has stored messages that were never sent, StreamRewoundError if it needs messages
+        that it had acknowledged before, and that were dropped here.
         """
         if position.seq > max(self.sent, self._sent_before):
             raise ProtocolError(
@@ -154,19 +142,12 @@ class SendWindow:
 
 
 class ReceiveWindow:
-    """The receiver's side.
+    """The receiver's side: the stream continues with the message after `position.taken`; the sender keeps `size`.
 
-    Parameters
-    ----------
-    position : where the stream continues; the next message delivered is the one after `position.taken`
-    size : unacknowledged messages that the sender keeps at most
-
-    Attributes
-    ----------
-    taken : newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
-    ended : whether the sender has sent the end of the stream
-    connected : whether the sender of the newest message was still connected when a message was last awaited
-    peer : the sender of the newest message, to which acknowledgements go; None before the first
+    taken      newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
+    ended      whether the sender has sent the end of the stream
+    connected  whether the sender of the newest message was still connected when a message was last awaited
+    peer       the sender of the newest message, to which acknowledgements go; None before the first
     """
 
     def __init__(self, position: Position, size: int) -> None:
@@ -184,7 +165,7 @@ class ReceiveWindow:
 
     @property
     def half_full(self) -> bool:
-        """Return whether half of the sender's window is not stored yet: the sender waits while its window is full."""
+        """Whether half of the sender's window is not stored yet: the sender waits while its window is full."""
         return 2 * (self.taken - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def asked(self, peer: bytes) -> Position:
@@ -196,9 +177,7 @@ class ReceiveWindow:
     ) -> tuple[bool, Position | None]:
         """A message of `size` bytes arrived; `last` says whether it is the end of the stream.
 
-        Returns
-        -------
-        whether it is the next one, to be given to the application; and the reply to its sender, if there is one now
+        Returns whether it is the next one, to be given to the application; and the reply to its sender, if any.
         """
         ends = last and not self.ended  # also before a restarted sender has repeated what was delivered
         if seq <= self.taken and not ends:  # retransmitted: the sender does not know that it arrived

@@ -34,16 +34,7 @@ class ResultsSender(ChannelSocket[Tracks | End]):
 
 
 class ResultsReceiver(ChannelSocket[Tracks | End]):
-    """The owner's side: each frame once, in order.
-
-    Parameters
-    ----------
-    last : number of the last message that the owner has
-
-    Attributes
-    ----------
-    last : number of the last message that was received
-    """
+    """The owner's side: each frame once, in order; `last` is the number of the last message that the owner has."""
 
     def __init__(self, endpoint: Endpoint, size: int, last: int) -> None:
         super().__init__(zmq.PULL, RESULTS, endpoint, high_water_mark=size)

@@ -244,18 +244,10 @@ def _transmit_rest() -> None:
 
 
 class ChannelSocket(Generic[Message]):
-    """One ZeroMQ socket of a channel.
+    """One ZeroMQ socket of a channel, of one of ZeroMQ's kinds; it queues `high_water_mark` messages for each peer.
 
-    Parameters
-    ----------
-    kind : of ZeroMQ's socket types
-    high_water_mark : messages that are queued for each peer at most
-
-    Attributes
-    ----------
-    channel : row of the table
-    rejected : messages that were dropped because they were not what the channel carries
-    run : id of the run that the last message is from, see `catstream.wire.codec`; empty if it is not known
+    rejected  messages that were dropped because they were not what the channel carries
+    run       id of the run that the last message is from, see `catstream.wire.codec`; empty if it is not known
     """
 
     def __init__(self, kind: int, channel: Channel[Message], endpoint: Endpoint, high_water_mark: int) -> None:

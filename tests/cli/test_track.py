@@ -242,7 +242,7 @@ def test_a_model_does_not_replace_the_video_that_is_tracked(video, fail):
 
 
 def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video, said, monkeypatch, tmp_path):
-    monkeypatch.setattr(Pipeline, "by_frame", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(Pipeline, "by_frame", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     source, _ = video  # without a box: nothing is learned, however late the interrupt arrives
     code, _, errors = said("track", source, "--save-model", tmp_path / "model")
     assert (code, list(tmp_path.iterdir())) == (130, [])
@@ -288,6 +288,6 @@ def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video
     run = catstream("track", source, "--box", box, "--paused", "--set", f"run.endpoint={endpoint}")
     assert "paused: to continue, catstream resume --endpoint" in run.stderr.readline()
     with subscribe(endpoint, "tracks", timeout=60) as tracks:
-        succeed("resume", "--endpoint", endpoint, "--timeout", 60)
+        succeed("resume", "--endpoint", endpoint)
         assert [track.frame for track in tracks] == list(range(32))
     assert run.wait(60) == 0

@@ -153,6 +153,12 @@ def test_a_complete_run_gets_no_further_rows_but_files_that_it_lacks_and_that_is
     assert (out / "demo.ndjson").read_bytes() == before
 
 
+def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed, succeed):
+    succeed("track", "--resume", killed / "kept")
+    succeed("track", "--resume", killed / "kept", "--output", killed / "new")
+    assert frames(killed / "new") == [*range(32)]
+
+
 def test_the_files_of_a_resumed_run_are_cut_before_it_receives_a_frame(killed, said, monkeypatch):
     monkeypatch.setattr(Pipeline, "by_frame", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
     table = killed / "out" / "demo.csv"

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import msgpack
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -352,11 +352,3 @@ def test_damaged_bytes_arrive_whole_or_are_rejected(kind, changes, cut):
         data[place % len(data)] = value
     decoded_or_refused(bytes(data))
     decoded_or_refused(bytes(data[: cut % len(data)]))
-
-
-@FUZZ
-@given(st.binary(max_size=64))
-@example(b"\xc1")
-def test_random_bytes_are_rejected(data):
-    with pytest.raises(ProtocolError):
-        decode(data, *ALL)

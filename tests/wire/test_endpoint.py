@@ -26,13 +26,6 @@ def mode(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
-@pytest.mark.parametrize("text", ["run", "tcp://127.0.0.1:5700", "tcp://[::1]:5700"])
-def test_each_sender_of_each_channel_has_its_own_address(text):
-    endpoint = Endpoint.parse(text)
-    assert str(endpoint) == text
-    assert len({endpoint.address(channel, sender) for channel, sender in PLACES}) == len(PLACES)
-
-
 def test_ports_follow_the_table():
     endpoint = Endpoint.parse("tcp://127.0.0.1:6000")
     for channel, sender in PLACES:
@@ -112,17 +105,6 @@ def test_a_folder_that_is_made_is_for_this_user_alone_and_another_one_has_to_be(
     for name, problem in bad.items():
         with pytest.raises(ServiceError, match=problem), meeting_place(str(folder / name), folder):
             pass
-
-
-def test_one_pipeline_at_a_time_meets_in_a_folder(folder):
-    with (
-        meeting_place(str(folder), folder),
-        pytest.raises(ServiceError, match="already running"),
-        meeting_place(str(folder), folder),
-    ):
-        pass
-    with meeting_place(str(folder), folder):
-        pass
 
 
 def killed(place: str = "") -> Path:

@@ -326,15 +326,6 @@ def test_a_message_that_is_missing_is_reported_at_once_and_then_only_now_and_the
     assert window.receive(b"peer", 5, now=PATIENCE_SECONDS + 0.01) == report
 
 
-def test_a_message_that_was_received_before_is_acknowledged_again_each_time():
-    window = ReceiveWindow(Position(), size=8)
-    window.receive(b"peer", 1, now=0.0)
-    window.acknowledge(Position(1, versions={"anna": 4}))
-    for peer in (b"peer", b"restarted", b"restarted"):
-        assert window.receive(peer, 1, now=0.0) == (False, Position(1, 1, versions={"anna": 4}))
-    assert window.peer == b"peer", "acknowledgements go to the sender of the newest message"
-
-
 def test_a_sender_goes_back_to_what_was_taken_and_once_on_each_connection():
     window = filled(size=5, count=5)
     window.receive(Position(2, 3, again=True), now=1.0)
@@ -344,15 +335,6 @@ def test_a_sender_goes_back_to_what_was_taken_and_once_on_each_connection():
     window.disconnected()
     window.receive(Position(2, 2, again=True), now=1.6)
     assert frames(window) == [payload(3), payload(4), payload(5)]
-
-
-def test_after_a_restart_of_the_receiver_its_first_acknowledgements_count():
-    window = filled(size=4, count=4)
-    window.receive(Position(1, 4), now=0.0)
-    window.receive(Position(1, 1, again=True), now=0.0)
-    assert window.taken == 1
-    assert window.receive(Position(1, 2), now=0.0)
-    assert window.taken == 2
 
 
 def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_patience():
@@ -380,16 +362,6 @@ def test_a_sender_that_only_waits_transmits_nothing_again():
         assert frames(sender) == []
 
 
-def test_the_end_and_a_broken_connection_are_noticed_and_reset_by_a_new_message():
-    window = ReceiveWindow(Position(), size=4)
-    assert (window.connected, window.ended) == (False, False)
-    window.receive(b"peer", 1, now=0.0)
-    window.disconnected()
-    assert (window.connected, window.ended) == (False, False)
-    window.receive(b"peer", 2, now=0.0, last=True)
-    assert (window.connected, window.ended) == (True, True)
-
-
 @pytest.mark.parametrize("late", [Position(1, 3), Position(2, 2)], ids=["stored less", "received less"])
 def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late):
     window = filled(size=4, count=4)
@@ -406,14 +378,6 @@ def test_messages_kept_in_memory_by_a_full_disk_are_acknowledged_and_do_not_coun
     window.push(4, payload(4))
     with pytest.raises(StreamRewoundError, match="had 3 messages and now has 1"):
         window.receive(Position(1, 1, again=True), now=0.0)
-
-
-def test_a_new_sender_counts_as_stored_only_what_is_on_disk():
-    window = SendWindow("features", 4, now=0.0)
-    window.resume(3, Position(3, 3, unsaved=2))
-    assert (window.acknowledged, window.stored) == (3, 1)
-    window.resume(3, Position(2, 3))
-    assert (window.acknowledged, window.stored) == (3, 2)
 
 
 def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sender_are_accepted():

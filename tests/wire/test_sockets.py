@@ -65,19 +65,6 @@ def take(receiver, taken, *, store):
     receiver.answer()
 
 
-def test_an_acknowledged_channel_delivers_every_message_once_in_order(endpoint, until):
-    taken = []
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-
-        def turn():
-            send_up_to(50, sender)
-            take(receiver, taken, store=True)
-
-        until(lambda: sender.window.stored == 50, turn)
-    assert taken == list(range(1, 51))
-    assert sender.window.taken == 50
-
-
 def test_a_sender_does_not_need_its_receiver_to_be_there_first(endpoint, until):
     taken = []
     with Sender(RESULTS, endpoint, WINDOW) as sender:
@@ -108,26 +95,6 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint,
             turn()
         until(lambda: sender.window.taken == 1, turn)
     assert taken == [1]
-
-
-def test_a_full_window_accepts_no_more_messages(endpoint, until):
-    taken = []
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        for seq in range(1, WINDOW + 1):
-            sender.send(tracks(seq))
-        with pytest.raises(ValueError, match="not acknowledged"):
-            sender.send(tracks(WINDOW + 1))
-
-        def turn():
-            sender.poll(0)
-            take(receiver, taken, store=False)
-
-        until(lambda: sender.window.taken == WINDOW, turn)
-        with pytest.raises(ValueError, match="not acknowledged"):  # taken is not yet stored
-            sender.send(tracks(WINDOW + 1))
-        receiver.acknowledge(Position(1))
-        until(lambda: sender.window.stored == 1, lambda: sender.poll(0.05))
-        sender.send(tracks(WINDOW + 1))
 
 
 def test_a_message_that_is_too_large_to_arrive_is_an_error_that_says_what_to_give(endpoint):
@@ -232,21 +199,6 @@ def test_a_reader_that_never_reads_blocks_nobody(endpoint, until):
         rest = [message.seq for message in iter(lambda: idle.receive(0.2), None)]
     assert rest == sorted(set(rest)), "what arrives is in order"
     assert 0 < len(rest) < messages, "what does not fit is lost, and seq tells"
-
-
-def test_a_slow_reader_of_models_skips_to_the_newest(endpoint, until):
-    with Publisher(MODELS, endpoint) as models, Subscriber(MODELS, endpoint) as reader:
-        until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
-        for version in range(2, 101):
-            models.send(model(version))
-        seen = []
-
-        def turn():
-            models.serve_late_joiners()
-            seen.extend(message.version for message in reader.receive_all())
-
-        until(lambda: seen and seen[-1] == 100, turn)
-    assert len(seen) < 100
 
 
 def test_a_late_subscriber_receives_no_old_tracks(endpoint, until):

@@ -10,14 +10,12 @@ import pytest
 import zmq
 
 from catstream.compression.forest import Forest
-from catstream.errors import ProtocolError
 from catstream.messages.kinds import (
     End,
     Features,
     Health,
     ObjectFeatures,
     Position,
-    Track,
     TrainingRows,
 )
 from catstream.settings import Settings
@@ -121,23 +119,6 @@ def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(en
         receiver.acknowledge(Position(1))  # stored only now
         until(lambda: sender.window.stored == 1, lambda: sender.poll(0.01))
         assert not other.poll(50)
-
-
-def test_a_repeated_acknowledgement_does_not_undo_a_later_one(endpoint, until):
-    before = rejected()
-    with zmq.Context.instance().socket(zmq.ROUTER) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-        receiver.bind(endpoint.address(CHANNELS["results"]))
-        for seq in (1, 2):
-            sender.send(Track(seq, seq, 0.0, "absent", None, 0.0, 0))
-        until(lambda: receiver.poll(10), lambda: sender.poll(0))
-        peer = receiver.recv_multipart()[0]
-        for answer in (Position(1, 1), Position(2, 2), Position(1, 1)):
-            receiver.send_multipart([peer, encode(answer)])
-        until(lambda: rejected() == before + 1, lambda: sender.poll(0.01))
-        assert (sender.window.stored, sender.window.taken) == (2, 2)
-        receiver.send_multipart([peer, encode(Position(9, 9))])
-        with pytest.raises(ProtocolError, match="another stream"):
-            until(lambda: False, lambda: sender.poll(0.01))
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

@@ -83,3 +83,11 @@ def test_an_unfit_json_path_is_an_error_before_the_work(tmp_path, walk, fail):
         (tmp_path / "video.mp4", "only a file whose name ends with .json is replaced"),
     ):
         assert why in fail("evaluate", walk, "--tracker", "mil", "--json", place)
+
+
+def test_a_report_that_cannot_be_written_is_an_error_of_one_line_after_the_table(tmp_path, walk, said):
+    (tmp_path / "report.html").mkdir()
+    code, output, errors = said("evaluate", walk, "--tracker", "mil", "--output", tmp_path)
+    assert re.search(r"walk +mil +12", output)
+    place = str(tmp_path / "report.html")
+    assert (code, errors) == (1, f"catstream: cannot write {place!r} (Is a directory): give another place\n")
