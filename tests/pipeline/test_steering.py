@@ -215,6 +215,18 @@ def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_vide
     assert versions[-1] > version
 
 
+def test_a_run_from_a_saved_model_goes_on_if_the_detector_dies(video, saved):
+    tracks = []
+    with Pipeline(video[0], settings={"run.lockstep": True}, model=saved, part=slice(10, 32)) as pipeline:
+        for track in pipeline:
+            tracks.append(track)
+            if track.frame == 8:
+                os.kill(pipeline.pids["detector"], signal.SIGKILL)
+    assert pipeline.restarts == 1
+    assert [track.frame for track in tracks] == list(range(22))
+    assert tracks[-1].box.overlap(video[1][31]) > 0.5
+
+
 def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, rng, tmp_path):
     path, _ = video
     with open_source(path) as source:
