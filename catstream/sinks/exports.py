@@ -74,7 +74,7 @@ def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
         with closing(sqlite3.connect(path)) as database, database:
             database.execute(f"CREATE TABLE tracks ({columns}, PRIMARY KEY (frame, object)) STRICT")
             marks = ", ".join("?" for _ in _COLUMNS)
-            database.executemany(f"INSERT INTO tracks VALUES ({marks})", _rows(frames))  # nosec B608: question marks
+            database.executemany(f"INSERT INTO tracks VALUES ({marks})", _rows(frames))  # nosec B608
     except sqlite3.Error as error:
         raise VideoError(f"cannot write {path}: {error}") from None
 

@@ -31,8 +31,8 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
-from catstream.errors import CatstreamError, CommandRejectedError, ProtocolError, SilenceError
-from catstream.messages.schema import ObjectName
+from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
+from catstream.messages.names import check_name
 from catstream.video.annotate import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
@@ -46,7 +46,7 @@ RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
 _MAX_BODY = 4096  # bytes
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.
-_CODES = {CommandRejectedError: 409, ProtocolError: 400, SilenceError: 504, CatstreamError: 503}
+_CODES = {CommandRejectedError: 409, ProtocolError: 400, ObjectError: 400, SilenceError: 504, CatstreamError: 503}
 
 
 def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
@@ -132,6 +132,8 @@ class Site:
             if len(body := body + part) > _MAX_BODY:
                 raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
         command = decode_json(body, Command)
+        if command.object:
+            check_name(command.object)
         try:
             answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
@@ -193,7 +195,7 @@ class Command:
     """A command of the page: the fields of `catstream.messages.kinds.Command` that it may set."""
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
-    object: ObjectName = ""
+    object: str = ""
     box: Box | None = None
     keep: bool = False
 

@@ -164,7 +164,8 @@ class PipelineFeed(Feed):
                 if not (due or channel == "tracks") or (message := _next(messages)) is None:
                     continue
                 now = monotonic()
-                self._call(self.dashboard.take, message, now, messages.run)
+                if deadline == inf or not isinstance(message, End):  # the next pipeline may have begun at this place
+                    self._call(self.dashboard.take, message, now, messages.run)
                 if channel == "health":
                     last_report = now
                 if isinstance(message, End):

@@ -63,9 +63,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   console.log("state", await state.innerText());
   await page.waitForSelector(".tree .node", { state: "attached", ...patience });
 
-  console.log("kill");
-  await is("silent");
-  console.log("state", await state.innerText());
+  console.log("trees");
   await is("ended");
   console.log("state", await state.innerText());
   for await (const line of createInterface({ input: process.stdin })) if (line === "restart") break;

@@ -88,7 +88,7 @@ const doing = {
     await page.keyboard.press("Escape");
     await page.click(`[aria-label="Forget ${ben.name}"]`);
   },
-  "two objects": (page) => page.click("dialog .danger"),
+  "two objects": (page) => Promise.all([page.waitForRequest("**/control"), page.click("dialog .danger")]),
   "drawing the next one while the answer comes": async (page) => {
     let answer;
     answered = new Promise((resolve) => { answer = resolve; });
