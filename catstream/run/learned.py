@@ -31,7 +31,6 @@ from catstream.messages.schema import check_message
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
 from catstream.numerics.threads import one_thread
 from catstream.settings import Settings
-from catstream.training.trainer import Trainer
 
 _KIND = "learned 3"  # and the version of what the file holds
 
@@ -330,6 +329,8 @@ def _check_alike(parts: Sequence[Learned]) -> None:
 
 
 def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings) -> Model:
+    from catstream.training.trainer import Trainer  # with filterpy, whose second of imports no client has to pay
+
     with one_thread():  # as a pipeline's own trainer: the model has the same bits
         return Trainer(settings).train(sample_of(trees, version, 0, centres, name))
 
