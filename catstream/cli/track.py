@@ -38,7 +38,7 @@ from catstream.services.options import (
 from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file
 from catstream.sinks.track_log import RunFiles, places_of
 
-_SHORTEST_SECONDS = 1.0  # of a run whose rate is told
+_SHORTEST_SECONDS = 1.0  # a shorter run is reported without its frames per second
 _REFRESH_SECONDS = 0.1  # between two updates of the progress
 
 

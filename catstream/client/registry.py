@@ -130,7 +130,7 @@ def _local(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
 
 
 def _status(answer: Listing) -> FleetStatus:
-    """What an answer says."""
+    """The content of an answer."""
     try:
         return msgspec.json.decode(answer.fleet, type=FleetStatus)
     except (msgspec.DecodeError, RecursionError) as error:
