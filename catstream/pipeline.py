@@ -34,6 +34,7 @@ from catstream.settings import Settings
 from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.socket import check_owner
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _CLOSED = ExitStack()  # marks a pipeline that was closed
@@ -231,7 +232,7 @@ class Pipeline:
             self._supervisor = Supervisor(job, folder, self._start, live=self.live)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._stack = str(endpoint), stack.pop_all()
-            self._pid = os.getpid()  # a copy of this process that is forked later does not end the run
+            self._owner = os.getpid()  # a copy of this process that is forked later does not end the run
         return self
 
     def _started(self, endpoint: str) -> Job:
@@ -249,7 +250,7 @@ class Pipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         stack, self._stack = self._stack, _CLOSED
-        if stack is not None and stack is not _CLOSED and self._pid == os.getpid():
+        if stack is not None and stack is not _CLOSED and self._owner == os.getpid():
             stack.__exit__(kind, error, trace)
 
     def close(self) -> None:
@@ -257,7 +258,7 @@ class Pipeline:
         self.__exit__(None, None, None)
 
     def __del__(self) -> None:
-        if getattr(self, "_stack", None) not in (None, _CLOSED):
+        if getattr(self, "_stack", None) not in (None, _CLOSED) and self._owner == os.getpid():
             text = f"{self!r} was not closed: use it in a `with`"
             self.close()
             warnings.warn(text, ResourceWarning, source=self, stacklevel=1)  # last: it may be an error
@@ -311,6 +312,7 @@ class Pipeline:
             raise ServiceError(_ONCE)
         if self._supervisor is None:
             raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
+        check_owner(self._owner)
         return self._supervisor
 
     @property
@@ -359,7 +361,10 @@ class Pipeline:
     @property
     def pids(self) -> dict[str, int]:
         """Process ids of the running processes, by name."""
-        return self._supervisor.pids if self._supervisor is not None else {}
+        if self._supervisor is None:
+            return {}
+        check_owner(self._owner)
+        return self._supervisor.pids
 
     @property
     def restarts(self) -> int:

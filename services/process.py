@@ -7,6 +7,7 @@ import logging
 import mmap
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +18,7 @@ from secrets import token_hex
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.messages.kinds import Health
 from catstream.run.job import Job
+from catstream.services.start_server import reset_process
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
@@ -167,9 +169,10 @@ def run(
     """
     if parent is not None:
         die_with(parent)
+    reset_process()
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)  # the supervisor selects by it
-    service = import_module(f"catstream.services.{name}_process")
     try:
+        service = import_module(f"catstream.services.{name}_process")
         job = Job.load(job) if isinstance(job, Path) else job
         job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
         process = Process(name, job, watchdog)
@@ -181,7 +184,7 @@ def run(
         _log.warning("%s", error)
         return 1
     except CatstreamError as error:
-        _log.error("%s", error)
+        print(error, file=sys.stderr)  # without the name: a supervisor raises it, and does not log it too
         return PERMANENT_FAILURE
     if process.source_failed:
         return SOURCE_FAILED

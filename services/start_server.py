@@ -21,6 +21,7 @@ import fcntl
 import gc
 import json
 import os
+import resource
 import select
 import signal
 import socket
@@ -45,13 +46,27 @@ _LONGEST = 1 << 16  # bytes of a request
 _MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
 
 
+def reset_process() -> None:
+    """Let this process begin in a known state, whatever its parent has set before: signals that are delivered, and as
+    many open files as it may have.
+    """
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
 class StartedProcess:
-    """A process that the server starts or has started; `answers` is the socket on which the server reports it."""
+    """A process that the server starts or has started; `answers` is the socket on which the server reports it.
+
+    lost  whether the server has ended before the process
+    """
 
     def __init__(self, answers: socket.socket) -> None:
         self._answers, self._lock = answers, threading.Lock()
         self._pid = 0
         self._code: int | None = None
+        self.lost = False
 
     @property
     def pid(self) -> int:
@@ -85,7 +100,7 @@ class StartedProcess:
             except ConnectionError:
                 data = b""
             if not data:  # the server has ended, and the kernel kills the process
-                self._code = -signal.SIGKILL
+                self._code, self.lost = -signal.SIGKILL, True
             elif self._pid:
                 self._code = int(data)
             else:
@@ -99,6 +114,12 @@ class StartedProcess:
             self._receive(_LOOK_SECONDS)
         self._answers.close()
 
+    def reap(self) -> None:
+        """Ask for the exit code of a process that the server has left behind to this one, if that has the number 1."""
+        if self.lost and self._pid and os.getpid() == 1:
+            with suppress(ChildProcessError):
+                os.waitpid(self._pid, 0)
+
 
 class StartServer:
     """A start server, as its program sees it; ServiceError if the program is not one that Python runs."""
@@ -107,6 +128,7 @@ class StartServer:
         if getattr(sys, "frozen", False) or not sys.executable:
             raise ServiceError("a frozen program has no Python to start processes with: run it with python")
         self.program = os.getpid()  # a copy of this process that is forked later has no server
+        self._started: list[StartedProcess] = []
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # If the program has closed its standard output, the socket may have its number.
         passed = fcntl.fcntl(theirs, fcntl.F_DUPFD_CLOEXEC, 3)
@@ -124,8 +146,14 @@ class StartServer:
         self.pid = self._process.pid
 
     def runs(self) -> bool:
-        """Whether it is of this process, and has not ended."""
-        return self.program == os.getpid() and self._process.poll() is None
+        """Whether it is of this process, and has not ended; ServiceError if it has ended with an error."""
+        if self.program != os.getpid():
+            return False
+        if (code := self._process.poll()) is not None and code > 0:
+            raise ServiceError(
+                f"{sys.executable} did not start the processes of a pipeline (exit code {code}): its error is above"
+            )
+        return code is None
 
     def start(self, name: str, job: Path, log: int, watchdog: int, *, restarted: bool) -> StartedProcess:
         """Request one of the processes `NAMES`, with descriptors of its log and its watchdog; do not wait for it."""
@@ -137,13 +165,17 @@ class StartServer:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, suppress(ConnectionError):  # the server has just ended: so has the process
             socket.send_fds(self._requests, [json.dumps(request).encode()], [log, watchdog, theirs.fileno()])
-        return StartedProcess(ours)
+        self._started = [each for each in self._started if each.poll() is None]
+        self._started.append(StartedProcess(ours))
+        return self._started[-1]
 
     def close(self) -> None:
         """End the server, and its processes with it."""
         self._requests.close()
         self._process.kill()  # it may be in a long import
         self._process.wait()
+        for each in self._started:
+            each.reap()
 
 
 _server: StartServer | None = None
@@ -180,6 +212,7 @@ os.register_at_fork(after_in_child=_unlock)
 
 def main(descriptor: int, program: int) -> None:
     """Start processes until the program ends, as the requests on a socket say; return in none of them."""
+    reset_process()
     limit_process()  # before anything imports numpy
     gc.disable()  # nothing of what is imported is garbage
     requests = socket.socket(fileno=descriptor)
@@ -194,7 +227,8 @@ def main(descriptor: int, program: int) -> None:
     while True:
         ready = [each for each, _ in poll.poll(0 if to_import else None)]
         if not ready:
-            import_module(f"catstream.services.{to_import.pop(0)}_process")
+            with suppress(Exception):  # the process imports it again, and reports the error
+                import_module(f"catstream.services.{to_import.pop(0)}_process")
         elif has_ended in ready:
             os.read(has_ended, 4096)
             while running and (ended := os.waitpid(-1, os.WNOHANG))[0]:
@@ -206,7 +240,8 @@ def main(descriptor: int, program: int) -> None:
                 return
             log, watchdog, answer_to = descriptors
             request = json.loads(data)
-            import_module(f"catstream.services.{request['name']}_process")
+            with suppress(Exception):
+                import_module(f"catstream.services.{request['name']}_process")
             gc.freeze()  # a later collection leaves the memory alone that all processes share
             parent = os.getpid()
             if not (pid := os.fork()):
@@ -246,4 +281,7 @@ def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    try:
+        main(int(sys.argv[1]), int(sys.argv[2]))
+    except OSError as error:  # the limit of processes or of memory
+        sys.exit(f"catstream: cannot start a process: {error.strerror}")

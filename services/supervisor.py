@@ -23,7 +23,7 @@ from typing import BinaryIO
 from catstream.errors import ServiceError, VideoError
 from catstream.messages.kinds import End, Health, Track, Tracks
 from catstream.run.job import Job
-from catstream.services.process import PERMANENT_FAILURE, SOURCE_FAILED, TURN_SECONDS, Watchdog
+from catstream.services.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS, Watchdog
 from catstream.services.start_server import NAMES, StartedProcess, start_server
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
@@ -50,6 +50,7 @@ class ProcessLog:
     def __init__(self, name: str, file: BinaryIO) -> None:
         self._mark, self._file = f"{name}: ", file
         self._read = 0  # bytes that `new_lines` has returned
+        self._begin = 0  # of what the process that runs now has logged
 
     def fileno(self) -> int:
         """The descriptor of the file."""
@@ -64,12 +65,16 @@ class ProcessLog:
         lines = whole.decode(errors="replace").splitlines()
         return [line.removeprefix(self._mark) for line in lines if line.startswith(self._mark)]
 
+    def begin(self) -> None:
+        """Forget what an earlier process has logged, for `last_line`."""
+        self._begin = os.fstat(self.fileno()).st_size
+
     def last_line(self) -> str:
-        """The last line that was logged."""
+        """The last line that the process has logged, empty if there is none."""
         size = os.fstat(self.fileno()).st_size
-        text = os.pread(self.fileno(), _LAST_LINE, max(0, size - _LAST_LINE))
+        text = os.pread(self.fileno(), _LAST_LINE, max(self._begin, size - _LAST_LINE))
         lines = text.decode(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix(self._mark) if lines else "it logged nothing"
+        return lines[-1].removeprefix(self._mark) if lines else ""
 
     def close(self) -> None:
         """Close the file."""
@@ -103,8 +108,23 @@ class Child:
         self.watchdog.close()
         self.watchdog, self._turns, self.silent = Watchdog(), 0.0, 0.0
         self.watchdog.after = after
+        self.log.begin()
         log, watchdog = self.log.fileno(), self.watchdog.handle
         self.process = start_server().start(self.name, self._job, log, watchdog, restarted=bool(self.restarts))
+
+    def ending(self, code: int) -> str:
+        """How the process has ended: the signal or the exit code; and its last line, if that can be about the end.
+
+        What another process kills has not logged why; what aborts has.
+        """
+        if code == STOPPED_EARLY:
+            return "as a signal asked it to end"
+        if self.process is not None and self.process.lost:
+            return "with the start server"
+        name = signal.Signals(-code).name if -code in {*signal.Signals} else -code  # those for real time have no name
+        how = f"with signal {name}" if code < 0 else f"with exit code {code}"
+        last = self.log.last_line() if code > 0 or code == -signal.SIGABRT else ""
+        return f"{how}: {last}" if last else how
 
     def check(self, seconds: float) -> bool:
         """Count the seconds without a turn of the loop; returns whether they are too many."""
@@ -154,7 +174,7 @@ class Supervisor:
         self._over: bool = False  # whether no further frames are received
         self._error: Exception | None = None
         self._checked = time.monotonic()
-        self._ending, self._hurries = threading.Event(), threading.Event()
+        self._ending, self._hurries, self._ended = threading.Event(), threading.Event(), threading.Event()
         # A restarted detector continues the time stamps of a live source, and every process the run.
         since = time.monotonic() if job.since is None else job.since
         file = replace(job, state=job.state or folder, since=since, run=token_hex(8)).save(folder)
@@ -209,12 +229,15 @@ class Supervisor:
     def stop(self) -> None:
         """End the processes in order, and receive what they still send; at once if this is interrupted."""
         self._ending.set()
-        try:
-            self._thread.join()
-        except BaseException:
-            self._hurries.set()
-            self._thread.join()
-            raise
+        interruption: BaseException | None = None
+        while not self._ended.is_set():
+            try:
+                self._ended.wait()  # of Python 3.11, a `join` that is interrupted takes the thread for ended
+            except BaseException as error:
+                self._hurries.set()
+                interruption = error
+        if interruption is not None:
+            raise interruption
 
     # In the thread
 
@@ -238,6 +261,7 @@ class Supervisor:
                 self._shut_down()
         finally:
             self._is_over()
+            self._ended.set()
 
     def _is_over(self) -> None:
         with self._changed:
@@ -293,15 +317,13 @@ class Supervisor:
 
     def _restart(self, child: Child, code: int, now: float) -> None:
         """Restart a process that died with an exit code, or schedule that."""
-        last = child.log.last_line()
         if code == PERMANENT_FAILURE:
-            raise ServiceError(last)
+            raise ServiceError(child.log.last_line())
         child.restarts.append(now)
         recent = sum(now - moment < RECENT_SECONDS for moment in child.restarts)
-        ending = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
         if recent > RESTARTS:
-            raise ServiceError(f"the {child.name} died {recent} times in a minute, the last time with {ending}: {last}")
-        _log.warning("the %s died with %s, and is restarted: %s", child.name, ending, last)
+            raise ServiceError(f"the {child.name} died {recent} times in a minute, the last time {child.ending(code)}")
+        _log.warning("the %s died %s; it is restarted", child.name, child.ending(code))
         if recent == 1:
             child.start(self._results.last)
         else:

@@ -34,7 +34,7 @@ from catstream.numerics.threads import one_thread
 from catstream.video.rendered import render, write
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
-from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.endpoint import Endpoint
 
 hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
 hypothesis.settings.load_profile("catstream")
@@ -162,8 +162,8 @@ def scene(texture):
 @pytest.fixture
 def folder():
     """A private folder with a name that is short enough for sockets."""
-    with private_folder() as path:
-        yield path
+    with tempfile.TemporaryDirectory(prefix="cs-") as path:
+        yield Path(path)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ continues if the stream moves to another node.
 
 from __future__ import annotations
 
+import os
 import threading
 from contextlib import ExitStack
 from time import monotonic
@@ -30,6 +31,7 @@ from catstream.messages.names import check_name
 from catstream.wire.channels import PUBLIC, TRACKS
 from catstream.wire.endpoint import Endpoint, Place, find
 from catstream.wire.newest import GapCounter, Subscriber
+from catstream.wire.socket import check_owner
 
 REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a running pipeline sends one every second
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
@@ -94,6 +96,7 @@ class Subscription(Generic[Message]):
         self._ends: Subscriber[Any] | None = None
         self._has_run = False  # whether the pipeline was there before
         self._over = self._closed = False
+        self._owner = os.getpid()
         self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
         self._stream = follow(endpoint, keys)
         if self._stream is not None:
@@ -182,6 +185,7 @@ class Subscription(Generic[Message]):
 
     def _take(self, deadline: float) -> Message | None:
         """The next message if one has arrived, without waiting; what else is to be done before the next wait."""
+        check_owner(self._owner)  # first: another thread of the original may have held the lock
         with self._turn:
             if self._closed:
                 raise ServiceError("the subscription was closed, perhaps by another thread or task: make another one")

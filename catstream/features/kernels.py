@@ -15,12 +15,20 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
-from numba.core import event
 from numpy import float32
 
+from catstream.errors import ServiceError
 from catstream.numerics.arrays import Float32, Float64, Int64, UInt8, UInt16, UInt32
+
+try:
+    import numba
+    from numba.core import event
+except PermissionError:
+    raise ServiceError(
+        "kernels cannot be compiled, as this process may not make memory executable: allow it, in a unit of systemd "
+        "with MemoryDenyWriteExecute=no"
+    ) from None
 
 #: Logged at the first start after an installation, before the kernels are compiled.
 COMPILING = "compiling kernels, once: about 8 s"

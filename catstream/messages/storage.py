@@ -114,6 +114,35 @@ def why_not_writable(path: Path, made: Path | None = None) -> str:
     return ""
 
 
+@contextlib.contextmanager
+def descriptor(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
+    """A descriptor to lock a file or folder with; OSError if it cannot be opened.
+
+    It is closed in a copy of this process that is forked, which would hold the lock for the rest of its own life.
+    """
+    handle, owner = os.open(path, flags, 0o600), os.getpid()
+    _descriptors.add(handle)
+    try:
+        yield handle
+    finally:
+        if owner == os.getpid():
+            _descriptors.remove(handle)
+            _flock(handle, fcntl.LOCK_UN)  # a copy that is just beginning may have it yet
+            os.close(handle)
+
+
+_descriptors: set[int] = set()
+
+
+def _close_descriptors() -> None:
+    for handle in _descriptors:
+        os.close(handle)
+    _descriptors.clear()
+
+
+os.register_at_fork(after_in_child=_close_descriptors)
+
+
 def lock(handle: int, seconds: float = 0.0) -> bool:
     """Lock an open file or folder until it is closed or this process ends; False if another keeps it for `seconds`."""
     deadline = time.monotonic() + seconds

@@ -98,17 +98,15 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
 
     ServiceError if another process keeps it locked, or it cannot be made.
     """
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
-    try:
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = stack.enter_context(storage.descriptor(folder, os.O_DIRECTORY))
+        except OSError as error:
+            raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
         if not storage.lock(handle, seconds):
             raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or {_HELP}")
         yield folder
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -131,11 +129,13 @@ def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterato
     Yields the list of the files that were saved, filled afterwards.
     """
     done: list[Path] = []
+    owner = os.getpid()
     try:
         yield done
     except BaseException:
-        for error in _save(files, state, settings, done):
-            _log.warning("%s", error)
+        if owner == os.getpid():  # not a copy that was forked during the run
+            for error in _save(files, state, settings, done):
+                _log.warning("%s", error)
         raise
     errors = _save(files, state, settings, done)
     for error in errors[1:]:

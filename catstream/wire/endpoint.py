@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from catstream.errors import ServiceError
-from catstream.messages.storage import is_locked, lock, writing
+from catstream.messages.storage import descriptor, is_locked, lock, writing
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 
@@ -73,7 +73,7 @@ class Endpoint:
         if "://" in text:
             raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
         folder = Path(text)
-        if any(len(os.fsencode(file)) > _MAX_PATH_BYTES for file in _files(folder)):
+        if _is_too_long(folder):
             raise ServiceError(
                 f"the name of the folder {text!r} is too long for a Unix socket: give a shorter one "
                 "(--set run.endpoint=FOLDER), or set TMPDIR to a shorter folder for temporary files"
@@ -125,8 +125,17 @@ class Endpoint:
             return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
     def lacks_sockets(self) -> bool:
-        """Whether it is a folder without any socket: a pipeline removes all of its own at its end."""
-        return self.folder is not None and not any(file.exists() for file in _files(self.folder))
+        """Whether it is a folder without any socket: a pipeline removes all of its own at its end.
+
+        ServiceError if this user may not enter the folder.
+        """
+        try:
+            return self.folder is not None and not any(file.exists() for file in _files(self.folder))
+        except PermissionError:
+            raise ServiceError(
+                f"the folder {str(self.folder)!r} is of another user, and this one may not enter it: attach as the "
+                "user that runs the pipeline, or let it listen at tcp://127.0.0.1:PORT (--set run.endpoint=...)"
+            ) from None
 
 
 #: The endpoint of a pipeline, as a program gives it.
@@ -144,6 +153,11 @@ def _file(channel: Channel[object], sender: str) -> str:
     return channel.name if len(channel.senders) == 1 else f"{channel.name}-{sender}"
 
 
+def _is_too_long(folder: Path) -> bool:
+    """Whether the kernel does not take the names of Unix sockets in a folder."""
+    return any(len(os.fsencode(file)) > _MAX_PATH_BYTES for file in _files(folder))
+
+
 def _files(folder: Path) -> Iterator[Path]:
     """The socket of each channel in a folder, that of the registry too."""
     return (folder / _file(channel, each) for channel in (*CHANNELS.values(), REGISTRY) for each in channel.senders)
@@ -151,18 +165,28 @@ def _files(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes."""
+    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes.
+
+    It is locked, as programs that remove old temporary files leave a locked folder alone (systemd-tmpfiles).
+    """
     if not (homes := _homes()):
         raise ServiceError("no folder for temporary files can be written to: set TMPDIR to one")
-    for path, text in _notes(homes[:1], f"{_PREFIX}*/{_OWNER}"):
+    home = next((each for each in homes if not _is_too_long(each / f"{_PREFIX}12345678")), homes[0])
+    for path, text in _notes([home], f"{_PREFIX}*/{_OWNER}"):
         if text is None:
             shutil.rmtree(path.parent, ignore_errors=True)
     with contextlib.ExitStack() as stack:
-        with writing(homes[0]):
-            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=homes[0]))
+        with writing(home):
+            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=home))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            lock(stack.enter_context(descriptor(folder, os.O_DIRECTORY)))
             stack.enter_context(note(folder / _OWNER, ""))
-        yield folder
+        owner = os.getpid()
+        try:
+            yield folder
+        finally:
+            if owner != os.getpid():  # a copy of this process that was forked
+                stack.pop_all()
 
 
 @contextlib.contextmanager
@@ -177,7 +201,7 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
         endpoint.keys.listening()
         endpoint.keys.client(endpoint.keys.public.decode())
     with contextlib.ExitStack() as stack:
-        if endpoint.folder is not None:  # of tcp, the kernel gives a port to one process only
+        if text and endpoint.folder is not None:  # of tcp, the kernel gives a port to one process only
             folder = stack.enter_context(_locked(endpoint.folder.absolute(), text))
             endpoint = Endpoint.parse(str(folder), endpoint.keys or "")
         place = str(endpoint), str(endpoint.keys.folder) if endpoint.keys is not None else "", fleet or source
@@ -189,14 +213,14 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
 @contextlib.contextmanager
 def _locked(folder: Path, text: str) -> Iterator[Path]:
     """A folder for the sockets of one pipeline, which is made; the sockets are removed afterwards."""
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise ServiceError(
-            f"cannot use the folder {text!r} as an endpoint ({error.strerror}): give another folder"
-        ) from None
-    try:
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
+        except OSError as error:
+            raise ServiceError(
+                f"cannot use the folder {text!r} as an endpoint ({error.strerror}): give another folder"
+            ) from None
         facts = os.fstat(handle)
         if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
             raise ServiceError(f"other users may write to {text!r}: give a folder of your own, chmod 700")
@@ -205,13 +229,13 @@ def _locked(folder: Path, text: str) -> Iterator[Path]:
                 f"a pipeline is already running on {text!r}: "
                 "wait for it, or give another folder (--set run.endpoint=FOLDER)"
             )
+        owner = os.getpid()
         try:
             yield folder
         finally:
-            for file in _files(folder):
-                file.unlink(missing_ok=True)
-    finally:
-        os.close(handle)
+            if owner == os.getpid():  # not a copy of this process that was forked
+                for file in _files(folder):
+                    file.unlink(missing_ok=True)
 
 
 def running() -> list[Endpoint]:
@@ -297,17 +321,17 @@ def _follows(endpoint: Endpoint, source: str) -> bool:
 @contextlib.contextmanager
 def note(path: Path, text: str) -> Iterator[None]:
     """A file that is locked as long as its process uses it; it is never visible without its lock and text."""
-    hidden = path.with_name(f".{path.name}")
-    with hidden.open("w", encoding="utf-8", errors=_ANY_BYTES) as file:
+    hidden, owner = path.with_name(f".{path.name}"), os.getpid()
+    with descriptor(hidden, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as handle:
         try:
-            lock(file.fileno(), math.inf)
-            file.write(text)
-            file.flush()
+            lock(handle, math.inf)
+            os.write(handle, text.encode(errors=_ANY_BYTES))
             hidden.rename(path)
             yield
         finally:
-            hidden.unlink(missing_ok=True)
-            path.unlink(missing_ok=True)
+            if owner == os.getpid():  # not a copy of this process that was forked
+                hidden.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
 
 
 def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:
@@ -321,8 +345,8 @@ def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | 
 
 
 def _homes() -> list[Path]:
-    """The parent folders of private folders, preferred first; a pipeline started by a timer has no runtime folder."""
+    """The parent folders of private folders, preferred first: the runtime folder of a user is removed at the logout."""
     homes = [os.environ.get("XDG_RUNTIME_DIR", "")]
     with contextlib.suppress(FileNotFoundError):  # there is no temporary folder that can be written to
-        homes.append(tempfile.gettempdir())
+        homes.insert(0, tempfile.gettempdir())
     return list(dict.fromkeys(Path(home) for home in homes if os.access(home, os.W_OK)))

@@ -73,7 +73,13 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
     return made
 
 
-os.register_at_fork(after_in_child=context.cache_clear)
+def check_owner(owner: int) -> None:
+    """Raise ServiceError in a copy of the process that made a connection: a fork copies no thread of ZeroMQ."""
+    if owner != os.getpid():
+        raise ServiceError(
+            f"process {owner} has made it, and this one is a copy of that (fork), without its connections: subscribe, "
+            "connect or start a pipeline in the process that uses it"
+        )
 
 
 def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
@@ -228,6 +234,18 @@ class _ZapHandler:
 _ZAP = _ZapHandler()
 
 
+def _begin_copy() -> None:
+    """Begin without the context and the threads of the process of which this one is a copy."""
+    global _ZAP, _lock
+    context.cache_clear()
+    _lock = threading.Lock()
+    _OPEN.clear()
+    _ZAP = _ZapHandler()
+
+
+os.register_at_fork(after_in_child=_begin_copy)
+
+
 def _too_many(error: zmq.ZMQError) -> ServiceError:
     """The error for a socket that ZeroMQ could not make: it has its files, and those of its monitor."""
     return ServiceError(
@@ -277,7 +295,6 @@ class ChannelSocket(Generic[Message]):
 
     def close(self) -> None:
         """Transmit what is queued, then close; the address is free for the next socket."""
-        _OPEN.discard(self)
         if self._pid != os.getpid():  # a copy in a process that was forked, which lacks ZeroMQ's threads
             return
         if self._listens:
@@ -294,6 +311,7 @@ class ChannelSocket(Generic[Message]):
         if self._domain:
             _ZAP.unregister(self._domain)
             self._domain = b""
+        _OPEN.discard(self)
 
     def __del__(self) -> None:
         # The monitor of a socket that was dropped has no reader any more, and would block ZeroMQ's thread: nothing more
@@ -397,8 +415,9 @@ class ChannelSocket(Generic[Message]):
     def _read_events(self, seconds: float = 0.0, until: Event | None = None) -> None:
         """Handle what was reported about connections; wait so long for each event, until a certain one.
 
-        ServiceError if this side connects and is denied.
+        ServiceError if this side connects and is denied, or in a copy of the process.
         """
+        check_owner(self._pid)
         for event in self._monitor.events(seconds) if self._monitor is not None else ():
             if event is Event.DISCONNECTED:
                 self._disconnected()

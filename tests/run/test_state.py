@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,19 @@ def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path
         owner.kill()
     with locked(tmp_path):
         pass
+
+
+def test_a_copy_of_a_process_that_lives_longer_does_not_keep_its_lock(tmp_path):
+    lives, ends = os.pipe()
+    with locked(tmp_path / "kept"):
+        if not os.fork():
+            os.close(ends)
+            os.read(lives, 1)
+            os._exit(0)
+    with locked(tmp_path / "kept"):
+        os.close(ends)
+    os.wait()
+    os.close(lives)
 
 
 def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_named(tmp_path, monkeypatch):

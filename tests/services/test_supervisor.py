@@ -9,10 +9,13 @@ from catstream.services.supervisor import ProcessLog
 
 def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
     with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
-        assert log.last_line() == "it logged nothing"
+        file.write(b"detector: an earlier one\n")
+        file.flush()
+        log.begin()
+        assert log.last_line() == ""
         file.write(b"detector: one\nTraceback\ndetector: tw")
         file.flush()
-        assert log.new_lines() == ["one"]
+        assert log.new_lines() == ["an earlier one", "one"]
         file.write(b"o\n")
         file.flush()
         assert log.new_lines() == ["two"]
