@@ -12,6 +12,7 @@ import difflib
 import json
 import math
 import os
+import re
 import reprlib
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -309,12 +310,12 @@ class Settings:
         overrides : mapping of str, or iterable of str
             Names and values, or texts `group.name=value` as `--set` takes them.
         environment : mapping of str, or None
-            Variables, `CATSTREAM_GROUP_NAME=value`; None for the process's own.
+            Variables, `CATSTREAM_GROUP_NAME=value`; None for the process's own. Others with this prefix are left alone.
 
         Raises
         ------
         SettingsError
-            For a preset that does not exist, a file that cannot be read, or a variable of no setting.
+            For a preset that does not exist, a file that cannot be read, or a variable that is empty or of no setting.
         """
         values: dict[str, object] = {}
         if preset is not None:
@@ -324,9 +325,11 @@ class Settings:
         if file is not None:
             values.update(flat(_read(Path(file))))
         for variable, text in (os.environ if environment is None else environment).items():
-            if variable.startswith("CATSTREAM_"):
-                name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
+            name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
+            if variable.startswith("CATSTREAM_") and not _is_foreign(name):
                 _check_name(name, variable)
+                if not text:
+                    raise SettingsError(f"the environment variable {variable} is empty: give it a value, or unset it")
                 values[name] = text
         return values | _named(overrides)
 
@@ -402,6 +405,7 @@ class Settings:
 
 
 _LOCAL = ("run.endpoint", "run.keys")
+_SERVICE = re.compile(r"(^|[._])(service[._](host|port)|port(_[0-9]+_(tcp|udp).*)?$|port\.[0-9]+_(tcp|udp))")
 
 _PAPER: dict[str, Value] = {
     "teaching.classifier": "one-class",
@@ -483,6 +487,16 @@ def _check_name(name: str, variable: str = "") -> None:
         )
 
 
+def _is_foreign(name: str) -> bool:
+    """Whether a variable with our prefix, as the name of a setting, is for something else.
+
+    It is of no group and like no setting; or an orchestrator has made it for a service that is called catstream.
+    """
+    if _SERVICE.search(name):
+        return True
+    return name.partition(".")[0] not in _groups() and not _nearest(name)
+
+
 def _nearest(name: str) -> list[str]:
     """Full names that are similar, or that end as the name does."""
     similar = difflib.get_close_matches(name.replace("_", "."), _kinds(), n=3)
@@ -523,7 +537,7 @@ def _named(given: Mapping[str, object] | Iterable[str]) -> dict[str, object]:
 
 def _pair(text: str) -> tuple[str, str]:
     name, sign, value = text.partition("=")
-    if not sign:
+    if not (sign and value.strip()):
         raise SettingsError(f"a setting is given as group.name=value, got {text!r}")
     return name.strip(), value.strip()
 

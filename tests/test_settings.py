@@ -82,6 +82,20 @@ def test_an_unknown_name_is_rejected_with_the_nearest_ones(way):
 
 
 @pytest.mark.parametrize(
+    "variable",
+    ["HOME", "LOG_LEVEL", "SERVICE_HOST", "PORT", "PORT_5700_TCP_ADDR", "RUN_SERVICE_PORT_WEB", "RUN_PORT_5700_TCP"],
+)
+def test_a_variable_with_our_prefix_that_is_for_something_else_is_left_alone(variable):
+    assert Settings.load(environment={f"CATSTREAM_{variable}": "x"}) == Settings()
+
+
+@pytest.mark.parametrize("variable", ["RUN_ENDPOINT", "CORESET_SIZE"])
+def test_an_empty_variable_of_a_setting_is_an_error(variable):
+    with pytest.raises(SettingsError, match=f"CATSTREAM_{variable} is empty"):
+        Settings.load(environment={f"CATSTREAM_{variable}": ""})
+
+
+@pytest.mark.parametrize(
     ("name", "why"),
     [
         ("coreset_size", "there is no setting 'coreset_size', did you mean 'coreset.size'"),

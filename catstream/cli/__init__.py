@@ -84,9 +84,11 @@ def group() -> None:
 
 
 def main() -> None:
-    """Run the command line. The exit code is 1 after an error, which is one line, and `INTERRUPTED` after Ctrl-C."""
+    """Run the command line. The exit code is 1 after an error, which is one line, and 130 after Ctrl-C."""
     INTERRUPTS.install()
     os.environ["PYTHONSAFEPATH"] = "1"  # no child of this process imports a file of the current folder
+    # FFmpeg asks a proxy, if the environment names one, for cameras on this machine too.
+    os.environ["no_proxy"] = ",".join(filter(None, ("127.0.0.1,localhost", os.environ.get("no_proxy"))))
     if sys.stdout is None:  # it was closed before the start (>&-): what is printed is dropped
         sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     try:

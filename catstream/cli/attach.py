@@ -37,9 +37,16 @@ from catstream.services.options import (
     with_overwrite,
 )
 from catstream.wire.channels import CHANNELS, PUBLIC
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.endpoint import Endpoint, Place, find
 
 _PROCESSES = CHANNELS["health"].senders
+
+
+def _not_empty(_: click.Context, parameter: click.Parameter, text: str | None) -> str:
+    """An option that selects a pipeline: an empty variable of a script must not select the only one that runs."""
+    if text == "":
+        raise click.BadParameter("it is empty: give a value, or leave the option out", param=parameter)
+    return text or ""
 
 
 def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
@@ -51,7 +58,10 @@ def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
 
 
 with_fleet_address = click.option(
-    "--fleet", default="", metavar="ADDRESS", help="HOST:PORT or name of the fleet; not needed if only one runs here."
+    "--fleet",
+    callback=_not_empty,
+    metavar="ADDRESS",
+    help="HOST:PORT or name of the fleet; not needed if only one runs here.",
 )
 
 #: Adds the options that select a running pipeline, as two texts: the arguments `endpoint` and `keys`. The endpoint of a
@@ -60,11 +70,21 @@ with_endpoint = combined(
     "endpoint",
     _endpoint,
     click.option(
-        "--endpoint", default="", metavar="PLACE", help="Endpoint of the pipeline; not needed if only one runs."
+        "--endpoint",
+        callback=_not_empty,
+        metavar="PLACE",
+        help="Endpoint of the pipeline; not needed if only one runs.",
     ),
-    click.option("--stream", default="", metavar="NAME", help="A stream of a fleet, instead of --endpoint."),
+    click.option("--stream", callback=_not_empty, metavar="NAME", help="A stream of a fleet, instead of --endpoint."),
     with_fleet_address,
     with_keys,
+)
+
+_with_source = click.option(
+    "--source",
+    callback=_not_empty,
+    metavar="SOURCE",
+    help="The source that the pipeline tracks, instead of --endpoint.",
 )
 
 with_wait = click.option(
@@ -152,11 +172,12 @@ def _line(value: Any) -> str:
 
 @click.command()
 @with_endpoint
+@_with_source
 @with_json
 @click.option(
     "--wait", default=3.0, show_default=True, type=NumberRange(0), help="Maximum seconds to wait for health reports."
 )
-def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
+def status(endpoint: str, keys: str, source: str, as_json: bool, wait: float) -> None:
     """Show the state of a running pipeline.
 
     The exit code is 0 if all three processes sent a health report, else 1, so
@@ -169,9 +190,12 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
     \b
     EXAMPLES
       catstream status
+      catstream status --source walk.mp4
       catstream status --endpoint run --json
     """
-    place, reports = _collect_reports(endpoint, keys, wait)
+    _check_one(endpoint, source)
+    pipeline: Place = find(keys=keys, source=source) if source else endpoint
+    place, reports = _collect_reports(pipeline, keys, wait)
     summary = _summary(place, reports)
     if as_json:
         click.echo(json.dumps(summary))
@@ -185,12 +209,17 @@ def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
             screen().print("", shown, sep="\n")
     if silent := [name for name in _PROCESSES if name not in reports]:
         if not reports:
-            locate(endpoint, keys)  # its error says why a stream of a fleet does not run
+            locate(pipeline, keys)  # its error says why a stream of a fleet does not run
         complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}")
         sys.exit(1)
 
 
-def _collect_reports(endpoint: str, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
+def _check_one(endpoint: str, source: str) -> None:
+    if endpoint and source:
+        raise click.UsageError("--source selects the pipeline, as --endpoint and --stream do: give one of them")
+
+
+def _collect_reports(endpoint: Place, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
     """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
     deadline = time.monotonic() + seconds
     reports: dict[str, list[Health]] = {}
@@ -282,8 +311,7 @@ class _Target:
     yes: bool
 
     def __post_init__(self) -> None:
-        if self.endpoint and self.source:
-            raise click.UsageError("--source selects the pipeline, as --endpoint and --stream do: give one of them")
+        _check_one(self.endpoint, self.source)
 
     @property
     def is_named(self) -> bool:
@@ -308,9 +336,7 @@ _with_pipeline = combined(
     "target",
     _Target,
     with_endpoint,
-    click.option(
-        "--source", default="", metavar="SOURCE", help="The source that the pipeline tracks, instead of --endpoint."
-    ),
+    _with_source,
     click.option(
         "--timeout", default=5.0, show_default=True, type=NumberRange(0), help="Seconds to wait for an answer."
     ),

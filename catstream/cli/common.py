@@ -21,9 +21,6 @@ from rich.table import Column, Table
 
 from catstream.errors import ServiceError
 
-#: Exit code of a command that was interrupted.
-INTERRUPTED = 130
-
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDTH = 140  # columns of a table that is not printed to a terminal
 
@@ -67,16 +64,21 @@ def text(form: str, *, last: bool = False) -> TextColumn:
 
 
 class Interrupts:
-    """Raises KeyboardInterrupt for Ctrl-C, SIGTERM and the loss of the terminal, except in the blocks below."""
+    """Raises KeyboardInterrupt for Ctrl-C, SIGTERM and the loss of the terminal, except in the blocks below.
+
+    exit_code  of a command that was interrupted, as a shell reports the signal: 130 for Ctrl-C, 143 for SIGTERM
+    """
 
     def __init__(self) -> None:
         self._leaving = self._deferring = self._pending = False
+        self.exit_code = 128 + signal.SIGINT
 
     def install(self) -> None:
         """Install the handlers. A signal that is ignored, as under nohup, stays ignored, except SIGTERM."""
         for number in _SIGNALS:
             if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._handle)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
     @contextmanager
     def leaving(self) -> Iterator[None]:
@@ -108,10 +110,11 @@ class Interrupts:
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
-    def _handle(self, *_: object) -> None:
+    def _handle(self, number: int, _: object) -> None:
+        self.exit_code = 128 + number
         if self._leaving:
             os.write(2, b"stopped\n")
-            os._exit(INTERRUPTED)
+            os._exit(self.exit_code)
         if not self._deferring:
             raise KeyboardInterrupt
         self._pending = True
@@ -124,7 +127,7 @@ INTERRUPTS = Interrupts()
 def stopped(result: str = "") -> NoReturn:
     """End a command that was interrupted; say what is there so far, and how to continue."""
     click.echo(f"stopped: {result}" if result else "stopped", err=True)
-    raise SystemExit(INTERRUPTED)
+    raise SystemExit(INTERRUPTS.exit_code)
 
 
 def check_file(file: Path, *, overwrite: bool) -> None:

@@ -156,7 +156,7 @@ class _Run:
     resume: Path | None
 
     def execute(self) -> None:
-        """Check everything that can be checked, then run to the end; after Ctrl-C, the exit code is `INTERRUPTED`."""
+        """Check everything that can be checked, then run to the end; after Ctrl-C, the exit code is 130."""
         self._check_options()
         pipeline = self._pipeline()
         files = self._files(pipeline)

@@ -95,7 +95,7 @@ def test_a_stopped_run_keeps_its_results(long_video, catstream, until, tmp_path,
     until(lambda: len(frames_of(tmp_path)) > 8)
     process.send_signal(number)
     errors = process.communicate(timeout=60)[1]
-    assert process.returncode == 130
+    assert process.returncode == 128 + number
     assert "the results so far are kept" in errors
     rows = frames_of(tmp_path)
     assert rows == list(range(len(rows)))

@@ -63,7 +63,7 @@ def test_at_a_terminal_a_command_to_an_unnamed_pipeline_needs_confirmation(pipel
 
 
 def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatch):
-    _, walk = pipeline(str(tmp_path / "walk.mp4"))
+    first, walk = pipeline(str(tmp_path / "walk.mp4"))
     _, street = pipeline("rtsp://10.0.0.7/street")
     assert "walk.mp4 at /" in str(said("stop").exception), "the error of several pipelines says what each follows"
     monkeypatch.chdir(tmp_path)
@@ -73,6 +73,16 @@ def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatc
     assert (walk, street) == (["pause"] * 3, ["stop"])
     assert "no pipeline of yours tracks 'other.mp4'" in str(said("stop", "--source", "other.mp4").exception)
     assert said("stop", "--source", "walk.mp4", "--endpoint", tmp_path).exit_code == 2
+    status = said("status", "--source", "walk.mp4", "--wait", "0")
+    assert f"no health report at {first} " in status.stderr
+
+
+@pytest.mark.parametrize("option", ["--endpoint", "--stream", "--source"])
+def test_an_option_that_is_empty_selects_no_pipeline(pipeline, option):
+    _, heard = pipeline("/films/walk.mp4")
+    result = said("stop", option, "")
+    assert (result.exit_code, heard) == (2, [])
+    assert "it is empty" in result.stderr
 
 
 def test_a_stream_of_a_fleet_can_be_selected_by_its_name(pipeline, managing):

@@ -297,6 +297,9 @@ def _started(
     for stream in streams:
         stream.start()
     wait_until(lambda: all(stream.ready.is_set() for stream in streams), "starting processes")
+    for stream in streams:
+        if stream.error is not None:  # it has no endpoint to observe
+            raise stream.error
     keys = plan.settings.run.keys
     seen = stack.enter_context(observed([stream.endpoint for stream in streams], name, keys))
     wait_until(lambda: all(each.warmed_up for each in seen), "learning the first models")

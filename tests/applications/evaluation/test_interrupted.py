@@ -11,7 +11,6 @@ import psutil
 import pytest
 
 from catstream.applications.workers import run_tasks, sigint_blocked
-from catstream.cli.common import INTERRUPTED
 
 
 def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, tmp_path):
@@ -26,7 +25,7 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     _, errors = process.communicate()
     assert "Traceback" not in errors
     assert errors.splitlines()[-1].startswith("stopped: complete runs are in ")
-    assert process.returncode == INTERRUPTED
+    assert process.returncode == 130
     assert not psutil.wait_procs(children, timeout=10)[1]
 
 
