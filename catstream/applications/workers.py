@@ -48,13 +48,27 @@ def sigint_blocked() -> Iterator[None]:
                 signal.raise_signal(signal.SIGINT)
 
 
+@contextmanager
+def sharing() -> Iterator[None]:
+    """A block in which memory or locks for other processes are made: ServiceError if this machine has no place."""
+    try:
+        yield
+    except OSError as error:
+        raise ServiceError(
+            f"processes cannot share memory ({error.strerror}): let /dev/shm be writable; catstream track and "
+            "catstream evaluate --jobs 1 do without"
+        ) from None
+
+
 def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Generator[_Result]:
     """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
 
     If the caller stops early, for example on Ctrl-C, all workers are killed.
     """
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),)) as pool:
+    with sharing():
+        made = ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),))
+    with made as pool:
         try:
             with sigint_blocked():  # the workers are started here
                 futures = [pool.submit(work, *task) for task in tasks]

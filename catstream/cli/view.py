@@ -95,8 +95,12 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
       catstream view --endpoint run --listen 8080
       VIEW_TOKEN=$(cat my-token) catstream view --listen 0.0.0.0:8000
     """
+    from catstream.client.registry import fleet_and_stream
     from catstream.web.app import pipeline_site
+    from catstream.wire.endpoint import find
 
+    if endpoint and fleet_and_stream(endpoint) is None:
+        find(endpoint, keys)  # its errors are of no passing kind
     _serve(pipeline_site(endpoint, keys), listen, token)
 
 

@@ -190,7 +190,8 @@ class FollowedStream:
         if (answer := self._registry.receive()) is None:
             return False
         if self._stream not in answer.streams:
-            self.end = End(0, f"the stream {self._stream} was removed from the fleet {answer.name}")
+            gone = f"the stream {self._stream} was removed from the fleet {answer.name}, or the fleet is down"
+            self.end = End(0, gone)
             return False
         return self._keep(answer.streams[self._stream])
 

@@ -38,6 +38,7 @@ Models = dict[tuple[str, str], bytes]
 _TURN_SECONDS = 0.5  # between two looks at the actors
 _REPORT_SECONDS = 0.1  # longest wait of a look for the reports of all streams
 _QUESTION_SECONDS = 0.1  # longest wait for a question to the registry
+_GOODBYE_SECONDS = 2.0  # for clients, which ask every second, to learn that there is no stream any more
 _CLIENTS_SECONDS = 5.0  # between two looks at the keys of the clients
 QUIET_SECONDS = 5.0  # without an answer of a stream, after which the status says so
 PLACED_SECONDS = 15.0  # for Ray to place and start a stream, after which the status says that it has not
@@ -77,6 +78,7 @@ class Controller:
         self._phase: Literal["idle", "up", "down"] = "idle"  # before the first change; and while the fleet ends
         self._recent = FleetStatus(name, time.time())
         self._unstored: dict[str, str] = {}  # why the last state of a stream that has stopped is not stored
+        self._asked = float("-inf")  # when a client of the registry has asked last
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
         self._registry: RegistryServer | None = None
@@ -133,6 +135,11 @@ class Controller:
 
     def end(self) -> list[str]:
         """End the threads and the registry; returns a line for each stream whose last state is not in the store."""
+        with self._lock:
+            self._spec = replace(self._spec, streams={})
+            self._recent = self.status()
+        if time.monotonic() - self._asked < _GOODBYE_SECONDS:
+            time.sleep(_GOODBYE_SECONDS)
         self._over.set()
         for thread in self._threads:
             thread.join()
@@ -181,7 +188,8 @@ class Controller:
     def _serve(self) -> None:
         """Answer the registry, without the store."""
         while self._registry is not None and not self._over.is_set():
-            self._registry.turn(_QUESTION_SECONDS)
+            if self._registry.turn(_QUESTION_SECONDS):
+                self._asked = time.monotonic()
 
     def _run(self) -> None:
         logged = ""

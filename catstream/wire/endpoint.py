@@ -125,12 +125,14 @@ class Endpoint:
             return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
     def lacks_sockets(self) -> bool:
-        """Whether it is a folder without any socket: a pipeline removes all of its own at its end.
+        """Whether it is a folder without any socket: a pipeline removes all of its own at its end."""
+        return self.folder is not None and not any(file.exists() for file in _files(self.folder))
 
-        ServiceError if this user may not enter the folder.
-        """
+    def check_access(self) -> None:
+        """Raise ServiceError if it is a folder that this user may not enter."""
         try:
-            return self.folder is not None and not any(file.exists() for file in _files(self.folder))
+            if self.folder is not None:
+                (self.folder / "control").exists()
         except PermissionError:
             raise ServiceError(
                 f"the folder {str(self.folder)!r} is of another user, and this one may not enter it: attach as the "
@@ -267,12 +269,15 @@ def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
     """The endpoint of a running pipeline: the given one, the one with this source, or the user's only one.
 
     The keys of this user's pipelines are known. The source is as it was given to the pipeline, or its file name; that
-    of a given endpoint is not looked for: see `source_at`. ServiceError if there is none, or more than one.
+    of a given endpoint is not looked for: see `source_at`. ServiceError if there is none, or more than one, or if
+    it is a folder of another user.
     """
     if isinstance(text, Endpoint):
         return text
     if text:
-        return Endpoint.parse(os.fspath(text), keys)
+        given = Endpoint.parse(os.fspath(text), keys)
+        given.check_access()
+        return given
     endpoints = running()
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so

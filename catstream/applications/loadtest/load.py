@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from catstream.applications.loadtest import crowd
-from catstream.applications.workers import SPAWN, sigint_blocked
+from catstream.applications.workers import SPAWN, sharing, sigint_blocked
 from catstream.box import Box
 from catstream.client.control import control
 from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
@@ -127,7 +127,8 @@ class Subscribers:
 
     def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0, keys: str = "") -> None:
         self._quick, self._readers = readers - slow - frozen, readers
-        self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
+        with sharing():
+            self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
         self._frozen_since = 0.0  # time of `freeze`
 
         def processes(numbers: range, pace: tuple[int, float]) -> list[Any]:
