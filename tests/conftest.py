@@ -162,7 +162,7 @@ def scene(texture):
 @pytest.fixture
 def folder():
     """A private folder with a name that is short enough for sockets."""
-    with tempfile.TemporaryDirectory(prefix="cs-") as path:
+    with tempfile.TemporaryDirectory(prefix="catstream-") as path:  # its notes are found
         yield Path(path)
 
 
