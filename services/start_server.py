@@ -186,7 +186,12 @@ def start_server() -> StartServer:
     """The server of this program; a new one if there is none."""
     global _server
     with _lock:
-        if _server is None or not _server.runs():
+        try:
+            runs = _server is not None and _server.runs()
+        except ServiceError:
+            close_start_server()  # the next call tries it again
+            raise
+        if _server is None or not runs:
             close_start_server()
             _server = StartServer()
         return _server
@@ -212,6 +217,9 @@ os.register_at_fork(after_in_child=_unlock)
 
 def main(descriptor: int, program: int) -> None:
     """Start processes until the program ends, as the requests on a socket say; return in none of them."""
+    if sys.stderr is None:  # the program has closed it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        sys.stderr = os.fdopen(2, "w")
     reset_process()
     limit_process()  # before anything imports numpy
     gc.disable()  # nothing of what is imported is garbage

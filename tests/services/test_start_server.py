@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -128,21 +129,53 @@ def test_nothing_outlives_a_program_that_is_killed(until):
     until(lambda: has_ended(server))
 
 
-def test_a_program_that_has_closed_its_standard_streams_has_a_server_that_runs(tmp_path, folder):
+@pytest.mark.parametrize("closed", ["os.closerange(0, 3)", ""], ids=["by itself", "before its start"])
+def test_a_program_without_standard_streams_has_processes_that_run(tmp_path, folder, closed):
     job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"
     program = f"""
 import os
 from pathlib import Path
-os.closerange(0, 3)
+{closed}
 from catstream.services.start_server import start_server
 from catstream.services.process import Watchdog
 with open({str(log)!r}, "w+b") as log:
-    process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), Watchdog().handle, restarted=False)
-    pid = process.pid
+    watchdog = Watchdog()
+    process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), watchdog.handle, restarted=False)
+    while watchdog.turns < 3 and process.poll() is None:
+        pass
+    code = process.poll()
     process.close()
-os._exit(0 if pid else 1)
+os._exit(0 if code is None else 1)
 """
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+    before = None if closed else lambda: os.closerange(0, 3)
+    assert subprocess.run([sys.executable, "-c", program], check=False, preexec_fn=before).returncode == 0
+
+
+def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_have(monkeypatch, start, until):
+    monkeypatch.setattr(module, "_server", None)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
+    try:
+        process, watchdog, _ = start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    until(lambda: watchdog.turns > 2)
+    assert psutil.Process(process.pid).rlimit(psutil.RLIMIT_NOFILE) == (hard, hard)
+    process.send_signal(signal.SIGTERM)
+    assert until(process.poll) == 4
+    module.close_start_server()
+
+
+def test_a_server_that_cannot_run_is_an_error_that_names_it(monkeypatch, until):
+    monkeypatch.setattr(module, "_server", None)
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    server = start_server()
+    until(lambda: server._process.poll() is not None)
+    with pytest.raises(ServiceError, match="/bin/false did not start"):
+        start_server()
+    assert module._server is None
 
 
 def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own(server):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 from contextlib import closing
 
-from catstream.services.supervisor import ProcessLog
+import pytest
+
+from catstream.services.process import STOPPED_EARLY
+from catstream.services.supervisor import Child, ProcessLog
 
 
 def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
@@ -27,3 +31,23 @@ def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_
         file.write(b"detector: " + bytes(200_000) + b"\ndetector: the source is lost\n")
         file.flush()
         assert [line for _ in range(9) for line in log.new_lines()] == ["the source is lost"]
+
+
+@pytest.mark.parametrize(
+    ("code", "ending"),
+    [
+        (-signal.SIGKILL, "with signal SIGKILL"),
+        (-signal.SIGABRT, "with signal SIGABRT: its last line"),
+        (-(signal.SIGRTMIN + 1), f"with signal {signal.SIGRTMIN + 1}"),
+        (1, "with exit code 1: its last line"),
+        (STOPPED_EARLY, "as a signal asked it to end"),
+    ],
+)
+def test_the_reason_of_a_death_is_the_signal_and_what_the_process_itself_has_said_of_it(tmp_path, code, ending):
+    child = Child("trainer", tmp_path, tmp_path)
+    with closing(child.log), (tmp_path / "trainer.log").open("ab") as file:
+        file.write(b"trainer: its last line\n")
+        file.flush()
+        assert child.ending(code) == ending
+        child.log.begin()
+        assert child.ending(code) == ending.removesuffix(": its last line")
