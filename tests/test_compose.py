@@ -1,7 +1,5 @@
 """docker-compose.yml and its image, held to the table of channels and to the processes: no Docker engine is needed."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Each example runs beside a real pipeline, and prints what that found."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import select

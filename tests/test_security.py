@@ -1,7 +1,5 @@
 """Nothing in the source runs what it reads: no pickle, no eval, no shell, no YAML loader."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

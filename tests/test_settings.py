@@ -1,7 +1,5 @@
 """Settings: what is none is refused, wherever it comes from."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle

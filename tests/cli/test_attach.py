@@ -1,7 +1,5 @@
 """`catstream watch` and `catstream status`, beside a pipeline that runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """What the commands share: the progress line and the summary of a run, and Ctrl-C between frames and within one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`catstream settings` in a terminal's place, in a pipe and as JSON."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

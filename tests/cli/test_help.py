@@ -1,7 +1,5 @@
 """Help teaches: what a command does, what it writes, and an example that works. And what all commands do alike."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`catstream loadtest`: a real run, its figures in three forms, and an exit code that says whether it held."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """`catstream merge`, as a person uses it."""
 
-from __future__ import annotations
-
 from itertools import islice
 
 import pytest

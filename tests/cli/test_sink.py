@@ -1,7 +1,5 @@
 """`catstream sink`, beside a pipeline that runs, and `catstream export` of what it has written."""
 
-from __future__ import annotations
-
 import json
 import select
 import signal

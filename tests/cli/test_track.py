@@ -1,7 +1,5 @@
 """`catstream track`, as a person runs it."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

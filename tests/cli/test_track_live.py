@@ -1,7 +1,5 @@
 """`catstream track` on streams that never end: followed until Ctrl-C, whatever happens to them."""
 
-from __future__ import annotations
-
 import csv
 import re
 import signal

@@ -1,7 +1,5 @@
 """`catstream track --state` and `--resume`: what was learned outlives every process, and its results continue."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 import subprocess

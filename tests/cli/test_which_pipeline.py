@@ -1,7 +1,5 @@
 """Which pipeline `stop`, `set-box`, `pause`, `resume` and `save` command: the one that is named, or the only one."""
 
-from __future__ import annotations
-
 import tempfile
 from contextlib import ExitStack
 

@@ -1,7 +1,5 @@
 """Laws of the forest: a message counts once, in order; a restart changes nothing; objects do not affect one another."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterator

@@ -7,8 +7,6 @@ y and every k <= n (Ghashami et al. 2016),
     max_y (||A y||^2 - ||C y||^2) <= (s_(k+1)^2 + s_(k+2)^2 + ...) / (n + 1 - k).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Laws of the hierarchical sample (paper, section "Coreset Appearance Model")."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -9,8 +9,6 @@ have none, so that at level q, with all errors adding up and none negative,
 The first is sharper than the (1 + epsilon)^q of the paper (section "Coreset Tree").
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

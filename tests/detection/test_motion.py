@@ -1,7 +1,5 @@
 """The Kalman filter of the centre: smooth while present, at rest while lost, anew after a jump."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

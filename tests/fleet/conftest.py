@@ -1,7 +1,5 @@
 """A fleet on a real cluster of two nodes that the tests of a process share: Ray uses one cluster in a process."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 

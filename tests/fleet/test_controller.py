@@ -1,7 +1,5 @@
 """The controller of a fleet, with a Ray of this file's own: what it starts, stops, stores and answers."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """A fleet on Ray: streams that are started, moved, continued after a death, refused and removed."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The life of a stream: the table, and the laws of what happens to a stream on any cluster."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import hypothesis.strategies as st

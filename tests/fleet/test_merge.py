@@ -1,7 +1,5 @@
 """Merging the saved models of streams: each frame counts once, in any order, within the bound of the coreset."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

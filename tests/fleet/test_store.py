@@ -1,7 +1,5 @@
 """The store: the same laws in a folder and on an S3 server; full disks, lost servers, hidden credentials."""
 
-from __future__ import annotations
-
 import logging
 import os
 import resource

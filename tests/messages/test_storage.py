@@ -1,7 +1,5 @@
 """Files of arrays: written whole, read as they were, and refused if they are damaged."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import re

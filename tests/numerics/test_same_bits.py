@@ -1,7 +1,5 @@
 """The same bits in every process: whatever the program has imported, and on any number of cores."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Linear algebra on one thread, inside a program that has set something else; and calls in threads."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

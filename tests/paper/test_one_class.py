@@ -1,7 +1,5 @@
 """The one-class support vector machine, against scikit-learn's own linear kernel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal

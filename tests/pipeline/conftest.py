@@ -1,7 +1,5 @@
 """What the tests of the pipeline share: a short video, and how to wait for processes."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from contextlib import ExitStack

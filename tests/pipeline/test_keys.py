@@ -1,7 +1,5 @@
 """A whole pipeline where nobody comes in without a key."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import pytest

@@ -1,7 +1,5 @@
 """A pipeline in a program: with `with` and without, more than once, in threads, and in an event loop."""
 
-from __future__ import annotations
-
 import asyncio
 import copy
 import gc

@@ -1,7 +1,5 @@
 """The three processes on a real video, from the first frame to the last."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The processes by themselves: started by hand, in any order, and ended in any way."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

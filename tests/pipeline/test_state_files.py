@@ -1,7 +1,5 @@
 """The files from which a run continues on another machine."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """A running pipeline is told what to do: another object, a pause, the end; and begins with what was saved."""
 
-from __future__ import annotations
-
 import os
 import signal
 from concurrent.futures import ThreadPoolExecutor, wait

@@ -1,7 +1,5 @@
 """Real sequences: beside the project in ../shared/data, or where TRACKING_DATA says."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Real sequences are followed, and absence is noticed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

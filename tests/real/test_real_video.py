@@ -1,7 +1,5 @@
 """Real files: every frame is read, and the truth fits it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What the tests of the registry share: the state of a fleet that a test decides, and keys."""
 
-from __future__ import annotations
-
 import pytest
 
 from catstream.wire.keys import allow, create

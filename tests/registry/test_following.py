@@ -1,7 +1,5 @@
 """A subscriber to a stream of a fleet stays attached when the stream moves, and returns each frame once."""
 
-from __future__ import annotations
-
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack

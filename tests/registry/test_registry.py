@@ -1,7 +1,5 @@
 """The registry of a fleet: its state arrives whole, and only clients with a key of the fleet get an answer."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The file of a job: what a run is, for its processes and for whoever resumes it."""
 
-from __future__ import annotations
-
 import os
 import stat
 from dataclasses import replace

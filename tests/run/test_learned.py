@@ -1,7 +1,5 @@
 """A saved model: the file, the trees that continue from it, and merging."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """The state on disk, and who may have it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The coreset trees as files, for subscribers."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The start server forks the processes of a program's pipelines, and ends with the program."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

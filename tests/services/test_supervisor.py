@@ -1,7 +1,5 @@
 """The log of a process, as its supervisor reads it."""
 
-from __future__ import annotations
-
 from contextlib import closing
 
 from catstream.services.supervisor import ProcessLog

@@ -1,7 +1,5 @@
 """Formats that are made from a log."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from math import nan

@@ -1,7 +1,5 @@
 """The log of a run: NDJSON and CSV hold every track at once, and are continued where a crash has cut them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """The server of a fleet's page: what it shows of a fleet whose registry answers, and who may see it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

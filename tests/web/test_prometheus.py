@@ -1,7 +1,5 @@
 """The metrics of a pipeline and of a fleet."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """The page in each of its states, in a real browser: readable for all, and telling what is so."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 

@@ -1,7 +1,5 @@
 """`catstream track --view`: the page of a run, its first box, and its metrics."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

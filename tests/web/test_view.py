@@ -1,7 +1,5 @@
 """`catstream view` and `catstream fleet view`, as a user starts them: who may open the page."""
 
-from __future__ import annotations
-
 import encodings.idna  # noqa: F401  # used below as another user, who may not read this installation
 import os
 import re

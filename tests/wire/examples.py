@@ -1,7 +1,5 @@
 """A valid message of any kind, made from its schema."""
 
-from __future__ import annotations
-
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np

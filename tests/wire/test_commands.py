@@ -1,7 +1,5 @@
 """Commands and their answers: each is carried out once, whatever gets lost, and whoever else talks."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Where the processes meet, and who is kept out."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

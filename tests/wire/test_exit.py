@@ -1,7 +1,5 @@
 """A process may end while messages of closed sockets are still queued."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

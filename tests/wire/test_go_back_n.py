@@ -3,8 +3,6 @@
 No process, no socket, no clock: the two state machines, a network that breaks and repeats frames, and a disk.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from unittest.mock import Mock

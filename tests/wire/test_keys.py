@@ -1,7 +1,5 @@
 """Who comes in, where a pipeline has keys: with real sockets, on every channel."""
 
-from __future__ import annotations
-
 import os
 import stat
 from contextlib import ExitStack, suppress
@@ -262,14 +260,8 @@ def test_a_revoked_client_receives_until_its_connection_ends_and_cannot_reconnec
         with Publisher(TRACKS, place()) as tracks:
             until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.receive_all())))
             revoke(keys, "watcher")
-            until(
-                lambda: heard[-1].seq == 2,
-                lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())),
-            )
-            with (
-                Subscriber(TRACKS, place("watcher")) as another,
-                pytest.raises(ServiceError, match="rejects this key"),
-            ):
+            until(lambda: heard[-1].seq == 2, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
+            with Subscriber(TRACKS, place("watcher")) as another, pytest.raises(ServiceError, match="rejects this key"):
                 until(lambda: False, lambda: (tracks.send(track(3)), another.receive(0.02)))
         list(iter(lambda: reader.receive(0.05), None))  # what was on its way
         with Publisher(TRACKS, place()) as tracks, pytest.raises(ServiceError, match="rejects this key"):

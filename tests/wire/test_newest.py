@@ -1,7 +1,5 @@
 """Published messages about several objects: each subscriber gets those of its object, and each object's newest."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -3,8 +3,6 @@
 Run as a program, it writes the fields of the messages and the table of the heads: `make protocol`.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import select

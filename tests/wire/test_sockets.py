@@ -1,7 +1,5 @@
 """Channels between sockets: what arrives when one side dies, dawdles, or is a stranger."""
 
-from __future__ import annotations
-
 import resource
 import select
 import socket
@@ -18,15 +16,7 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError
-from catstream.messages.kinds import (
-    End,
-    Model,
-    Position,
-    Sample,
-    Summary,
-    Track,
-    Tracks,
-)
+from catstream.messages.kinds import End, Model, Position, Sample, Summary, Track, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.endpoint import Endpoint
@@ -251,10 +241,7 @@ def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_on
 
 @pytest.mark.parametrize(
     "bind",
-    [
-        lambda endpoint: Receiver(FEATURES, endpoint, Position(), WINDOW),
-        lambda endpoint: Publisher(MODELS, endpoint),
-    ],
+    [lambda endpoint: Receiver(FEATURES, endpoint, Position(), WINDOW), lambda endpoint: Publisher(MODELS, endpoint)],
     ids=["receiver", "publisher"],
 )
 def test_a_second_socket_at_the_same_address_is_rejected(endpoint, bind):

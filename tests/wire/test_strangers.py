@@ -1,7 +1,5 @@
 """What a stranger sends on any channel is counted by what is wrong with it, and dropped: nothing is trusted."""
 
-from __future__ import annotations
-
 import struct
 
 import msgpack
@@ -10,14 +8,7 @@ import pytest
 import zmq
 
 from catstream.compression.forest import Forest
-from catstream.messages.kinds import (
-    End,
-    Features,
-    Health,
-    ObjectFeatures,
-    Position,
-    TrainingRows,
-)
+from catstream.messages.kinds import End, Features, Health, ObjectFeatures, Position, TrainingRows
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES, RESULTS

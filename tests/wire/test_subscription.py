@@ -1,7 +1,5 @@
 """Attached to a pipeline: what a reader gets, what it is told that it missed, and when it ends."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Readers: the same truth in every layout."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Ctrl-C ends an evaluation in one line, with all its processes."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,7 +1,5 @@
 """One-pass evaluation: what is run, kept, found again, and refused."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Figures say what made them, and nothing of where that was."""
 
-from __future__ import annotations
-
 import json
 import platform
 import subprocess

@@ -1,7 +1,5 @@
 """The report and the command: one file with all in it, and a table."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

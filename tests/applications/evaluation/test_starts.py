@@ -1,7 +1,5 @@
 """The starts of the runs: their frames, and boxes that tracking can begin with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the tests of the search share: a model of the demo's dahlia, and one of its pagoda."""
 
-from __future__ import annotations
-
 import pytest
 
 from catstream.box import Box

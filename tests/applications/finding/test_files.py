@@ -1,7 +1,5 @@
 """Which files are searched."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 

@@ -1,7 +1,5 @@
 """The scan of a frame for several models at once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The search of videos and images."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 

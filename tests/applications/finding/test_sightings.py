@@ -1,7 +1,5 @@
 """Sightings that follow one another are an interval."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the tests of load tests share: tracks and models as an observer sees them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A broadcast: each frame at its moment, known by its time stamp, none left out for a slow reader."""
 
-from __future__ import annotations
-
 import threading
 import time
 import urllib.error

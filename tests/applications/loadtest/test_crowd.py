@@ -1,7 +1,5 @@
 """The rendered video of several objects, and its truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The report: the figures and the limits that were not met, on one page that needs nothing else."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ElementTree

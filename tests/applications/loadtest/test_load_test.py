@@ -1,7 +1,5 @@
 """Real runs: pipelines on a camera that does not wait, also if they are ended early."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 

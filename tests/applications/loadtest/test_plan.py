@@ -1,7 +1,5 @@
 """Limits and plans: what must hold, told in words, and what makes no sense refused."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
