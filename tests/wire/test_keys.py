@@ -9,7 +9,7 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, Features, Position, Track
+from catstream.messages.kinds import Answer, Command, End, Features, Position
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, CONTROL, FEATURES, MODELS, TRACKS
 from catstream.wire.codec import encode
@@ -18,7 +18,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys, allow, clients, create, revoke
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.results import ResultsReceiver, ResultsSender
-from catstream.wire.socket import rejects
+from tests.wire.examples import rejected, track
 
 WINDOW = 4
 CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # name and role of some
@@ -31,14 +31,6 @@ OUTSIDE = [(name, who) for name in CHANNELS for who in ("none", "wrong", "revoke
     for who, role in CLIENTS.items()
     if ROLES.index(role) < ROLES.index(channel.role)
 ]
-
-
-def track(seq):
-    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
-
-
-def rejected():
-    return rejects()["rejected"]
 
 
 @pytest.fixture
@@ -324,7 +316,7 @@ def test_a_client_without_keys_gets_an_error_if_the_pipeline_requires_them(place
     listens = listener("tracks" if attach == "subscribe" else "control")
     endpoint = str(place("none"))
 
-    def rejected():
+    def attached():
         listens()
         if attach == "subscribe":
             with catstream.subscribe(endpoint, "tracks", timeout=0.2) as tracks, suppress(SilenceError):
@@ -334,4 +326,4 @@ def test_a_client_without_keys_gets_an_error_if_the_pipeline_requires_them(place
                 pipeline.pause()
 
     with pytest.raises(ServiceError, match=r"requires authentication.*--keys DIR"):
-        until(rejected)
+        until(attached)
