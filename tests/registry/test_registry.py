@@ -11,7 +11,7 @@ from catstream.messages.kinds import FleetStatus, Listing, NodeStatus, Question,
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import find, fleets, meeting_place, running
-from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, public_key, revoke, synchronise
+from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, revoke, synchronise
 from catstream.wire.socket import rejects
 
 CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
@@ -101,18 +101,6 @@ def test_an_address_is_read_as_it_is_written():
             fleet_and_stream(wrong)
 
 
-def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_the_stream(
-    fleet_keys, folder, tcp, managing
-):
-    create(folder / "stream")
-    server, anna = public_key(folder / "stream"), Keys.load(folder / "anna")
-    keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server)})
-    with managing(keyed, tcp, str(fleet_keys)), Registry(tcp.removeprefix("tcp://"), str(folder / "anna")) as registry:
-        place = registry.endpoint_of(registry.stream("cam-7"))
-    assert place.keys == replace(anna, server=server.encode())
-    assert str(place) == "tcp://10.0.0.2:5700"
-
-
 def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp, managing):
     address = tcp.removeprefix("tcp://")
     create(folder / "other")
@@ -134,11 +122,8 @@ def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(
     own = clients(stream)["pipeline"]
     allow(stream, "old", "control", output=folder / "old")
     synchronise(stream, allowed(fleet_keys))
-    assert clients(stream) == {
-        "pipeline": own,
-        "fleet.pipeline": clients(fleet_keys)["pipeline"],
-        "anna": clients(fleet_keys)["anna"],
-    }
+    of_fleet = clients(fleet_keys)
+    assert clients(stream) == {"pipeline": own, "fleet.pipeline": of_fleet["pipeline"], "anna": of_fleet["anna"]}
     revoke(fleet_keys, "anna")
     allow(fleet_keys, "anna", "control", output=folder / "new")
     synchronise(stream, allowed(fleet_keys))

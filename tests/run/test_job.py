@@ -2,7 +2,6 @@
 
 import os
 import stat
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box
-from catstream.errors import ObjectError, ProtocolError, ServiceError, SettingsError
+from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import storage
 from catstream.run.job import Job, Results
 from catstream.settings import Settings
 
-JOB = Job(
-    "rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240), started=1e9
-)
+JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240))
 
 numbers = st.none() | st.integers(0, 10**6) | st.integers(0, 10**6).map(np.int64)
 paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
@@ -80,24 +77,3 @@ def test_a_field_of_another_type_is_an_error(tmp_path, field, value):
     storage.write(file, {}, storage.read_metadata(file) | {field: value})
     with pytest.raises(ProtocolError, match="is not a valid job of a pipeline"):
         Job.load(file)
-
-
-def test_a_run_is_continued_only_with_the_same_frames_and_training_settings():
-    JOB.check_fits(replace(JOB, settings=Settings(run={"lag_frames": 3})), Path("kept"))
-    with pytest.raises(SettingsError, match=r"frames 0 to the last, .* frames 3 to the last"):
-        JOB.check_fits(replace(JOB, part=slice(3, None)), Path("kept"))
-    with pytest.raises(SettingsError, match=r"started with coreset\.size=64, not 32"):
-        JOB.check_fits(replace(JOB, settings=Settings(coreset={"size": 32})), Path("kept"))
-
-
-def test_an_object_has_a_box_or_a_model():
-    replace(JOB, models={"ben": Path("walker.safetensors")})
-    with pytest.raises(SettingsError, match=r"anna: a box gives .* give one of them"):
-        replace(JOB, models={"anna": Path("walker.safetensors")})
-
-
-def test_a_job_has_at_most_as_many_objects_as_the_settings_allow():
-    boxes = {str(number): Box(1, 2, 30, 40) for number in range(9)}
-    replace(JOB, boxes=boxes, settings=Settings(run={"objects_most": 9}))
-    with pytest.raises(ObjectError, match=r"9 objects are more than 8: .*run\.objects_most=9"):
-        replace(JOB, boxes=boxes, settings=Settings(run={"objects_most": 8}))

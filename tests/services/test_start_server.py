@@ -116,10 +116,8 @@ def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_
 
 
 def test_nothing_outlives_a_program_that_is_killed(until):
-    program = (
-        "import time; from catstream.services.start_server import start_server; "
-        "print(start_server().pid, flush=True); time.sleep(600)"
-    )
+    program = "import time; from catstream.services.start_server import start_server; "
+    program += "print(start_server().pid, flush=True); time.sleep(600)"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as owner:
         server = psutil.Process(int(owner.stdout.readline()))
         owner.kill()
