@@ -41,10 +41,8 @@ hypothesis.settings.load_profile("catstream")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: Which of the processes that share the tests (pytest-xdist) this is, and of how many.
-WORKER, WORKERS = (
-    int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]),
-    int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)),
-)
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -62,9 +62,6 @@ def assert_within_the_bound(tree, rows, subspaces, squared_distance):
     assert_allclose(energy(summary(tree)) + dropped, energy(rows), rtol=1e-12)
 
 
-# --- what it keeps ---------------------------------------------------------------------------------
-
-
 def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared_distance):
     assert_within_the_bound(grown(stream), stream, subspaces, squared_distance)
 
@@ -86,9 +83,6 @@ def test_sums_counts_and_leaves_are_exact(kind, count, seed):
     assert_array_equal(tree.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
 
 
-# --- what it costs ---------------------------------------------------------------------------------
-
-
 @given(st.integers(0, 300), seeds)
 def test_levels_strictly_fall_from_oldest_to_newest(count, seed):
     levels = [node.level for node in grown(whole_numbers(count, seed), size=4).nodes]
@@ -104,9 +98,6 @@ def test_memory_grows_with_the_logarithm_of_the_rows(rng):
         nodes = math.log2(p / n) + 1 if p >= n else 0
         assert len(tree.nodes) <= nodes
         assert tree.nbytes <= nodes * (4 * n * d + 8 * d) + 4 * n * d
-
-
-# --- the same, however it comes ------------------------------------------------------------------------
 
 
 @KINDS
@@ -145,9 +136,6 @@ def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
     assert (bits(one), bits(other)) == before
 
 
-# --- on disk --------------------------------------------------------------------------------------------
-
-
 @KINDS
 @pytest.mark.parametrize("count", [0, 3, 64, 103])
 def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
@@ -180,9 +168,6 @@ def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch
     with pytest.raises(KeyboardInterrupt):
         tree.insert(stream[:SIZE])
     assert bits(tree) == before
-
-
-# --- what it refuses ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -21,25 +21,13 @@ def moving(motion: Motion, frames: int = 60) -> np.ndarray:
     return estimate
 
 
-def centre(estimate: np.ndarray) -> np.ndarray:
-    return estimate[0, :2]
-
-
-def velocity(estimate: np.ndarray) -> np.ndarray:
-    return estimate[0, 2:]
-
-
-def distance(a: np.ndarray | tuple[float, float], b: np.ndarray | tuple[float, float]) -> float:
-    return float(np.hypot(a[0] - b[0], a[1] - b[1]))
-
-
 def test_a_lost_object_coasts_to_a_stop(motion):
     estimate = moving(motion)
-    start, speed = centre(estimate), np.hypot(*velocity(estimate))
+    (x, y, *velocity), *_ = estimate
     for _ in range(500):
         estimate = predicted(estimate, motion, lost=True)
-    assert np.hypot(*velocity(estimate)) < 1e-6
-    assert distance(centre(estimate), start) < 5.01 * speed
+    assert np.hypot(*estimate[0, 2:]) < 1e-6
+    assert np.hypot(*(estimate[0, :2] - (x, y))) < 5.01 * np.hypot(*velocity)
 
 
 def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(motion):
@@ -49,8 +37,8 @@ def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(m
     shares = []
     for estimate in (never_left, back):
         expected = predicted(estimate, motion)
-        x, y = centre(expected)
-        shares.append((centre(measured(expected, motion, (x + 5, y)))[0] - x) / 5)
+        x, y = expected[0, :2]
+        shares.append((measured(expected, motion, (x + 5, y))[0, 0] - x) / 5)
     assert shares[0] < 0.3 < 0.6 < shares[1]
 
 

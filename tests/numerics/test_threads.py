@@ -42,9 +42,8 @@ with one_thread():
 
 def test_a_library_that_is_imported_inside_is_on_one_thread_too():
     environment = os.environ | dict.fromkeys(_VARIABLES, "2")
-    said = subprocess.run(
-        [sys.executable, "-c", FIRST_USE], env=environment, capture_output=True, text=True, check=True
-    )
+    program = [sys.executable, "-c", FIRST_USE]
+    said = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
     assert said.stdout == "{1}\n"
 
 

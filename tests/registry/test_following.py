@@ -10,22 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import catstream
-from catstream.box import Box
 from catstream.client.registry import FollowedStream
 from catstream.client.subscription import wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
+from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
 from catstream.wire.keys import allow, allowed, create, public_key, revoke, synchronise
 from catstream.wire.newest import Publisher
+from tests.wire.examples import present as track
 
 STOPPED = End(99, "it was stopped by a command")
-
-
-def track(seq, name=""):
-    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
 
 
 class Stream:

@@ -43,14 +43,6 @@ def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
             served.result()
 
 
-def test_a_stream_that_does_not_run_has_no_endpoint(managing):
-    idle = replace(SITE, streams={"cam-7": StreamStatus("cam-7", "failed", trouble="there is no camera")})
-    with managing(idle), Registry() as registry:
-        assert registry.endpoint_of(registry.stream("cam-7")) is None
-        with pytest.raises(ServiceError, match="cam-7 runs nowhere, its state is failed: there is no camera"):
-            locate("fleet://cam-7")
-
-
 def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
     with managing(SITE) as controller, meeting_place("", folder, source="walk.mp4") as pipeline:
         assert fleets() == {"site": controller}

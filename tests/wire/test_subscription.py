@@ -10,18 +10,14 @@ import pytest
 import zmq
 
 import catstream
-from catstream.box import Box
 from catstream.errors import ObjectError, ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, ObjectFeatures, Track, TrainingRows
+from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
 from catstream.wire.endpoint import meeting_place
 from catstream.wire.newest import Publisher
 from tests.wire.examples import model
-
-
-def track(seq, name="", version=1):
-    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, version, object=name)
+from tests.wire.examples import present as track
 
 
 def features(seq):

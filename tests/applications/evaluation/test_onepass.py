@@ -22,11 +22,9 @@ SETTINGS = Settings()
 
 @pytest.fixture
 def run(sequence, found) -> EvaluationRun:
-    frames = len(sequence)
     found[0], found[9] = sequence.boxes[0], np.nan
-    return EvaluationRun(
-        "catstream", sequence, FIRST, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02)
-    )
+    confidence, seconds = np.linspace(1, 0.5, len(sequence)).round(6), np.full(len(sequence), 0.02)
+    return EvaluationRun("catstream", sequence, FIRST, found.round(4), confidence, seconds)
 
 
 @pytest.fixture
@@ -106,14 +104,10 @@ def test_runs_from_changed_first_boxes_are_stored_beside_the_others(tmp_path, se
 
 
 @pytest.mark.parametrize(
-    "changed",
-    [
-        pytest.param(lambda sequence: sequence.boxes[:-1], id="fewer boxes"),
-        pytest.param(lambda sequence: sequence.boxes + 3, id="another first box"),
-    ],
+    "changed", [lambda boxes: boxes[:-1], lambda boxes: boxes + 3], ids=["fewer boxes", "another first box"]
 )
 def test_runs_with_another_ground_truth_are_repeated(tmp_path, sequence, counted, changed):
-    for boxes in (sequence.boxes, changed(sequence)):
+    for boxes in (sequence.boxes, changed(sequence.boxes)):
         evaluate([replace(sequence, boxes=boxes)], ["catstream"], SETTINGS, output=tmp_path)
     assert len(counted) == 2
 
@@ -184,9 +178,8 @@ def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
     script = tmp_path / "killed.py"
     script.write_text(f"""
 import signal
-from catstream.applications.evaluation.datasets import find_sequences
+from catstream.applications.evaluation.datasets import find_sequences, temporal
 from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.datasets import temporal
 from catstream.settings import Settings
 
 def done(run):
@@ -212,10 +205,8 @@ if __name__ == "__main__":
 def test_rows_are_means_over_the_runs_with_their_spread(sequence):
     runs = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(2))
     rows = rows_of(runs)
-    assert [(row.name, row.tracker, row.frames, row.runs) for row in rows] == [
-        ("walk", "catstream", 12, 2),
-        ("walk", "mil", 12, 2),
-    ]
+    facts = [(row.name, row.tracker, row.frames, row.runs) for row in rows]
+    assert facts == [("walk", "catstream", 12, 2), ("walk", "mil", 12, 2)]
     scores = [run.score().auc for run in runs[:2]]
     assert rows[0].auc == pytest.approx(np.mean(scores))
     assert rows[0].auc_spread == pytest.approx(np.std(scores))
@@ -239,7 +230,6 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
     rows = rows_of(map(with_success, (12, 9), starts)) + rows_of(map(with_success, (12, 10), starts))
     assert [row.flips for row in rows] == [True, False]  # 9 of 12 frames have the object: 0.33 and 0.22 are lost
     assert flips_of(rows[:1]) == {"catstream": ["walk"]}
-    assert describe_flips(rows[1:]) == [
-        "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
-    ]
+    said = "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
+    assert describe_flips(rows[1:]) == [said]
     assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}

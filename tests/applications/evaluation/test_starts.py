@@ -51,12 +51,8 @@ def test_if_no_frame_has_a_valid_box_or_can_be_read_the_run_says_so(sequence, tm
     errors: list[CatstreamError] = []
     assert evaluate([outside], ["mil"], Settings(), starts=temporal(2), failed=errors.append) == []
     assert evaluate([unreadable], ["mil"], Settings(), starts=temporal(2), failed=errors.append) == []
-    assert [str(error).split(": ")[0] for error in errors] == [
-        "mil on walk",
-        "mil on walk@6",
-        "mil on walk",
-        "mil on walk@8",
-    ]
+    starts = ["mil on walk", "mil on walk@6", "mil on walk", "mil on walk@8"]
+    assert [str(error).split(": ")[0] for error in errors] == starts
 
 
 def test_every_choice_starts_when_the_object_appears(sequence):
@@ -99,10 +95,8 @@ def test_jittered_boxes_are_the_given_one_and_fixed_random_ones_within_two_perce
 def test_tracking_can_start_with_every_changed_box(centre, sides, data):
     truth = Box(0, 0, *sides).centred(*centre)
     sequence = Sequence("walk", None, np.array([truth]))
-    start = Start(
-        0, data.draw(st.sampled_from([start.variation for start in jittered(4)(sequence)[1:]] + list(SHIFTS)))
-    )
-    box = start.box(sequence, (160, 120))
+    variations = [*SHIFTS, *(start.variation for start in jittered(4)(sequence)[1:])]
+    box = Start(0, data.draw(st.sampled_from(variations))).box(sequence, (160, 120))
     assert box.validated(160, 120) is box
 
 

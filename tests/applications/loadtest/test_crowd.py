@@ -1,5 +1,7 @@
 """The rendered video of several objects, and its truth."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
@@ -16,11 +18,10 @@ def test_the_same_arguments_give_the_same_pixels():
 def test_all_objects_begin_whole_in_the_picture_and_apart(count):
     _, boxes = next(render(count, 2))
     assert list(boxes) == list(NAMES[:count])
-    assert all(
-        box.x >= 0 and box.y >= 0 and box.x + box.w <= SIZE[0] and box.y + box.h <= SIZE[1] for box in boxes.values()
-    )
-    pairs = [(a, b) for i, a in enumerate(boxes.values()) for b in list(boxes.values())[:i]]
-    assert all(a.overlap(b) == 0 for a, b in pairs)
+    for box in boxes.values():
+        assert 0 <= box.x <= box.x + box.w <= SIZE[0]
+        assert 0 <= box.y <= box.y + box.h <= SIZE[1]
+    assert all(a.overlap(b) == 0 for a, b in combinations(boxes.values(), 2))
 
 
 def test_some_objects_leave_and_come_back():

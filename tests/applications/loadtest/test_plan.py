@@ -43,10 +43,8 @@ def test_a_malformed_limit_is_an_error(text):
 @pytest.mark.parametrize(
     ("facts", "said"),
     [
-        ({"subscribers": 3, "slow_subscribers": 4}, "4 of 3 subscribers cannot be slow"),
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
         ({"objects": 99}, "shows at most 16 objects, not 99"),
-        ({"settings": Settings(run={"lockstep": True})}, "leave out lockstep"),
         ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],
 )
