@@ -1,10 +1,10 @@
-"""The start server forks the processes of a program's pipelines, and ends with the program."""
+"""The start server forks the processes of a program's pipelines, and ends with it; and the log of a process."""
 
 import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import psutil
@@ -161,3 +161,22 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
     monkeypatch.setattr(sys, name, value, raising=False)
     with pytest.raises(ServiceError, match="run it with python"):
         start_server()
+
+
+def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
+    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
+        assert log.last_line() == "it logged nothing"
+        file.write(b"detector: one\nTraceback\ndetector: tw")
+        file.flush()
+        assert log.new_lines() == ["one"]
+        file.write(b"o\n")
+        file.flush()
+        assert log.new_lines() == ["two"]
+        assert log.last_line() == "two"
+
+
+def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_one(tmp_path):
+    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
+        file.write(b"detector: " + bytes(200_000) + b"\ndetector: the source is lost\n")
+        file.flush()
+        assert [line for _ in range(9) for line in log.new_lines()] == ["the source is lost"]

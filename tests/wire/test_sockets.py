@@ -5,6 +5,7 @@ import select
 import socket
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -18,7 +19,7 @@ import catstream
 from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Position, Sample, Summary, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import MODELS, RESULTS, SAMPLES, TRACKS
+from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.socket import Event, Monitor, context
@@ -174,3 +175,34 @@ def test_too_many_open_files_are_an_error_that_names_the_limit(folder, open_file
     open_files(40)
     with ExitStack() as stack, pytest.raises(ServiceError, match="ulimit -n"):
         [stack.enter_context(catstream.subscribe(str(folder), "tracks")) for _ in range(40)]
+
+
+SENDER = """
+import sys
+import numpy as np
+from catstream.messages.kinds import Features, ObjectFeatures, Position, TrainingRows
+from catstream.wire.acknowledged import Sender
+from catstream.wire.channels import FEATURES
+from catstream.wire.endpoint import Endpoint
+
+rows = TrainingRows.labelled(np.ones((10, 100_000), np.float32), 1)
+with Sender(FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
+    features.ask_position(0)
+    features.window.resume(0, Position())
+    for seq in range(1, 33):
+        features.send(Features(seq, seq - 1, 0.0, {"anna": ObjectFeatures(None, {"appearance": rows})}))
+"""
+
+
+def test_a_process_that_ends_with_queued_messages_ends_normally(folder):
+    place = Endpoint.parse(str(folder))
+    with zmq.Context.instance().socket(zmq.ROUTER) as receiver:
+        receiver.set(zmq.LINGER, 0)
+        receiver.set(zmq.RCVHWM, 1)
+        receiver.bind(place.listening(FEATURES))
+        with subprocess.Popen([sys.executable, "-c", SENDER, str(folder)], stderr=subprocess.PIPE) as sender:
+            while sender.poll() is None:
+                time.sleep(0.02)
+                if receiver.poll(0):
+                    receiver.recv_multipart()
+            assert sender.returncode == 0, sender.stderr.read().decode()
