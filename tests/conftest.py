@@ -184,7 +184,7 @@ def tcp():
     raise AssertionError("no free ports on this machine")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def until():
     """Wait until a condition holds, turn after turn, and return what it returned; fail where it never does."""
 

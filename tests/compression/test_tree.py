@@ -148,16 +148,6 @@ def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
     assert bits(loaded) == bits(tree)
 
 
-def test_rows_inserted_into_a_tree_are_not_in_its_copy(stream):
-    tree = grown(stream[:3])
-    copy, other = tree.copy(), tree.copy()
-    tree.insert(stream[3:])
-    assert bits(copy) == bits(grown(stream[:3]))
-    copy.insert(stream[3:])
-    assert bits(copy) == bits(tree)
-    assert bits(other) == bits(grown(stream[:3]))
-
-
 @KINDS
 def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch):
     def interrupted(*_):
@@ -182,12 +172,6 @@ def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
     with pytest.raises(ProtocolError):
         tree.insert(rows)
     assert bits(tree) == before
-
-
-def test_a_state_whose_rows_are_no_table_is_rejected():
-    arrays, metadata = grown(np.ones((9, 6)), size=4).state()
-    with pytest.raises(ProtocolError, match="not the state of a coreset tree"):
-        CoresetTree.from_state(arrays | {"rows.0": arrays["rows.0"].reshape(-1)}, metadata)
 
 
 def test_trees_of_other_sizes_or_rows_are_rejected():

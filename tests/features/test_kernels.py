@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
-import pytest
 
 from catstream.features import kernels, layout
 from catstream.features.kernels import COMPILING
@@ -44,21 +43,6 @@ def test_kernels_are_compiled_in_memory_if_no_folder_can_be_written(tmp_path):
 def test_the_numbers_that_the_kernels_repeat_are_those_of_the_layout():
     for name in ("CELL", "WINDOW", "CHANNELS", "SIDE"):
         assert getattr(kernels, name) == getattr(layout, name)
-
-
-@pytest.mark.parametrize(
-    "colours",
-    [
-        [[0, 0, 0]],
-        np.zeros((1, 3)),
-        np.zeros(3, np.uint8),
-        np.zeros((3, 3), np.uint8).T,
-        np.frombuffer(bytes(3), np.uint8),
-    ],
-)
-def test_an_argument_of_another_type_is_refused(colours):
-    with pytest.raises(TypeError):
-        kernels.convert_to_lab(colours, np.zeros((1, 3), np.uint8))
 
 
 def test_a_forked_process_and_threads_can_call_kernels():

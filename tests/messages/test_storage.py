@@ -19,17 +19,12 @@ METADATA = {"kind": "trees", "nodes": [{"level": 3, "energy": "0x1.8p+3"}, {"lev
 WHOLE = storage.encode(ARRAYS, METADATA)
 
 
-@pytest.fixture
-def umask():
-    """Sets the umask for one test."""
-    before = os.umask(0)
-    yield os.umask
-    os.umask(before)
-
-
-def test_a_file_without_a_secret_has_the_permissions_of_the_umask(tmp_path, umask):
-    umask(0o027)
-    storage.write(tmp_path / "tree", {}, {})
+def test_a_file_without_a_secret_has_the_permissions_of_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        storage.write(tmp_path / "tree", {}, {})
+    finally:
+        os.umask(before)
     assert stat.S_IMODE((tmp_path / "tree").stat().st_mode) == 0o640
 
 

@@ -7,13 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import cv2
-import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from catstream.numerics import threads
-from catstream.numerics.threads import _VARIABLES, Scratch, in_parallel, one_thread
+from catstream.numerics.threads import _VARIABLES, in_parallel, one_thread
 
 
 def counts():
@@ -123,15 +122,6 @@ def test_the_first_error_is_raised(cores):
     with pytest.raises(ValueError, match="1"):
         in_parallel(call, range(4))
     assert set(ended) == ({0, 3} if cores > 1 else {0})
-
-
-def test_scratch_is_kept_for_a_size_and_no_two_threads_share_it():
-    scratch = Scratch(lambda size: (np.empty(size),))
-    (here,) = scratch.kept(3)
-    assert scratch.kept(3)[0] is here
-    assert scratch.kept(4)[0] is not here
-    with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(lambda: scratch.kept(3)).result()[0] is not here
 
 
 #: Prints a digest of two models that a Tracker learns, merged.

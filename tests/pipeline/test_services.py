@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from itertools import islice
 
@@ -175,10 +174,10 @@ def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_o
     for resume in (False, True):
         supervisor = Supervisor(replace(job, resume=resume), folder)
         try:
-            before = runs_of_all(folder)
+            before = runs_of_all(folder, until)
             os.kill(killed := supervisor.pids["detector"], signal.SIGKILL)
             until(lambda killed=killed, found=supervisor: found.pids.get("detector", killed) != killed)
-            assert runs_of_all(folder) == before
+            assert runs_of_all(folder, until) == before
         finally:
             supervisor.stop()
         assert len(before) == 1, "the processes agree"
@@ -187,14 +186,11 @@ def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_o
     assert "" not in runs
 
 
-def runs_of_all(folder):
+def runs_of_all(folder, until):
     """The runs that the health reports of all processes are from."""
-    runs, deadline = {}, time.monotonic() + 60
+    runs = {}
     with Subscriber(HEALTH, Endpoint.parse(str(folder))) as reports:
-        while runs.keys() < set(NAMES) and time.monotonic() < deadline:
-            if (report := reports.receive(0.1)) is not None:
-                runs[report.process] = reports.run
-    assert runs.keys() == set(NAMES)
+        until(lambda: runs.keys() == set(NAMES), lambda: runs.update({reports.receive(60).process: reports.run}))
     return set(runs.values())
 
 
