@@ -33,6 +33,7 @@ from catstream.video.rendered import render, write
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.keys import allow, create
 
 hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
 hypothesis.settings.load_profile("catstream")
@@ -166,6 +167,14 @@ def folder():
 def endpoint(folder):
     """The endpoint of a pipeline in `folder`."""
     return Endpoint.parse(str(folder))
+
+
+@pytest.fixture
+def keys(folder):
+    """A folder of keys; beside it those of a client, anna, who may watch."""
+    create(folder / "keys")
+    allow(folder / "keys", "anna", "watch", output=folder / "anna")
+    return folder / "keys"
 
 
 @pytest.fixture

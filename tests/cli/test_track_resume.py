@@ -44,7 +44,8 @@ def wreck(video, program, until, tmp_path_factory):
     results = ["--output", place / "out", "--video", "--state", place / "kept"]
     command = [*program, "track", source, "--box", box, *map(str, results), *OFTEN]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    until(lambda: len(checkpoints(place / "kept")) > 1 and len(frames(place / "out")) >= 6)
+    kept, out = place / "kept", place / "out"
+    until(lambda: process.poll() is not None or (len(checkpoints(kept)) > 1 and len(frames(out)) >= 6))
     assert process.poll() is None, process.communicate()[1]
     kill_everything(process)
     process.stderr.close()

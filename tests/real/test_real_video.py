@@ -1,17 +1,46 @@
-"""Real files: every frame is read, the truth fits it, and the object is followed."""
+"""Real files: every frame is read, the truth fits it, and the object is followed.
 
+They are beside the project in ../shared/data, or where TRACKING_DATA says.
+"""
+
+import os
+from collections.abc import Callable
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.datasets import find_sequences
+from catstream.applications.evaluation.datasets import Sequence, find_sequences
 from catstream.applications.evaluation.onepass import evaluate
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.paper.scm import SparseCollaborativeModel
 from catstream.settings import Settings
 from catstream.video.source import open_source
+
+DATA = Path(os.environ.get("TRACKING_DATA") or Path(__file__).parents[3] / "shared" / "data")
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of all sequences; the test is skipped where there is none."""
+    if not DATA.is_dir():
+        pytest.skip(f"no real sequences at {DATA}: put some there, or set TRACKING_DATA")
+    return DATA
+
+
+@pytest.fixture(scope="session")
+def real(data: Path) -> Callable[[str], Sequence]:
+    """A real sequence by its name; the test is skipped where it is absent."""
+
+    def find(name: str) -> Sequence:
+        if not (data / name).is_dir():
+            pytest.skip(f"{name} is not in {data}")
+        return find_sequences(data / name)[0]
+
+    return find
+
 
 VIDEOS = ["TLD_01_david", "TLD_02_jumping", "TLD_04_pedestrian2", "TLD_06_car", "TLD_10_panda"]
 

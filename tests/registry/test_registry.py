@@ -93,39 +93,39 @@ def test_an_address_is_read_as_it_is_written():
             fleet_and_stream(wrong)
 
 
-def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp, managing):
+def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(keys, folder, tcp, managing):
     address = tcp.removeprefix("tcp://")
     create(folder / "other")
-    with managing(SITE, tcp, str(fleet_keys)):
+    with managing(SITE, tcp, str(keys)):
         with Registry(address) as registry, pytest.raises(ServiceError, match="requires authentication"):
             registry.streams()
         with Registry(address, str(folder / "other"), timeout=0.5) as registry, pytest.raises(SilenceError):
             registry.streams()
         before = rejects()["rejected"]
-        revoke(fleet_keys, "anna")
+        revoke(keys, "anna")
         with Registry(address, str(folder / "anna")) as registry, pytest.raises(ServiceError, match="rejects this key"):
             registry.streams()
         assert rejects()["rejected"] > before
 
 
-def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(fleet_keys, folder):
+def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(keys, folder):
     stream = folder / "stream"
     create(stream)
     own = clients(stream)["pipeline"]
     allow(stream, "old", "control", output=folder / "old")
-    synchronise(stream, allowed(fleet_keys))
-    of_fleet = clients(fleet_keys)
+    synchronise(stream, allowed(keys))
+    of_fleet = clients(keys)
     assert clients(stream) == {"pipeline": own, "fleet.pipeline": of_fleet["pipeline"], "anna": of_fleet["anna"]}
-    revoke(fleet_keys, "anna")
-    allow(fleet_keys, "anna", "control", output=folder / "new")
-    synchronise(stream, allowed(fleet_keys))
+    revoke(keys, "anna")
+    allow(keys, "anna", "control", output=folder / "new")
+    synchronise(stream, allowed(keys))
     assert clients(stream)["anna"] == Client("control", Keys.load(folder / "new").public.decode())
     assert (stream / "clients" / "anna").stat().st_mode & 0o777 == 0o600
 
 
 @pytest.mark.parametrize("name", ["../server.key", ".hidden", ""])
-def test_a_client_whose_name_is_no_name_changes_nothing(fleet_keys, name):
-    before = clients(fleet_keys)
+def test_a_client_whose_name_is_no_name_changes_nothing(keys, name):
+    before = clients(keys)
     with pytest.raises(ServiceError, match="a client's name"):
-        synchronise(fleet_keys, {name: Client("watch", "k" * 40)})
-    assert clients(fleet_keys) == before
+        synchronise(keys, {name: Client("watch", "k" * 40)})
+    assert clients(keys) == before
