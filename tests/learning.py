@@ -21,6 +21,11 @@ def features(rng, appearance=1.0):
     return ObjectFeatures(BOX, training, DetectorState(0, "confident", WINDOW, WINDOW, WINDOW))
 
 
+def rows_of(tree):
+    """All rows that a coreset tree has in memory, C."""
+    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+
+
 def learned_from(video, box, part, settings=None):
     """What a tracker learns in a part of a video, in whose first frame the object has this box."""
     tracker = Tracker(settings)

@@ -21,6 +21,7 @@ from catstream.compression.node import sample, spread
 from catstream.compression.reduce import energy, reduce
 from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError
+from tests.learning import rows_of
 
 SIZE = 16
 ROUNDING = 1e-5  # of float32, relative to ||A||^2
@@ -41,11 +42,6 @@ def whole_numbers(count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(-9, 10, (count, 6)).astype(np.float32)
 
 
-def summary(tree: CoresetTree) -> np.ndarray:
-    """All rows in memory, C."""
-    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
-
-
 def bits(tree: CoresetTree) -> dict[str, bytes]:
     arrays, metadata = tree.state()
     return {"metadata": repr(metadata).encode()} | {name: array.tobytes() for name, array in arrays.items()}
@@ -56,11 +52,11 @@ def assert_within_the_bound(tree, rows, subspaces, squared_distance):
     levels, dropped, slack = tree.nodes[0].level, tree.dropped_energy, ROUNDING * energy(rows)
     for basis in subspaces:
         k = basis.shape[1]
-        truth, approximation = squared_distance(rows, basis), squared_distance(summary(tree), basis)
+        truth, approximation = squared_distance(rows, basis), squared_distance(rows_of(tree), basis)
         assert truth - dropped - slack <= approximation <= truth + slack
         assert truth - slack <= approximation + dropped <= (1 + levels * k / (SIZE - k + 1)) * truth + slack
     assert tree.rows_seen == len(rows)
-    assert_allclose(energy(summary(tree)) + dropped, energy(rows), rtol=1e-12)
+    assert_allclose(energy(rows_of(tree)) + dropped, energy(rows), rtol=1e-12)
 
 
 def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared_distance):

@@ -19,7 +19,7 @@ from catstream.run.job import Job
 from catstream.run.learned import Learned
 from catstream.run.state import files
 from catstream.settings import Settings
-from tests.learning import features
+from tests.learning import features, rows_of
 
 SETTINGS = Settings(coreset={"size": 4})
 
@@ -73,10 +73,6 @@ def put_state(tmp_path, name, seed, frames=12):
     Store(str(tmp_path / "store")).stream(name).claim("here").write(files(folder), {})
 
 
-def coreset(tree):
-    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
-
-
 def test_the_newest_states_of_all_streams_are_merged_within_the_bound_and_only_a_new_model_is_stored(store, tmp_path):
     streams = ["door", "yard", "hall", "gate"]
     merged = merge_streams(store, streams, "anna", named=False)
@@ -86,7 +82,7 @@ def test_the_newest_states_of_all_streams_are_merged_within_the_bound_and_only_a
     tree = Learned.from_bytes(merged.model, "").trees["object"]
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(row_length(), 3)))[0].astype(np.float32)
     rows = [each.training[APPEARANCE].rows[:4] for seed in range(3) for each in stream(seed)]
-    truth, kept = energy(np.vstack(rows) @ basis), energy(coreset(tree) @ basis)
+    truth, kept = energy(np.vstack(rows) @ basis), energy(rows_of(tree) @ basis)
     assert tree.rows_seen == sum(map(len, rows))
     assert truth - tree.dropped_energy - 1e-5 * truth <= kept <= truth * (1 + 1e-5)
     assert merge_streams(store, streams[::-1], "anna", named=False).model == merged.model

@@ -15,7 +15,7 @@ from catstream.messages import storage
 from catstream.messages.heads import APPEARANCE, TREES
 from catstream.run.learned import Learned, check_sizes, merge
 from catstream.settings import Settings
-from tests.learning import BOX, features
+from tests.learning import BOX, features, rows_of
 
 SIZE, WIDTH, FRAMES = 8, row_length(), 60
 SETTINGS = Settings(coreset={"size": SIZE})
@@ -50,11 +50,6 @@ def learned(messages):
 
 def bits(trees):
     return {(name, key): array.tobytes() for name, tree in trees.items() for key, array in tree.state()[0].items()}
-
-
-def rows_of(tree):
-    """All rows in memory, C."""
-    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
 
 
 def test_a_saved_model_is_loaded_bit_for_bit(learned, tmp_path):
