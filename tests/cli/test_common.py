@@ -18,13 +18,13 @@ from catstream.messages.kinds import Track
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
-def shown(width, frames, **pipeline):
+def shown(width, seen, **pipeline):
     """What the line of a pipeline shows while the tracks of some frames come, and its run."""
     pipeline = SimpleNamespace(lost_seconds=0, holding="", totals={}, restarts=0, **pipeline)
     written, run = StringIO(), RunProgress(pipeline)
     console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
     with run.line(console) as progress:
-        for tracks in frames:
+        for tracks in seen:
             run.show(progress, tracks)
         progress.refresh()
     return written.getvalue(), run
