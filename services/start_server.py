@@ -272,7 +272,11 @@ def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.dup2(log, sys.stderr.fileno())
-        for descriptor in {int(each.name) for each in Path("/proc/self/fd").iterdir()} - {0, 1, 2, watchdog}:
+        try:
+            descriptors = {int(each.name) for each in Path("/proc/self/fd").iterdir()}
+        except FileNotFoundError:  # there is no /proc
+            descriptors = {*range(1024)}
+        for descriptor in descriptors - {0, 1, 2, watchdog}:
             with suppress(OSError):  # the one of the listing
                 os.close(descriptor)
         with suppress(OSError):  # it was removed
