@@ -125,7 +125,7 @@ class StartServer:
     """A start server, as its program sees it; ServiceError if the program is not one that Python runs."""
 
     def __init__(self) -> None:
-        if getattr(sys, "frozen", False) or not sys.executable:
+        if getattr(sys, "frozen", False) or not os.access(sys.executable or "", os.X_OK):
             raise ServiceError("a frozen program has no Python to start processes with: run it with python")
         self.program = os.getpid()  # a copy of this process that is forked later has no server
         self._started: list[StartedProcess] = []

@@ -143,8 +143,8 @@ os._exit(0 if code is None else 1)
     assert subprocess.run([sys.executable, "-c", program], check=False, preexec_fn=before).returncode == 0
 
 
-def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_have(monkeypatch, start, until):
-    monkeypatch.setattr(module, "_server", None)
+def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_have(start, until):
+    module.close_start_server()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
@@ -157,7 +157,6 @@ def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_hav
     assert psutil.Process(process.pid).rlimit(psutil.RLIMIT_NOFILE) == (hard, hard)
     process.send_signal(signal.SIGTERM)
     assert until(process.poll) == 4
-    module.close_start_server()
 
 
 def test_a_server_that_cannot_run_is_an_error_that_names_it(monkeypatch, until):
@@ -184,7 +183,7 @@ def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own(server):
     os.close(writing)
 
 
-@pytest.mark.parametrize(("name", "value"), [("frozen", True), ("executable", "")])
+@pytest.mark.parametrize(("name", "value"), [("frozen", True), ("executable", ""), ("executable", "/gone/python")])
 def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name, value):
     monkeypatch.setattr(module, "_server", None)
     monkeypatch.setattr(sys, name, value, raising=False)
