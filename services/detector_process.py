@@ -19,7 +19,7 @@ from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import Answer, Command, End, Features, Model, Tracks, run_state
+from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED
 from catstream.services.control_commands import STOPPED, answer, carried_out, check_room, is_kept, object_of
@@ -212,7 +212,9 @@ class DetectorLoop:
         """
         given = self._begin_boxes(frame)
         if self._holds and not given:
-            self._show(self.detectors.seq, frame)  # the other objects, while a box is drawn
+            # The other objects, while a box is drawn. A live source goes on: where they are by now is not known.
+            live = self._source is not None and self._source.live
+            self._show(self.detectors.seq, frame, {} if live else self._tracks.tracks)
         while self._holds and not given and not self.end_reason and self._source is not None and not self._source.live:
             sleep(TURN_SECONDS)
             self.turn()
@@ -247,7 +249,7 @@ class DetectorLoop:
         tracks = replace(tracks, tracks={name: replace(each, pts=frame.pts) for name, each in tracks.tracks.items()})
         models = {name: replace(features.objects[name], model=each.to_bytes()) for name, each in self._begun.items()}
         self._tracks, self._begun = tracks, {}
-        self._show(tracks.frame, frame)
+        self._show(tracks.frame, frame, tracks.tracks)
         return tracks, replace(features, objects=features.objects | models)
 
     def send(self, tracks: Tracks, features: Features) -> None:
@@ -290,10 +292,10 @@ class DetectorLoop:
                 self._receive_models(TURN_SECONDS)
             self.turn()
 
-    def _show(self, number: int, frame: Frame) -> None:
-        """Show a frame with the last boxes of the objects, if somebody looks."""
-        tracks = self._tracks.tracks.items()
-        boxes = {name: each.box for name, each in tracks if each.box is not None and name in self.desired.objects}
+    def _show(self, number: int, frame: Frame, tracks: Mapping[str, Track]) -> None:
+        """Show a frame with the boxes of the objects that are tracked, if somebody looks."""
+        present = ((name, each.box) for name, each in tracks.items() if name in self.desired.objects)
+        boxes = {name: box for name, box in present if box is not None}
         self._outputs.previews.show(number, frame.image, boxes)
 
     # Commands

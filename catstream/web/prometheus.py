@@ -40,7 +40,7 @@ def _of_pipeline(feed: PipelineFeed) -> Iterator[_Sample]:
     if running and "detector" in dashboard.health:
         counters = dashboard.health["detector"].counters
         yield "paused", counters.get("paused", 0.0), of
-        yield "source_lost_seconds", counters.get("lost_seconds", 0.0), of
+        yield "source_lost_seconds", counters.get("lost_seconds", 0.0) if dashboard.state[0] == "lost" else 0.0, of
     for process, report in dashboard.health.items() if running else ():
         yield f"{process}_age_seconds", max(0.0, time() - report.time), of
         of_objects = {counter for counters in report.objects.values() for counter in counters}

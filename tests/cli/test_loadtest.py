@@ -14,7 +14,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
     assert code == 1
     assert re.fullmatch(
-        r"catstream: broken: max is .*, limit at most 0 \(seconds from a frame to its track\)", errors.splitlines()[-1]
+        r"catstream: broken: max is .*, limit at most 0 ms \(from a frame to its track\)", errors.splitlines()[-1]
     )
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
     assert "met: missed" in output

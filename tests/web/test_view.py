@@ -75,7 +75,9 @@ def test_a_malformed_address_is_an_error(text):
 
 
 @pytest.mark.parametrize("prefix", ["", "view-"])
-def test_the_token_of_a_page_is_read_from_an_option_or_a_variable_and_is_a_random_one_without_them(prefix):
+def test_the_token_of_a_page_is_read_from_an_option_or_a_variable_and_is_that_of_the_user_without_them(
+    prefix, tmp_path, monkeypatch
+):
     @click.command()
     @with_token(prefix)
     def command(token):
@@ -84,9 +86,16 @@ def test_the_token_of_a_page_is_read_from_an_option_or_a_variable_and_is_a_rando
     def says(*words, **variables):
         return CliRunner().invoke(command, list(words), env=variables, standalone_mode=False).output
 
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    file = tmp_path / "catstream" / "view-token"
     made = [says(), says(VIEW_TOKEN="")]
-    assert all(re.fullmatch(r"[0-9a-f]{32}\n", each) for each in made)
-    assert made[0] != made[1]
+    assert re.fullmatch(r"[0-9a-f]{32}\n", made[0])
+    assert made == [made[0], file.read_text()]
+    assert file.stat().st_mode & 0o777 == 0o600
+    file.chmod(0o644)
+    assert says() != made[0], "others may have read it"
+    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null")
+    assert says() != says(), "it cannot be kept"
     assert says(f"--{prefix}token", "none") == "None\n"
     assert says(f"--{prefix}token", "given-on-the-line", VIEW_TOKEN="from-a-variable-1") == "given-on-the-line\n"
     assert says(VIEW_TOKEN="from-a-variable-1") == "from-a-variable-1\n"
