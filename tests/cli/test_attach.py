@@ -12,6 +12,7 @@ import time
 import pytest
 
 from catstream.cli.attach import _format, _summary
+from catstream.client.control import control
 from catstream.features.layout import row_length
 from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline
@@ -108,6 +109,18 @@ def test_each_message_is_one_line(resting, succeed, channel, word):
     output, _ = succeed("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
     (line,) = output.splitlines()
     assert word in line
+
+
+def test_watch_says_why_nothing_arrives(resting, catstream):
+    with control(resting.endpoint, timeout=SECONDS) as steering:
+        steering.pause()
+        try:
+            process = catstream("watch", "tracks", "--endpoint", resting.endpoint)
+            said = process.stderr.readline()
+        finally:
+            steering.resume()
+    assert said.startswith("waiting: no tracks arrived from")
+    assert said.endswith("the state of the pipeline is: paused\n")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
