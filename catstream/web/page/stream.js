@@ -235,7 +235,7 @@ export class StreamPage {
     if (closed) return "The server of this page was stopped: this is the last picture. The pipeline may still run.";
     if (silent !== null) return "The server of this page does not answer. This page tries again.";
     if (status.phase === "waiting") return status.reason || "Waiting for a pipeline";
-    if (status.phase === "silent") return `The pipeline does not send messages. This page waits for it. ${status.reason}`;
+    if (status.phase === "silent") return `The pipeline does not send messages. This page waits for it. The reason: ${status.reason}`;
     if (!stage.hasPicture) return "Waiting for a picture";
     return status.state === "lost" ? `${status.words[0].toUpperCase()}${status.words.slice(1)}: this is the last picture.` : "";
   }
