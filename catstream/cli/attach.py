@@ -40,7 +40,7 @@ from catstream.services.options import (
 from catstream.wire.channels import CHANNELS, PUBLIC
 from catstream.wire.endpoint import Endpoint
 
-_SILENT_SECONDS = 5.0  # without a message, after which `watch` says why
+_SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
 _PROCESSES = CHANNELS["health"].senders
 
 
@@ -119,10 +119,10 @@ def watch(
       catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
     """
     seen = 0
-    with Subscription[Any](endpoint, channel, object=name, timeout=_SILENT_SECONDS, keys=keys) as messages:
+    with Subscription[Any](endpoint, channel, object=name, keys=keys) as messages:
         with suppress(KeyboardInterrupt):
             wait_for_pipeline(messages.endpoint, messages.keys, wait)
-            for message in _saying_why_silent(messages):
+            for message in saying_why_silent(messages):
                 fields = msgspec.to_builtins(message, builtin_types=(bytes,), enc_hook=_described)
                 click.echo(json.dumps(fields, default=_described) if as_json else _line(fields))
                 seen += 1
@@ -132,9 +132,9 @@ def watch(
         click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
 
 
-def _saying_why_silent(messages: Subscription[Any]) -> Iterator[Any]:
+def saying_why_silent(messages: Subscription[Any]) -> Iterator[Any]:
     """Each message; the reason why none arrives is printed once, until there is another reason or a message."""
-    said = ""
+    messages.timeout, said = _SILENT_SECONDS, ""
     while True:
         try:
             for message in messages:
