@@ -64,7 +64,7 @@ def first_pages(files: list[Path]) -> list[tuple[Path, int]]:
     """Return the first page of each file, and log once that there are more."""
     if (count := _page_count(files[0])) > 1:
         _log.warning(
-            "%s has %d pages, and of each image in a folder the first one is read: name it alone", files[0], count
+            "%s has %d pages, of which only the first is read in a folder: give the file itself", files[0], count
         )
     return [(file, 0) for file in files]
 

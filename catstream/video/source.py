@@ -7,6 +7,7 @@
 The text is one of these:
 
     a video file        any format that FFmpeg reads; every frame is read once, in order
+    an image file       its pages
     a folder            its images in natural order (2.png before 10.png), or those of its `img`, `color` or `rgb`
                         folder, or its only video; sequence folders of the public benchmarks open unchanged
     a pattern           images/%05d.png or images/*.png
@@ -234,8 +235,9 @@ class _Images:
         for index, number in enumerate(numbers[start:], start):
             image = self._read(number)
             shape = shape or image.shape
-            self.scaled += image.shape != shape
-            yield Frame(index, number / self.rate, _of_one_size(image, shape, resize, self._path(number), number))
+            scaled = _of_one_size(image, shape, resize, self._path(number), number)
+            self.scaled += scaled is not image
+            yield Frame(index, number / self.rate, scaled)
 
     def _path(self, number: int) -> Path:
         return self._read_image.pages[number][0]
@@ -316,10 +318,10 @@ class _Video:
                         shape = image.shape
                         if shape[0] != frame.height:  # it was turned
                             self.pixel_aspect = 1 / self.pixel_aspect
-                    self.scaled += image.shape != shape
-                    image = _of_one_size(image, shape, self.settings.resize, self.path, number)
+                    scaled = _of_one_size(image, shape, self.settings.resize, self.path, number)
+                    self.scaled += scaled is not image
                     if number in rest:
-                        yield Frame(wanted.index(number), time, image)
+                        yield Frame(wanted.index(number), time, scaled)
                 if number + 1 >= wanted.stop:  # damage after the part must not be an error
                     return
 
