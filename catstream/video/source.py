@@ -77,6 +77,8 @@ class _FileSource(Source):
         wanted = range(sys.maxsize)[part]
         self._frames = reader.frames(wanted, start)
         self._first: Frame | None = next(self._frames, None)
+        if self._first is None and wanted[start:].start == 0:
+            raise VideoError(f"no frame of {name} can be decoded, as if it began after its only key frame: {EXPECTED}")
         if self._first is None:
             raise VideoError(
                 f"{name} has {reader.count() or 'no'} frames, numbered from 0, and none from frame "

@@ -389,6 +389,15 @@ def test_a_start_after_the_end_is_an_error(video):
         open_source(video("a.avi", frames=5), start=5)
 
 
+def test_a_video_without_a_frame_that_can_be_decoded_is_an_error_that_says_so(video):
+    path = video("a.mp4", frames=5)
+    data = path.read_bytes()
+    first, last = data.index(b"mdat") + 4, data.index(b"moov") - 4
+    path.write_bytes(data[:first] + bytes(last - first) + data[last:])
+    with pytest.raises(VideoError, match="no frame of a can be decoded"):
+        open_source(path, skip_damaged=True)
+
+
 def test_a_closed_source_has_no_frames(video):
     source = open_source(video("a.avi", frames=5))
     next(source)
