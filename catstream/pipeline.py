@@ -331,7 +331,8 @@ class Pipeline:
         """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees.
 
         And of the tracks that were received here (`rows`), and how often a process was restarted (`restarts`). If
-        frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`, and
+        frames of a file were left out, how many were `damaged`, and if they had
+        another size than the first one, how many were `scaled`; of a live source, how many frames were `skipped`, and
         how often it was `reopened`.
         """
         if self._supervisor is None or self._supervisor.end is None:

@@ -425,8 +425,8 @@ class End:
     seq     number of the last message before it, plus one
     reason  description of why the stream ended
     failed  whether it ended because of an error
-    totals  final counters, by name: `sent` and `stored` features messages, `damaged` and `skipped` frames, and how
-            often a live source was `reopened`
+    totals  final counters, by name: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
+            and how often a live source was `reopened`
     """
 
     seq: Integer

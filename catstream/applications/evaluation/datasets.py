@@ -36,7 +36,8 @@ from catstream.box import Box
 from catstream.errors import BoxError, SettingsError, VideoError
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64, UInt8
-from catstream.video.source import natural_order, open_source
+from catstream.video.images import natural_order
+from catstream.video.source import open_source
 
 #: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
 #: boxes.
