@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -9,7 +10,7 @@ import shutil
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.accuracy import MEASURES, write_report
+from catstream.applications.evaluation.accuracy import COUNTS, MEASURES, mean_of, rows_of, write_report
 from catstream.applications.evaluation.datasets import FIRST
 from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.settings import Settings
@@ -29,16 +30,29 @@ def test_the_report_is_self_contained(tmp_path, sequence, found):
     assert page.count("<tr") == 1 + 2 + 2 + 1 + 2 * 2  # the sequences with the means, and the attributes
 
 
+def test_the_frames_without_a_reported_box_are_added_up_over_runs_and_sequences(tmp_path, sequence, found):
+    boxes, other = found.copy(), dataclasses.replace(sequence, name="other")
+    absent = np.flatnonzero(np.isnan(sequence.boxes[:, 0]))
+    boxes[[0, *absent[:2]]] = np.nan
+    runs = [run_of(sequence, found), run_of(sequence, boxes), run_of(other, boxes)]
+    mean = mean_of(rows_of(runs))["catstream"]
+    count = len(absent)
+    assert [mean[each] for each in COUNTS] == [3 * count, 4, 3 * (12 - count), 2]
+    page = write_report(tmp_path / "report.html", runs, Settings(), {}).read_text()
+    assert f"2/{2 * count} {1 / count:.1%}" in page
+    assert f"2/{3 * (12 - count)} " in page
+
+
 def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
     out, file = tmp_path / "out", tmp_path / "numbers.json"
     attributes = tmp_path / "attributes.json"
     attributes.write_text('{"walk": ["blur"]}')
     files = ["--output", out, "--json", file, "--attributes", attributes]
     output, errors = succeed("evaluate", walk, *files, "--set", "coreset.size=32")
-    assert re.search(r"walk +catstream +12 +0\.\d{3}", output)
+    assert re.search(r"walk +catstream +12 +0\.\d{3} .* \d/\d \d+\.\d%  0/\d+ 0\.0%", output)
     assert "report.html" in output + errors
     figures = json.loads(file.read_text())
-    assert figures["mean"]["catstream"].keys() == set(MEASURES)
+    assert figures["mean"]["catstream"].keys() == {*MEASURES, *COUNTS}
     assert figures["mean"]["catstream"]["success"] > 0.7
     assert figures["attributes"]["blur"] == {"sequences": ["walk"], "mean": figures["mean"]}
     assert (out / "report.html").exists()
