@@ -107,10 +107,10 @@ def evaluate(
     if attributes is not None and output is None and json_file is None:
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
-    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path)]
+    errors: list[CatstreamError] = []
+    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path, errors.append)]
     seen = {} if attributes is None else datasets.read_attributes(attributes)
 
-    errors: list[CatstreamError] = []
     try:
         columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
         with line_of(messages(), *columns) as progress:
@@ -142,7 +142,7 @@ def evaluate(
         shared = datasets.with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
         write_json(json_file, accuracy.to_json(rows, settings, shared))
         if output is not None:
-            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared)}")
+            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared, errors)}")
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"

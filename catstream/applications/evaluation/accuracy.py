@@ -14,6 +14,7 @@ import numpy as np
 from catstream.applications.evaluation.runs import EvaluationRun, provenance
 from catstream.applications.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.applications.page import SHARES, Axis, plot, table, write_page
+from catstream.errors import CatstreamError
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
@@ -190,11 +191,16 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def write_report(
-    path: Path, runs: list[EvaluationRun], settings: Settings, attributes: Mapping[str, Sequence[str]]
+    path: Path,
+    runs: list[EvaluationRun],
+    settings: Settings,
+    attributes: Mapping[str, Sequence[str]],
+    errors: Sequence[CatstreamError] = (),
 ) -> Path:
     """Write the report of an evaluation as one self-contained HTML file.
 
     attributes : names of the sequences that have each attribute
+    errors : those of runs that are not included
     """
     rows = rows_of(runs)
     sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
@@ -203,6 +209,7 @@ def write_report(
         f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
         "the object count only for F and noticed. Noticed and false are the frames without and with the object that "
         "have no reported box. ± is the standard deviation over the runs of a sequence.</p>",
+        *(f'<p class="about">Not included: {escape(str(error))}</p>' for error in errors),
         *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
         _plots(runs),
         "<h2>Sequences</h2>",

@@ -78,14 +78,20 @@ def test_options_that_contradict_one_another_are_an_error(walk, fail, options, m
 
 
 def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk, said):
-    torn = tmp_path / "torn"
-    shutil.copytree(walk, torn)
-    (torn / "img" / "0012.png").unlink()
+    for name in ("torn", "malformed"):
+        shutil.copytree(walk, tmp_path / "all" / name)
+    shutil.copytree(walk, tmp_path / "all" / "walk")
+    (tmp_path / "all" / "torn" / "img" / "0012.png").unlink()
+    (tmp_path / "all" / "malformed" / "groundtruth_rect.txt").write_text("1,2,3,4\n")
     file = tmp_path / "out.json"
-    code, output, errors = said("evaluate", walk, torn, "--tracker", "mil", "--json", file)
+    options = "--tracker", "mil", "--json", file, "--output", tmp_path / "out"
+    code, output, errors = said("evaluate", tmp_path / "all", *options)
     assert re.search(r"walk +mil +12 +0\.\d{3}", output)
-    assert re.search(r"mil on torn: .* 1 frame too few", errors)
-    assert (code, "1 of 2 runs" in errors.splitlines()[-1]) == (1, True)
+    page = (tmp_path / "out" / "report.html").read_text()
+    for message in (r"mil on torn: .* 1 frame too few", r"malformed/groundtruth_rect.txt\S* has one box"):
+        assert re.search(message, errors)
+        assert re.search(message, page)
+    assert (code, "2 of 3 runs" in errors.splitlines()[-1]) == (1, True)
     assert [row["name"] for row in json.loads(file.read_text())["sequences"]] == ["walk"]
 
 
