@@ -37,6 +37,7 @@ def test_start_frames_are_evenly_spaced_over_the_frames_with_the_object(sequence
     assert frames(1) == [0]
     assert frames(2) == [0, 8]  # the object is absent in 5, 6 and 7
     assert frames(4) == [0, 3, 8, 9]
+    assert frames(12) == [0, 1, 2, 3, 4, 8, 9, 10]  # after the last one with the object, there is nothing to measure
 
 
 @pytest.mark.parametrize("box", [(-40, 50, 60, 30), (140, 50, 60, 30), (60, 50, 30, 1), (-99, 0, 330, 90)])
