@@ -202,7 +202,8 @@ def _readings(line: str) -> list[list[float]]:
     [[215.0, 90.0, 61.0, 18.0, 50.0, 20.0, 50.0, 30.0], [215.9, 61.18, 50.2, 50.3]]
     """
     readings: list[list[float]] = []
-    separated, words = line.replace(",", " ").replace(";", " ").split(), re.split(r",?[;\s]+", line.strip(" \t,;"))
+    line = line.strip(" \t,;")
+    separated, words = re.split(r"\s*[,;]\s*|\s+", line), re.split(r",?[;\s]+", line)
     if not any(re.match(r"[-+]?0\d", field) for field in separated):  # 02 has been the decimals of a number
         with suppress(ValueError):
             readings.append([float(field) for field in separated])

@@ -137,6 +137,7 @@ def test_folders_of_one_name_are_told_apart_by_the_names_of_their_links(tmp_path
         ("groundtruth_rect.txt", "1,2,3\n", "line 1: expected x,y,w,h, with decimal points, got '1,2,3'"),
         ("groundtruth_rect.txt", "1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers as in line 1"),
         ("groundtruth_rect.txt", "1,2,3,4\na,b,c,d\n", "line 2"),
+        ("groundtruth_rect.txt", "1,,2,3,4\n", "line 1"),
         ("groundtruth_rect.txt", "x,y,w,h\n1,2,3,4\n", "line 1: expected x,y,w,h"),
         ("groundtruth_rect.txt", "1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
         ("groundtruth_rect.txt", "215,90,61,18,50,02,50,03\n", "line 1: expected x,y,w,h"),
