@@ -106,7 +106,9 @@ def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
         return f"{value:.3f}" if spread is None or values.get("runs") == 1 else f"{value:.3f} ±{spread:.3f}"
 
     def share(part: float | None, whole: float | None) -> str:
-        return f"{part}/{whole} {part / whole:.1%}" if part is not None and whole else "-"
+        if part is None or not whole:
+            return "-"
+        return f"{part}/{whole} {part / whole:.{0 if part / whole > 0.1 else 1}%}"
 
     measures = [text(measure) for measure in MEASURES if measure != "fps"]
     shares = share(values["noticed"], values["absent"]), share(values["false"], values["present"])
@@ -272,4 +274,4 @@ def _shaded(texts: list[str]) -> list[str]:
     shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:shaded]]
     style = "background: rgb(47 158 68 / {:.0f}%); padding: .1rem .3rem"
     shown = [f'<span style="{style.format(each)}">{text}</span>' for each, text in zip(shades, texts, strict=False)]
-    return [*shown, *texts[shaded:]]
+    return [*shown, *(f'<span style="white-space: nowrap">{text}</span>' for text in texts[shaded:])]
