@@ -284,8 +284,8 @@ def _figures(found: Mapping[str, Record]) -> str:
     csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     return filled(f"""
         On {len(found["accuracy"]["sequences"])} public sequences, the area under the success plot (AUC) is
-        **{boxes:.3f}** on average over four first boxes that differ by at most 2 %. With the true first box it is {ours:.3f}, and
-        that of OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences;
+        **{boxes:.3f}** on average over four first boxes that differ by at most 2 %. With the true first box it is
+        {ours:.3f}, and that of OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences;
         [Results](docs/results.md) lists the others separately.
 
         On {speed["machine"]["cores"]} cores, `catstream track` processes **{rest:.0f} frames/s** ({start:.0f} in the
