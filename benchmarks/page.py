@@ -227,8 +227,8 @@ def _noticed(record: Record) -> str:
     *each, (_, absent, noticed, share, present, false, wrong) = table.rows
     names = ", ".join(f"{name} {part:.0%}" for name, _, _, part, *_ in each)
     return (
-        f"in {noticed} of the {absent} frames without the object ({share:.0%}; {names}) no box is reported, and in "
-        f"{false} of the {present} frames with it ({wrong:.1%}) none is reported either."
+        f"absence is reported in {noticed} of the {absent} frames without the object ({share:.0%}; {names}), and "
+        f"falsely in {false} of the {present} frames with it ({wrong:.1%})."
     )
 
 
