@@ -223,9 +223,8 @@ def loadtest(
       catstream loadtest --find-limit --size 320x240
     """
     # Imported here so that --help and the other commands start faster.
-    from catstream.applications.loadtest.latency import percentiles
     from catstream.applications.loadtest.load_report import milliseconds, to_json, write_report
-    from catstream.applications.loadtest.load_test import Limit, Plan, run_load_test, violations
+    from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)
@@ -244,8 +243,8 @@ def loadtest(
             if find_limit:
                 verdict = "; ".join(violations(asked, result)) or "met"
                 click.echo(
-                    f"{result.plan.rate:g} frames/s due, {result.followed:.1f} tracked, "
-                    f"p99 {milliseconds(percentiles(result.track)['p99'])} ms: {verdict}"
+                    f"{result.plan.rate:g} frames/s due; in the worst stream {result.followed:.1f} tracked, "
+                    f"p99 {milliseconds(KINDS['p99'].measure(result))} ms: {verdict}"
                 )
 
         load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)

@@ -273,7 +273,7 @@ class _Run:
             page = "the page" if self.view is not None else f"the page of catstream view {place}"
             ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
             console.print(f"waiting for a box: {ways}")
-        elif pipeline.holding:
+        elif pipeline.holding == "paused":
             console.print(f"paused: to continue, catstream resume {place}")
 
     def _write_tracks(

@@ -168,7 +168,7 @@ def open_source(
 def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
     """Open a file, a folder or a pattern; return its name for results, and what reads it."""
     if path.is_dir():
-        name = path.resolve().name
+        name = _named(path)
         for folder in (*(path / inner for inner in _FOLDERS), path):
             if folder.is_dir() and _visible(folder, IMAGES):
                 return name, _Images(image_files(folder), settings)
@@ -180,13 +180,19 @@ def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
     if path.is_file():
         return path.stem, _Video(path, settings)
     if re.search(r"%0?\d*d|[*?\[]", path.name):
-        return path.parent.resolve().name, _Images(image_files(path), settings)
+        return _named(path.parent), _Images(image_files(path), settings)
     if path.exists():
         raise VideoError(
             f"{str(path)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
             "write the video to a file, or serve it as a stream"
         )
     raise VideoError(f"there is no video or folder {str(path)!r}: {_EXPECTED}")
+
+
+def _named(folder: Path) -> str:
+    """The name of a folder of images for results; of the folder of images in a sequence, that of the sequence."""
+    folder = folder.resolve()
+    return (folder.name in _FOLDERS and folder.parent.name) or folder.name
 
 
 def source_text(source: object) -> str:

@@ -379,6 +379,8 @@ OPENED = {
     },
     "without hidden files": ([".0000.png", "0001.png"], "walk", [1]),
     "digits that are not decimal": (["²2.png", "²10.png"], "walk", [0, 1]),
+    "the images of a sequence": (["img/1.jpg", "img/2.jpg"], "walk/img", [0, 1]),
+    "a pattern in a sequence": (["rgb/1.jpg", "rgb/2.jpg"], "walk/rgb/%d.jpg", [0, 1]),
     "names that are not UTF-8": ([f"{LATIN}/1{LATIN}.png", f"{LATIN}/2{LATIN}.png"], f"walk/{LATIN}", [0, 1]),
 }
 
