@@ -16,7 +16,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.errors import CatstreamError, StreamRewoundError
-from catstream.messages.kinds import Health
+from catstream.messages.kinds import Health, run_state
 from catstream.run.job import Job
 from catstream.services.start_server import reset_process
 from catstream.wire.channels import HEALTH
@@ -147,7 +147,8 @@ class Process:
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own = counters() | rejects()
-            self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects()))
+            state = run_state(own)[0] if self.name == "detector" else None
+            self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects(), state))
         else:
             self._health.serve_late_joiners()
 
