@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.errors import ProtocolError, ServiceError, SettingsError, without_password
 from catstream.messages.kinds import Track
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
@@ -31,7 +31,6 @@ from catstream.services.decisions import DESIRED, DesiredState
 from catstream.services.start_server import start_server
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
 

@@ -23,7 +23,7 @@ import numpy as np
 from catstream.box import Box, Window
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
-from catstream.errors import SettingsError, VideoError
+from catstream.errors import SettingsError, VideoError, without_password
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
@@ -32,7 +32,7 @@ from catstream.messages.kinds import Model
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import RunSettings, Settings
-from catstream.video.frames import Frame, read_ahead, without_password
+from catstream.video.frames import Frame, read_ahead
 from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
 
 _One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
