@@ -21,6 +21,10 @@ _HOST = re.compile(r"([\w.-]*|\[[\w:.%]+\])(:\d+)?")
 _PLAIN = re.compile(r"(?!.*(pass|pwd|token|secret|auth|key|login|user|usr|cred|sign))[\w.~+,-]*", re.IGNORECASE)
 
 
+#: A word of a text that may be an address with a password.
+_SUSPECT = re.compile(r"""[^\s'"()]*:[^\s'"()]*[@=][^\s'"()]*""")
+
+
 class CatstreamError(Exception):
     """Base class of all errors that catstream raises on purpose."""
 
@@ -150,3 +154,12 @@ def without_password(source: str) -> str:
         return f"{protocol}..."
     plain = [*takewhile(_PLAIN.fullmatch, path)]
     return protocol + "/".join([host, *plain]) + ("/..." if len(plain) < len(path) else "?..." if query else "")
+
+
+def without_passwords(text: str) -> str:
+    """Return a text without the passwords of the addresses in it.
+
+    >>> without_passwords("a box is x,y,w,h, got 'rtsp://me:secret@10.0.0.7/one'")
+    "a box is x,y,w,h, got 'rtsp://10.0.0.7/one'"
+    """
+    return _SUSPECT.sub(lambda word: without_password(word[0]), text)

@@ -26,7 +26,7 @@ from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
-from catstream.run.state import begun, last_seq, saved
+from catstream.run.state import begun, last_seq, last_time, saved
 from catstream.services.decisions import DESIRED, DesiredState
 from catstream.services.start_server import start_server
 from catstream.services.supervisor import Supervisor
@@ -234,14 +234,20 @@ class Pipeline:
         return self
 
     def _started(self, endpoint: str) -> Job:
-        """The job for the processes that are started now."""
+        """The job for the processes that are started now.
+
+        The times of a live run go on after those before, also if the clock of the machine was set back since.
+        """
+        passed = max(0.0, time.time() - self._job.started)
+        if self.live and self._resumed_job is not None and self._state is not None:
+            passed = max(passed, last_time(self._state) + self.settings.run.checkpoint_seconds)
         return replace(
             self._job,
             endpoint=endpoint,
             owned=True,
             state=self._state,
             resume=self._resumed_job is not None,
-            since=time.monotonic() - max(0.0, time.time() - self._job.started),
+            since=time.monotonic() - passed,
         )
 
     def __exit__(

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column, Table
 
-from catstream.errors import ServiceError
+from catstream.errors import ServiceError, without_passwords
 
 #: Exit code of a command that was interrupted.
 INTERRUPTED = 130
@@ -39,8 +39,8 @@ def messages() -> Console:
 
 
 def complain(problem: object) -> None:
-    """Print a problem in one line that begins with the name of the program."""
-    click.echo(f"catstream: {problem}", err=True)
+    """Print a problem in one line that begins with the name of the program, without passwords of addresses in it."""
+    click.echo(f"catstream: {without_passwords(str(problem))}", err=True)
 
 
 def table(*heads: str, right: Collection[str] = ()) -> Table:

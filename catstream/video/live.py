@@ -63,7 +63,9 @@ class LiveSource(Source):
     ) -> None:
         super().__init__(_name(text), RATE, (0, 0))
         self.skipped = self.reopened = 0
-        self._text, self._address, self._settings = text, without_password(text), settings
+        protocol, mark, place = text.partition("://")
+        self._text = protocol.lower() + mark + place  # FFmpeg knows its protocols in small letters
+        self._address, self._settings = without_password(text), settings
         self._format: str | None = None  # for the next connection; None if FFmpeg finds it out
         self._shown = (-math.inf, 0.0)  # time stamp of the last frame of a segment, and when it was returned
         self._number, self._zero, self._idle = start, since, idle
@@ -115,7 +117,10 @@ class LiveSource(Source):
                 self.close()
                 hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
                 problem, _, advice = self._problem.partition(": ")  # what to do about it, if that is known
-                advice = advice or f"check that it is running, and its address{hint}"
+                what = (
+                    "its user and password" if re.search("40[13]", problem) else "that it is running, and its address"
+                )
+                advice = advice or f"check {what}{hint}"
                 raise VideoError(f"cannot open {self._address!r} ({problem}): {advice}")
         return self._frame(*newest)
 
@@ -182,14 +187,14 @@ class LiveSource(Source):
     def _decoded(self, opened: float, is_known: bool) -> Iterator[VideoFrame]:
         """Yield the undamaged frames of one connection, until it ends.
 
-        If no frame came before, half of the time is left for the other way of reading MJPEG. TimeoutError if data
+        If no frame came before, a part of the time is left for the other way of reading MJPEG. TimeoutError if data
         arrives without frames.
         """
         import av
 
         settings, due = self._settings, opened + self._settings.open_seconds
         if _is_http(self._text) and self._format is None and not is_known:
-            due -= settings.open_seconds / 2
+            due -= settings.open_seconds / 5
         timeouts = max(1.0, due - monotonic()), settings.silent_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
         with _open_container(self._text, self._format, timeouts) as container:
             stream, is_segmented = video_stream(container), container.format.name == "hls"
@@ -247,7 +252,7 @@ class LiveSource(Source):
 
 
 def _is_http(text: str) -> bool:
-    return text.lower().startswith(("http:", "https:"))
+    return text.startswith(("http:", "https:"))
 
 
 def _open_container(text: str, form: str | None, timeouts: tuple[float, float]) -> InputContainer:
@@ -263,11 +268,11 @@ def _open_container(text: str, form: str | None, timeouts: tuple[float, float]) 
         metadata_errors="replace",
     )
     problem, kind = "", container.format.name
+    has_end = container.duration if kind in ("hls", "dash") else (container.size or 0) > 0
     if video_stream(container) is None:
         problem = "it has no video"
-    elif _is_http(text) and not kind.endswith(("_pipe", "mjpeg")):
-        if container.duration or (kind not in ("hls", "dash") and (container.size or 0) > 0):
-            problem = "it is a recording: download it, and give the file"
+    elif _is_http(text) and has_end and not kind.endswith(("_pipe", "mjpeg", "mpjpeg")):
+        problem = "it is a recording: download it, and give the file"
     if problem:
         container.close()
         raise VideoError(problem)
