@@ -67,8 +67,7 @@ class _Commands(click.Group):
         except (KeyboardInterrupt, click.Abort):  # click would report it as an error
             stopped()
         except click.UsageError as error:
-            error.message = without_passwords(error.message)
-            raise
+            raise click.UsageError(without_passwords(error.format_message()), error.ctx) from None
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

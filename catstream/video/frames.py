@@ -38,7 +38,8 @@ class Frame:
     number  0, 1, 2 ... over the frames that the source returns; skipped frames have no number
     time    seconds since the start of the video; for a live source, the arrival time
     image   uint8 (h, w, 3), blue green red; a grey image is expanded
-    pts     presentation time stamp in a live stream, in seconds of the stream's own clock; None for a file
+    pts     presentation time stamp in a live stream, in seconds of the stream's own clock; None for a file, or if the
+            stream states none
     """
 
     number: int
