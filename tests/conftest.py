@@ -1,7 +1,5 @@
 """What all tests share."""
 
-from __future__ import annotations
-
 import fcntl
 import io
 import logging
@@ -35,6 +33,7 @@ from catstream.video.rendered import render, write
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.keys import allow, create
 
 hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
 hypothesis.settings.load_profile("catstream")
@@ -43,10 +42,8 @@ hypothesis.settings.load_profile("catstream")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: Which of the processes that share the tests (pytest-xdist) this is, and of how many.
-WORKER, WORKERS = (
-    int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]),
-    int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)),
-)
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -173,6 +170,14 @@ def endpoint(folder):
 
 
 @pytest.fixture
+def keys(folder):
+    """A folder of keys; beside it those of a client, anna, who may watch."""
+    create(folder / "keys")
+    allow(folder / "keys", "anna", "watch", output=folder / "anna")
+    return folder / "keys"
+
+
+@pytest.fixture
 def tcp():
     """A tcp endpoint: as many free ports in a row as the channels take."""
     ports = max(channel.port + len(channel.senders) for channel in CHANNELS.values())
@@ -188,7 +193,7 @@ def tcp():
     raise AssertionError("no free ports on this machine")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def until():
     """Wait until a condition holds, turn after turn, and return what it returned; fail where it never does."""
 

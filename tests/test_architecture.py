@@ -1,7 +1,5 @@
 """The rules of imports in `docs/architecture.md`: downward only, and each foreign library in one place."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
@@ -86,13 +84,7 @@ IMPORTERS = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {
-    "mcap",
-    "av",
-    "pyarrow",
-    "ray",
-    "obstore",
-}
+SLOW = {"mcap", "av", "pyarrow", "ray", "obstore"}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

@@ -1,7 +1,5 @@
 """Boxes, as people write them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -22,9 +20,8 @@ def test_a_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
     "value", ["10,20,30", "a,b,c,d", "", (10, 20, 30), [[10, 20], [30, 40]], None, 7, (10, 20, None, 40)], ids=repr
 )
 def test_anything_but_four_numbers_is_one_line_of_error_with_an_example(value):
-    with pytest.raises(
-        BoxError, match=r"a box is four numbers x,y,w,h in pixels, got .*: for example 120,80,64,48"
-    ) as told:
+    said = r"a box is four numbers x,y,w,h in pixels, got .*: for example 120,80,64,48"
+    with pytest.raises(BoxError, match=said) as told:
         Box.parse(value)
     assert "\n" not in str(told.value)
 

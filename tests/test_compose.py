@@ -1,13 +1,11 @@
 """docker-compose.yml and its image, held to the table of channels and to the processes: no Docker engine is needed."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -44,16 +42,6 @@ def filled_in(text, **variables):
         return variables.get(name, other)
 
     return re.sub(r"\$\{(\w+)(?:(:[-?])([^}]*))?\}", value, text)
-
-
-@contextmanager
-def ended(process):
-    """Ends a process with the `with`."""
-    with process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 def words(name):
@@ -176,9 +164,9 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
             for there, place in here.items():
                 variables = {key: value.replace(there, place) for key, value in variables.items()}
                 line = [word.replace(there, place) for word in line]
-            stack.enter_context(
-                ended(subprocess.Popen([sys.executable, "-m", "catstream.services", *line], env=os.environ | variables))
-            )
+            service = [sys.executable, "-m", "catstream.services", *line]
+            process = stack.enter_context(subprocess.Popen(service, env=os.environ | variables))
+            stack.callback(process.kill)
         with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
             assert next(tracks).box is not None
         first = int(tcp.rpartition(":")[2])

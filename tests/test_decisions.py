@@ -1,7 +1,5 @@
 """Each decision has a status, and names the decisions that it changed and those that changed it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -12,12 +10,7 @@ PAGES = {int(path.name[:4]): path for path in sorted(FOLDER.glob("0*.md"))}
 EVERY_DECISION = pytest.mark.parametrize("number", PAGES)
 
 #: Relation of a decision to another one -> relation of that one to it.
-MUTUAL = {
-    "supersedes": "superseded by",
-    "superseded by": "supersedes",
-    "amends": "amended by",
-    "amended by": "amends",
-}
+MUTUAL = {"supersedes": "superseded by", "superseded by": "supersedes", "amends": "amended by", "amended by": "amends"}
 
 
 def status(number: int) -> str:

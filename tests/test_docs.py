@@ -3,8 +3,6 @@
 Run as a program, this file updates the life of a stream in `docs/how-to/fleet.md`: `make life`.
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import io

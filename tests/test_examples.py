@@ -1,7 +1,5 @@
 """Each example runs beside a real pipeline, and prints what that found."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import select
@@ -21,7 +19,6 @@ import catstream
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
-from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.keys import create
 
@@ -79,10 +76,8 @@ def beside(request, demo_video, shown, tmp_path_factory):
     if not keys and missing("rerun_subscriber.py") is None:
         words["rerun_subscriber.py"] = ["--save", shown]
     with ExitStack() as stack:
-        # A window of one: the pipeline continues only if its tracks are received.
-        pipeline = stack.enter_context(
-            Pipeline(str(source), boxes[0], Settings(run={"unstored_frames": 1, "keys": keys}))
-        )
+        settings = {"run.unstored_frames": 1, "run.keys": keys}  # it continues only if its tracks are received
+        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], settings))
         models = stack.enter_context(catstream.subscribe(pipeline.endpoint, "models", timeout=0, keys=keys))
         readers = {}
         for name, more in words.items():

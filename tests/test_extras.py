@@ -1,7 +1,5 @@
 """Optional dependencies: what `pip install catstream` leaves out, and what is said about it."""
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The pages of results show what the benchmarks wrote, and README and the tutorial what the pages show."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

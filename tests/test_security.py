@@ -1,7 +1,5 @@
 """Nothing in the source runs what it reads: no pickle, no eval, no shell, no YAML loader."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os
@@ -86,8 +84,7 @@ HOLE = {"id": "CVE-1", "fix_versions": ["2.0"]}
 def test_an_audit_fails_for_a_hole_and_nothing_else(said, code, words, tmp_path):
     (tmp_path / "pip_audit.py").write_text(f"print({said!r})")
     audit = [sys.executable, ROOT / ".ci" / "audit"]
-    run = subprocess.run(
-        audit, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, timeout=60
-    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    run = subprocess.run(audit, env=environment, capture_output=True, text=True, timeout=60)
     assert run.returncode == code
     assert words in run.stdout

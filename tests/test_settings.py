@@ -1,7 +1,5 @@
 """Settings: what is none is refused, wherever it comes from."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import pickle
@@ -113,13 +111,8 @@ def test_a_number_of_any_kind_is_stored_as_one_of_python():
 def test_groups_may_be_written_in_one_way_or_the_other():
     flat, nested = {"coreset.size": 32, "run.seed": 7}, {"coreset": {"size": 32}, "run": {"seed": 7}}
     groups = Settings(coreset=CoresetSettings(size=32), run=RunSettings(seed=7))
-    assert (
-        Settings.from_values(flat)
-        == Settings.from_values(nested)
-        == Settings().but(nested)
-        == Settings(**nested)
-        == groups
-    )
+    assert Settings.from_values(flat) == Settings.from_values(nested) == groups
+    assert Settings().but(nested) == Settings(**nested) == groups
 
 
 @pytest.mark.parametrize(
@@ -141,9 +134,5 @@ def test_a_text_is_read_as_a_person_writes_it(pair, name, value):
 @pytest.mark.parametrize("preset", [None, *PRESETS])
 def test_settings_survive_texts_copies_and_pickles(preset):
     settings = Settings.load(preset=preset, environment={})
-    for other in (
-        Settings.from_values(settings.texts()),
-        copy.deepcopy(settings),
-        pickle.loads(pickle.dumps(settings)),
-    ):
-        assert other == settings
+    assert Settings.from_values(settings.texts()) == settings
+    assert copy.deepcopy(settings) == pickle.loads(pickle.dumps(settings)) == settings

@@ -1,7 +1,5 @@
 """What `make demo` and `make test` set up: the lock files, the Pythons, the package."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The orders between time limits that once broke something when they were not kept."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

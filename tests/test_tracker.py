@@ -112,9 +112,8 @@ def test_an_invalid_frame_is_rejected_and_the_tracker_continues(video, bad):
 
 
 def test_a_frame_of_another_size_is_rejected(video):
-    with pytest.raises(
-        FrameError, match="this frame is 160x240 pixels, those before it 320x240: resize it, or call init"
-    ):
+    said = "this frame is 160x240 pixels, those before it 320x240: resize it, or call init"
+    with pytest.raises(FrameError, match=said):
         started(video).update(video[0][1][:, :160])
 
 
@@ -149,15 +148,3 @@ def test_a_copy_of_a_tracker_continues_as_the_tracker(video):
 def test_a_time_that_is_not_finite_is_rejected(video, time):
     with pytest.raises(FrameError, match="finite number of seconds"):
         started(video).update(video[0][1], time)
-
-
-_FOLLOWS = """
-import sys, numpy as np
-from catstream import Tracker
-first, *frames = np.load(sys.argv[1])
-tracker = Tracker()
-tracker.init(first, sys.argv[2])
-for frame in frames:
-    tracker.update(frame)
-    print(tracker.track)
-"""

@@ -20,7 +20,7 @@ from catstream.detection import extent
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import due
 from catstream.errors import BoxError
-from catstream.features.cells import Cells
+from catstream.features.cells import window_rows
 from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
@@ -181,15 +181,15 @@ def affine_copies(
     change = rng.normal(size=(count, 4))
     if count:
         change[0] = 0
-    rows = []
+    patches = []
     for number, (scale, right, down, turn) in enumerate(change):
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _elsewhere(window, rng) if _is_moved(number, moved) else None
         patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
         if number >= max(count - mirrored, 1):
-            patch = np.ascontiguousarray(patch[:, :, ::-1])
-        rows.append(Cells.within(patch).row(0, 0))
-    return np.array(rows, np.float32)
+            patch = patch[:, :, ::-1]
+        patches.append(patch)
+    return window_rows(patches)
 
 
 def _is_moved(number: int, share: float) -> bool:
@@ -282,8 +282,8 @@ def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Setti
     trials = [trial for each in extent.trials(window, settings.extent) for trial in each]
     if not trials:
         return {}
-    cuts = [Cells.within(frame.around(trial.window, WINDOW)).row(0, 0) for trial in trials]
-    return {EXTENT: _fits([extent.Trial(window), *trials], [rows.rows[0], *cuts], 1, settings.teaching)}
+    cuts = window_rows([frame.around(trial.window, WINDOW) for trial in trials])
+    return {EXTENT: _fits([extent.Trial(window), *trials], np.vstack([rows.rows[:1], cuts]), 1, settings.teaching)}
 
 
 def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings) -> Training:
@@ -291,19 +291,16 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
 
     The windows are cut from shifted and rotated copies of the object, most of which are on another background.
     """
-    trials, rows = [], []
     kinds = extent.trials(window, settings.extent)
-    for kind in kinds:
-        for trial, row in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings):
-            trials.append(trial)
-            rows.append(row)
-    return {EXTENT: _fits(trials, rows, 1 / len(kinds), settings.teaching)} if kinds else {}
+    cuts = [cut for kind in kinds for cut in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings)]
+    rows = window_rows([patch for _, patch in cuts])
+    return {EXTENT: _fits([trial for trial, _ in cuts], rows, 1 / len(kinds), settings.teaching)} if kinds else {}
 
 
 def _first_cuts(
     frame: Pyramid, window: Window, trials: list[extent.Trial], rng: np.random.Generator, settings: Settings
 ) -> Iterator[tuple[extent.Trial, np.ndarray]]:
-    """Trials at copies of the object in the first frame, each with its feature row."""
+    """Trials at copies of the object in the first frame, each with its patch."""
     for number in range(math.ceil(settings.coreset.size / len(trials))):
         right, down, turn = rng.normal(size=3) if number else np.zeros(3)
         copy = _shifted(window, right, down)
@@ -311,12 +308,10 @@ def _first_cuts(
         for trial in trials:
             tried = trial.window.centred(*copy.centre)
             patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset)
-            yield trial, Cells.within(patch).row(0, 0)
+            yield trial, patch
 
 
-def _fits(
-    trials: Sequence[extent.Trial], cuts: Sequence[np.ndarray], weight: float, teaching: TeachingSettings
-) -> TrainingRows:
+def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, teaching: TeachingSettings) -> TrainingRows:
     """Rows of group "extent" from trials and the feature row of each."""
     labels = [_gaussian(trial.larger + trial.wider, _EXTENT_SIGMA) for trial in trials]  # one of the two is 0
     offsets = [(extent.offset_label(trial.larger), extent.offset_label(trial.wider)) for trial in trials]

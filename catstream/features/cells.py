@@ -17,14 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from catstream.features import kernels
-from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, SHADES, WINDOW, row_length
+from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, WINDOW, row_length
 from catstream.features.pyramid import planes_of
 from catstream.numerics.arrays import writable
-from catstream.numerics.threads import Scratch
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
-_MOST_KEPT = 1024  # cells of an image whose scratch is kept: a patch, and no whole frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +95,14 @@ class Cells:
         return scores
 
 
+def window_rows(patches: Sequence[np.ndarray]) -> np.ndarray:
+    """Feature rows of windows, each in a patch, uint8 (3, 96, 96), with the margin: float32 (k, d)."""
+    features = np.empty((len(patches), row_length()), np.float32)
+    if len(patches):
+        kernels.describe_windows(np.stack(patches), MARGIN, _SHARES, _SHADES_OF, features)
+    return features
+
+
 def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
     """HOG and mean colour of every whole cell of an image.
 
@@ -118,23 +124,8 @@ def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
     rows, columns = planes.shape[1] // CELL, planes.shape[2] // CELL
     cells = np.empty((max(rows - 2 * margin, 0), max(columns - 2 * margin, 0), CHANNELS), np.float32)
     if cells.size:
-        arrays = _scratch.kept if rows * columns <= _MOST_KEPT else _scratch.made
-        kernels.describe_cells(planes, margin, _SHARES, cells, *arrays(rows, columns))
+        kernels.describe_cells(planes, margin, _SHARES, cells)
     return cells
-
-
-@Scratch
-def _scratch(rows: int, columns: int) -> tuple[np.ndarray, ...]:
-    """The arrays for intermediate results of `describe_cells`."""
-    width, signed = columns * CELL, 18
-    return (
-        np.empty((3, 3, width + 2), np.float32),
-        np.empty((3, width + CELL), np.float32),
-        np.empty(width + CELL, np.uint8),
-        np.empty((columns + 1, signed, 4), np.float32),
-        np.empty((rows + 2, columns + 2, signed), np.float32),
-        np.empty((rows, columns), np.float32),
-    )
 
 
 def _shares() -> np.ndarray:
@@ -169,8 +160,7 @@ def add_colour_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray
     scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
     least : windows with a lower score are left out, and their score stays as it is
     """
-    strips = np.empty((scores.shape[1] + kernels.COUNTED - 1, SHADES), np.uint16)
-    kernels.add_colour_scores(found, writable(weights), least, strips, np.empty(SHADES, np.uint16), scores)
+    kernels.add_colour_scores(found, writable(weights), least, scores)
 
 
 def highest_colour_score(weights: np.ndarray) -> float:

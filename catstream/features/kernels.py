@@ -3,7 +3,7 @@
 numba's cache notices a change of this file only. So all kernels are here, with what they call and the numbers that they
 read; `catstream.features.layout` has some of these numbers, too, and a test compares them.
 
-A kernel returns nothing and allocates no array. Arithmetic may be reordered and nothing is checked: no index beyond
+A kernel writes into an array that it is given. Arithmetic may be reordered and nothing is checked: no index beyond
 the end, no division by 0. Other threads run during a call. An array of another type than in the signature is a
 TypeError, and so is one that cannot be written.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from numba.core import event
 from numpy import float32
 
-from catstream.numerics.arrays import Float32, Float64, Int64, UInt8, UInt16, UInt32
+from catstream.numerics.arrays import Float32, Float64, Int64, UInt8, UInt16
 
 #: Logged at the first start after an installation, before the kernels are compiled.
 COMPILING = "compiling kernels, once: about 8 s"
@@ -195,20 +195,15 @@ def _add(magnitude: Float32, orientation: UInt8, shares: Float32, blocks: Float3
 
 
 @_part
-def _count(
-    planes: UInt8,
-    margin: int,
-    shares: Float32,
-    lines: Float32,
-    gradients: Float32,
-    orientation: UInt8,
-    blocks: Float32,
-    histogram: Float32,
-) -> None:
+def _count(planes: UInt8, margin: int, shares: Float32, histogram: Float32) -> None:
     """Histograms of the cells within a margin."""
     rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
     height, width = rows * CELL, columns * CELL
-    across, down, magnitude = gradients[0], gradients[1], gradients[2]
+    lines = np.empty((3, 3, width + 2), np.float32)  # the channels of the rows above, here and below, in turns
+    across, down = np.empty(width, np.float32), np.empty(width, np.float32)
+    magnitude = np.empty(width + CELL, np.float32)  # with half a cell more on either side
+    orientation = np.empty(width + CELL, np.uint8)
+    blocks = np.empty((columns + 1, _SIGNED, 4), np.float32)  # of the pixels between the centres of four cells
     inner = slice(margin * CELL, (columns + 1 - margin) * CELL)
     for x in range(len(magnitude)):
         magnitude[x] = orientation[x] = 0
@@ -228,8 +223,8 @@ def _count(
         for y in range(top, bottom):
             above, here, below = lines[(y + 2) % 3], lines[y % 3], lines[(y + 1) % 3]
             _read(planes, min(y + 1, height - 1), below)
-            _gradients(above, here, below, across[:width], down[:width], magnitude[_HALF : _HALF + width])
-            _orientations(across[:width], down[:width], orientation[_HALF : _HALF + width])
+            _gradients(above, here, below, across, down, magnitude[_HALF : _HALF + width])
+            _orientations(across, down, orientation[_HALF : _HALF + width])
             line = shares[(y + _HALF) % CELL]
             _add(magnitude[inner], orientation[inner], line, blocks[margin : columns + 1 - margin])
         for block in range(margin, columns + 1 - margin):
@@ -264,9 +259,10 @@ def _colour(planes: UInt8, margin: int, cells: Float32) -> None:
 
 
 @_part
-def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32) -> None:
+def _normalise(histogram: Float32, margin: int, cells: Float32) -> None:
     """Each cell's histogram by the energies of the four blocks of 2 x 2 cells that it is in."""
-    rows, columns = energy.shape
+    rows, columns = histogram.shape[0] - 2, histogram.shape[1] - 2
+    energy = np.empty((rows, columns), np.float32)
     for row in range(rows):
         for column in range(columns):
             bins = histogram[row + 1, column + 1]
@@ -308,35 +304,17 @@ def _normalise(histogram: Float32, margin: int, energy: Float32, cells: Float32)
             features[30] = _TEXTURE * texture_d
 
 
-@_kernel(
-    "void(uint8[:,:,::1], int64, float32[:,:,::1], float32[:,:,::1], float32[:,:,::1], float32[:,::1], uint8[::1], "
-    "float32[:,:,::1], float32[:,:,::1], float32[:,::1])"
-)
-def describe_cells(
-    planes: UInt8,
-    margin: int,
-    shares: Float32,
-    cells: Float32,
-    lines: Float32,
-    gradients: Float32,
-    orientation: UInt8,
-    blocks: Float32,
-    histogram: Float32,
-    energy: Float32,
-) -> None:
+@_kernel("void(uint8[:,:,::1], int64, float32[:,:,::1], float32[:,:,::1])")
+def describe_cells(planes: UInt8, margin: int, shares: Float32, cells: Float32) -> None:
     """HOG and mean colour of the cells within the margin.
 
     It goes line by line: what a line's pixels do is written so that the compiler does eight of them at once. Only
     counting them is one by one, but each pixel is added to its four nearest cells at once.
-
-    Scratch: lines (3, 3, width + 2), the three channels of the rows above, here and below, in turns; of a row with half
-    a cell more on either side, gradients (3, width + 8), across, down and magnitude, and orientation (width + 8,);
-    blocks (columns + 1, 18, 4), of the pixels between the centres of four cells their shares in each; energy
-    (rows, columns); histogram (rows + 2, columns + 2, 18), with one cell more on every side, which takes what falls
-    outside.
     """
-    _count(planes, max(margin - 1, 0), shares, lines, gradients, orientation, blocks, histogram)
-    _normalise(histogram, margin, energy, cells)
+    rows, columns = cells.shape[0] + 2 * margin, cells.shape[1] + 2 * margin
+    histogram = np.empty((rows + 2, columns + 2, _SIGNED), np.float32)  # one more on every side: what falls outside
+    _count(planes, max(margin - 1, 0), shares, histogram)
+    _normalise(histogram, margin, cells)
     _colour(planes, margin, cells)
 
 
@@ -366,17 +344,15 @@ def _count_shades(found: UInt16, row: int, column: int, features: Float32) -> No
         features[shade] = _ROOT * np.sqrt(features[shade])
 
 
-@_kernel("void(uint16[:,::1], float32[::1], float32, uint16[:,::1], uint16[::1], float32[:,::1])")
-def add_colour_scores(
-    found: UInt16, weights: Float32, least: float, strips: UInt16, counts: UInt16, scores: Float32
-) -> None:
+@_kernel("void(uint16[:,::1], float32[::1], float32, float32[:,::1])")
+def add_colour_scores(found: UInt16, weights: Float32, least: float, scores: Float32) -> None:
     """Add the score of the histogram of each window.
 
     A strip is the histogram of the cells of a column that the windows of a row count. From one row of windows to the
     next, a cell leaves each strip and another enters; from one window to the next, a strip leaves and another enters.
-
-    Scratch: strips (columns + 5, SHADES), counts (SHADES,).
     """
+    strips = np.empty((scores.shape[1] + COUNTED - 1, len(weights)), np.uint16)
+    counts = np.empty(len(weights), np.uint16)
     for row in range(len(scores)):
         top = (row + 1) * SIDE
         for column in range(len(strips)):
@@ -421,6 +397,17 @@ def cut_rows(grid: Float32, shades: UInt16, places: Int64, features: Float32) ->
         _count_shades(shades, row, column, features[k, _PLACES:])
 
 
+@_kernel("void(uint8[:,:,:,::1], int64, float32[:,:,::1], uint16[::1], float32[:,::1])")
+def describe_windows(patches: UInt8, margin: int, shares: Float32, table: UInt16, features: Float32) -> None:
+    """Feature rows of patches, each of which is a window and its margin."""
+    cells, found = np.empty((WINDOW, WINDOW, CHANNELS), np.float32), np.empty((WINDOW * SIDE, WINDOW * SIDE), np.uint16)
+    first, inner = np.zeros((1, 2), np.int64), slice(margin * CELL, (margin + WINDOW) * CELL)
+    for k in range(len(patches)):
+        describe_cells(patches[k], margin, shares, cells)
+        look_up_shades(patches[k][:, inner, inner], table, found)
+        cut_rows(cells.reshape(WINDOW, -1), found, first, features[k : k + 1])
+
+
 @_kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])")
 def add_cell_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
     """Add the products of each row of cells, (34 columns,), with each row of the windows that it lies in."""
@@ -434,30 +421,16 @@ def add_cell_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
                 scores[row - i, column] += total
 
 
-@_kernel(
-    "void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1], uint32[:,::1], float32[::1], float32[::1])"
-)
-def sample(
-    image: UInt8,
-    left: float,
-    top: float,
-    across: float,
-    down: float,
-    found: UInt8,
-    pixels: UInt32,
-    share: Float32,
-    line: Float32,
-) -> None:
-    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row.
-
-    Scratch, of each pixel of a row found: pixels (2, columns), where in the line the two pixels are that it lies
-    between; share (columns,) of the second one; line (columns of the image,).
-    """
+@_kernel("void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1])")
+def sample(image: UInt8, left: float, top: float, across: float, down: float, found: UInt8) -> None:
+    """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
     channels, rows, columns = found.shape
     height, width = image.shape[0], image.shape[1] // channels
     begin = min(max(int(np.floor(left)), 0), width - 1)
     end = min(max(int(np.floor(left + (columns - 1) * across)) + 2, begin + 1), width)
-    first, second = pixels[0], pixels[1]
+    line = np.empty(image.shape[1], np.float32)
+    # Of each pixel found: where in the line the two pixels are that it lies between, and the share of the second one.
+    first, second, share = np.empty(columns, np.uint32), np.empty(columns, np.uint32), np.empty(columns, np.float32)
     for i in range(columns):
         x = left + i * across
         pixel = int(np.floor(x))
@@ -480,18 +453,18 @@ def sample(
                 line_found[i] = np.uint8(value + share[i] * (values[second[i]] - value))
 
 
-@_kernel("void(float64[:,::1], float64[:,::1], float64[:,::1], int64[::1], float32[:,::1])")
-def sparse_codes(gains: Float64, gram: Float64, scratch: Float64, active: Int64, codes: Float32) -> None:
+@_kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")
+def sparse_codes(gains: Float64, gram: Float64, codes: Float32) -> None:
     """Non-negative sparse codes, by active sets (Lawson and Hanson).
 
     The atom that gains most comes in, those that turn negative go.
 
     `gains` are those at code 0. The set's Gram matrix is kept as a Cholesky factor whose diagonal is inverted, with the
     solution of its forward substitution: an atom that comes in adds one row to both.
-    Scratch: scratch (atoms + 4, atoms), active (atoms,).
     """
     count = len(gram)
-    code, wanted, forward, gain, factor = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4:]
+    code, wanted, forward, gain = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    active, factor = np.empty(count, np.int64), np.empty((count, count))
     for row in range(len(codes)):
         start, size = gains[row], 0
         for atom in range(count):

@@ -11,7 +11,6 @@ import numpy as np
 from catstream.box import Window
 from catstream.features.kernels import sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
-from catstream.numerics.threads import Scratch
 
 _MOST_CELLS = 62_500  # of the region around a tiny window, which bounds the cost of a large frame
 _OVERLAP = WINDOW + 2 * MARGIN  # cells that adjacent parts of a region share, at least: a window and its margin
@@ -144,8 +143,7 @@ class Pyramid:
         if not turn:
             found = np.empty((1 if image.ndim == 2 else 3, size, size), np.uint8)
             lines = image.reshape(len(image), -1)
-            scratch = _scratch.kept(size, lines.shape[1])
-            sample(lines, x - middle * across, y - middle * down, across, down, found, *scratch)
+            sample(lines, x - middle * across, y - middle * down, across, down, found)
             return found
         cos, sin = math.cos(turn), math.sin(turn)
         right, below = (across * cos, across * sin), (-down * sin, down * cos)
@@ -162,12 +160,6 @@ def planes_of(image: np.ndarray) -> np.ndarray:
     planes = np.empty((3, *image.shape[:2]), np.uint8)
     cv2.split(image, list(planes))  # into these
     return planes
-
-
-@Scratch
-def _scratch(size: int, columns: int) -> tuple[np.ndarray, ...]:
-    """The arrays for intermediate results of `sample`."""
-    return np.empty((2, size), np.uint32), np.empty(size, np.float32), np.empty(columns, np.float32)
 
 
 def _half(image: np.ndarray) -> np.ndarray:

@@ -13,11 +13,10 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache, lru_cache
+from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    import numpy as np
     from threadpoolctl import ThreadpoolController
 
 _Item = TypeVar("_Item")
@@ -145,14 +144,3 @@ def _pool() -> ThreadPoolExecutor:
 
 
 os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
-
-
-class Scratch(threading.local):
-    """The arrays for intermediate results of a kernel, which the function `made` makes for some sizes.
-
-    Each thread keeps those of the last sizes: to make them for a small image takes a third as long as the kernel.
-    `kept` is the function, but arrays that this thread made before are used again.
-    """
-
-    def __init__(self, made: Callable[..., tuple[np.ndarray, ...]]) -> None:
-        self.made, self.kept = made, lru_cache(maxsize=16)(made)

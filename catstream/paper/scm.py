@@ -230,8 +230,5 @@ def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
     """
     wide = atoms.astype(np.float64)
     codes = np.zeros((len(rows), len(atoms)), np.float32)
-    count = len(atoms)
-    sparse_codes(
-        rows @ wide.T - _PENALTY, wide @ wide.T, np.zeros((count + 4, count)), np.zeros(count, np.int64), codes
-    )
+    sparse_codes(rows @ wide.T - _PENALTY, wide @ wide.T, codes)
     return codes

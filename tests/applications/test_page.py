@@ -1,7 +1,5 @@
 """Plots and timelines: curves and bars where they belong, and nothing over them."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ElementTree
 

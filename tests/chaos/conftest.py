@@ -1,7 +1,5 @@
 """The faults are those of `benchmarks/chaos.py`."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

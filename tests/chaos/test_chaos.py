@@ -1,7 +1,5 @@
 """Under every fault nothing is lost and nothing comes twice: real processes, disks and clocks."""
 
-from __future__ import annotations
-
 import chaos
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """`catstream watch` and `catstream status`, beside a pipeline that runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -16,23 +14,20 @@ from catstream.features.layout import row_length
 from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
-from catstream.settings import Settings
 from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.newest import Publisher
 
 SECONDS = 60  # that anything may take on a busy machine
 
 
-def pipeline(video):
-    """A pipeline that continues only if its tracks are received."""
-    source, box = video
-    return Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1}))
+#: A pipeline continues only if its tracks are received.
+SETTINGS = {"run.unstored_frames": 1}
 
 
 @pytest.fixture(scope="module")
 def resting(video):
     """A pipeline that has learned its first model, and waits."""
-    with pipeline(video) as running:
+    with Pipeline(*video, SETTINGS) as running:
         for track in running:
             if track.model_version:
                 break
@@ -40,7 +35,7 @@ def resting(video):
 
 
 def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(long_video, catstream):
-    with pipeline(long_video) as running:
+    with Pipeline(*long_video, SETTINGS) as running:
         place = ["--endpoint", running.endpoint]
         features = catstream("watch", "features", "--count", 3, *place)
         tracks = catstream("watch", "tracks", "--json", *place)

@@ -1,7 +1,5 @@
 """What the commands share: the progress line and the summary of a run, and Ctrl-C between frames and within one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -20,38 +18,38 @@ from catstream.messages.kinds import Track
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
+def shown(width, seen, **pipeline):
+    """What the line of a pipeline shows while the tracks of some frames come, and its run."""
+    pipeline = SimpleNamespace(lost_seconds=0, holding="", totals={}, restarts=0, **pipeline)
+    written, run = StringIO(), RunProgress(pipeline)
+    console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
+    with run.line(console) as progress:
+        for tracks in seen:
+            run.show(progress, tracks)
+        progress.refresh()
+    return written.getvalue(), run
+
+
 @pytest.mark.parametrize("live", [False, True], ids=["file", "live"])
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
     health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
-    seen = {"health": health, "lost_seconds": 0, "holding": "", "totals": {}}
-    pipeline = SimpleNamespace(live=live, frames=None if live else 30000, **seen)
-    written = StringIO()
-    console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
-    run = RunProgress(pipeline)
-    with run.line(console) as progress:
-        run.show(progress, {"": Track(1, 0, 0.0, "bootstrapping", None, -12.25, 12345)})
-        progress.refresh()
-    lines = [part for part in written.getvalue().replace("\x1b[2K", "\r").split("\r") if "bootstrapping" in part]
-    shown = lines[-1].split("\n")[0].split("\x1b")[0].rstrip()
-    assert len(shown) <= width
-    assert shown.startswith("bootstrapping")
-    assert ("1/30000" in shown) != live
-    assert ("12345" in shown) == (width >= 80)
+    track = Track(1, 0, 0.0, "bootstrapping", None, -12.25, 12345)
+    written, _ = shown(width, [{"": track}], live=live, frames=None if live else 30000, health=health)
+    lines = [part for part in written.replace("\x1b[2K", "\r").split("\r") if "bootstrapping" in part]
+    line = lines[-1].split("\n")[0].split("\x1b")[0].rstrip()
+    assert len(line) <= width
+    assert line.startswith("bootstrapping")
+    assert ("1/30000" in line) != live
+    assert ("12345" in line) == (width >= 80)
 
 
 def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_each():
-    pipeline = SimpleNamespace(live=False, frames=9, health={}, lost_seconds=0, holding="", totals={}, restarts=0)
-    written = StringIO()
-    console = Console(file=written, width=120, force_terminal=True, color_system=None, soft_wrap=True)
-    run = RunProgress(pipeline)
-    with run.line(console) as progress:
-        for box in (Box(1, 2, 30, 40), None):
-            seen = {"anna": Track(1, 0, 0.0, "present", box, 0.9, 7, object="anna")}
-            run.show(progress, seen | {"ben": Track(1, 0, 0.0, "absent", None, 0.1, 4, object="ben")})
-        progress.refresh()
-    assert "1/2 present" in written.getvalue()
-    assert "anna +0.90  ben +0.10" in written.getvalue()
+    anna = [Track(1, 0, 0.0, "present", box, 0.9, 7, object="anna") for box in (Box(1, 2, 30, 40), None)]
+    ben = Track(1, 0, 0.0, "absent", None, 0.1, 4, object="ben")
+    written, run = shown(120, [{"anna": each, "ben": ben} for each in anna], live=False, frames=9, health={})
+    assert "1/2 present" in written
+    assert "anna +0.90  ben +0.10" in written
     assert run.summary([]).splitlines()[1:] == [
         "  anna: present in 1 of 2 frames, model version 7",
         "  ben: present in 0 of 2 frames, model version 4",

@@ -1,7 +1,5 @@
 """No file in the current folder is run, whichever command is started there."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`catstream demo`, from the photographs to the annotated video."""
 
-from __future__ import annotations
-
 import re
 
 from catstream.video.source import open_source

@@ -1,7 +1,5 @@
 """Commands of a fleet, with a stand-in for it."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from types import SimpleNamespace
 

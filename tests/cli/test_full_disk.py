@@ -1,7 +1,5 @@
 """A disk that is full before the run has ended: what is lost is said on the terminal, and what was written is kept."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

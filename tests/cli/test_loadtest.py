@@ -1,7 +1,5 @@
 """`catstream loadtest`: a real run, its figures in three forms, and an exit code that says whether it held."""
 
-from __future__ import annotations
-
 import json
 import re
 
@@ -13,9 +11,8 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     limits = ["--limit", "max=0", "--limit", "missed=1"]
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
     assert code == 1
-    assert re.fullmatch(
-        r"catstream: broken: max is .*, limit at most 0 \(seconds from a frame to its track\)", errors.splitlines()[-1]
-    )
+    broken = r"catstream: broken: max is .*, limit at most 0 \(seconds from a frame to its track\)"
+    assert re.fullmatch(broken, errors.splitlines()[-1])
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
     assert "met: missed" in output
 

@@ -1,15 +1,10 @@
 """`catstream merge`, as a person uses it."""
 
-from __future__ import annotations
-
-from itertools import islice
-
 import pytest
 
 from catstream.box import Box
 from catstream.run.learned import Learned
-from catstream.tracker import Tracker
-from catstream.video.source import open_source
+from tests.learning import learned_from
 
 #: A part of the background of the demo video.
 LAKE = Box(20.0, 160.0, 60.0, 60.0)
@@ -22,14 +17,7 @@ def models(demo_video, once):
 
     def learn(folder):
         for name, first, box in (("door", 0, boxes[0]), ("yard", 30, boxes[30]), ("lake", 0, LAKE)):
-            tracker = Tracker({"coreset.size": 16})
-            with open_source(str(path)) as source:
-                for frame in islice(source, first, first + 15):
-                    if frame.number == first:
-                        tracker.init(frame.image, box)
-                    else:
-                        tracker.update(frame.image)
-            tracker.learned().save(folder / name)
+            learned_from(path, box, slice(first, first + 15), {"coreset.size": 16}).save(folder / name)
 
     folder = once("models", learn)
     return folder / "door", folder / "yard", folder / "lake"

@@ -1,7 +1,5 @@
 """`catstream set-box`, `search`, `forget`, `pause`, `resume`, `save` and `stop`, as a person uses them."""
 
-from __future__ import annotations
-
 import csv
 import json
 from concurrent.futures import ThreadPoolExecutor

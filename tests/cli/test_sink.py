@@ -1,7 +1,5 @@
 """`catstream sink`, beside a pipeline that runs, and `catstream export` of what it has written."""
 
-from __future__ import annotations
-
 import json
 import select
 import signal
@@ -16,7 +14,6 @@ from mcap.reader import make_reader
 from catstream.messages.kinds import Health, Track
 from catstream.messages.names import counted
 from catstream.pipeline import Pipeline
-from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.newest import Publisher
@@ -25,9 +22,8 @@ FILES = ["tracks.ndjson", "t.csv", "walk.mp4", "walk.mcap"]
 
 
 def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_path):
-    source, box = long_video
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    with Pipeline(source, [float(side) for side in box.split(",")], Settings(run={"unstored_frames": 1})) as pipeline:
+    with Pipeline(*long_video, {"run.unstored_frames": 1}) as pipeline:
         sinks = {}
         for folder in (whole, stopped):
             folder.mkdir()

@@ -1,12 +1,9 @@
 """`catstream track`, as a person runs it."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json
 import signal
-import time
 from functools import partial
 from pathlib import Path
 
@@ -91,8 +88,8 @@ def test_a_stopped_run_keeps_its_results(long_video, catstream, until, tmp_path,
     more = ["--video", "--save-model", tmp_path / "model", "--set", "run.unstored_frames=1", "--lockstep"]
     heeded = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
     process = catstream("track", source, "--box", box, "--output", tmp_path, *more, preexec_fn=heeded)
-    children = started(process, tmp_path / "demo.ndjson")
-    until(lambda: len(frames_of(tmp_path)) > 8)
+    until(lambda: len(frames_of(tmp_path)) > 8 or process.poll() is not None)
+    children = [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
     process.send_signal(number)
     errors = process.communicate(timeout=60)[1]
     assert process.returncode == 130
@@ -104,16 +101,6 @@ def test_a_stopped_run_keeps_its_results(long_video, catstream, until, tmp_path,
         assert len(rows) - sum(1 for _ in film) in (0, 1)
     assert Learned.load(tmp_path / "model").model.version >= 1
     assert not any(map(psutil.pid_exists, children))
-
-
-def started(process, results):
-    """Wait for the first result; returns the process ids of the children."""
-    deadline = time.monotonic() + 60
-    while not (results.exists() and results.read_text()):
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < deadline, "no track came"
-        time.sleep(0.01)
-    return [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
 
 
 def test_a_damaged_video_is_followed_up_to_the_break_or_over_it_if_requested(video, fail, succeed, tmp_path):
@@ -196,13 +183,15 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     assert (tmp_path / "file").read_text() == "mine\n"
 
 
-def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_nothing(video, catstream, fail, tmp_path):
+def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_nothing(
+    video, catstream, fail, until, tmp_path
+):
     source, box = video
     place, slowly = ["--set", f"run.endpoint={tmp_path / 'run'}"], ["--set", "run.unstored_frames=1", "--lockstep"]
     nohup = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
     results = ["--output", tmp_path / "one", "--video"]
     first = catstream("track", source, "--box", box, *results, *slowly, *place, preexec_fn=nohup)
-    started(first, tmp_path / "one" / "demo.ndjson")
+    until(lambda: frames_of(tmp_path / "one") or first.poll() is not None)
     first.send_signal(signal.SIGHUP)
     assert "already running" in fail("track", source, "--box", box, "--output", tmp_path / "two", *place)
     assert not (tmp_path / "two").exists()

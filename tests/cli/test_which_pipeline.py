@@ -1,7 +1,5 @@
 """Which pipeline `stop`, `set-box`, `pause`, `resume` and `save` command: the one that is named, or the only one."""
 
-from __future__ import annotations
-
 import tempfile
 from contextlib import ExitStack
 
@@ -65,7 +63,10 @@ def test_at_a_terminal_a_command_to_an_unnamed_pipeline_needs_confirmation(pipel
 def test_a_pipeline_can_be_selected_by_its_source(pipeline, tmp_path, monkeypatch):
     _, walk = pipeline(str(tmp_path / "walk.mp4"))
     _, street = pipeline("rtsp://10.0.0.7/street")
-    assert "walk.mp4 at /" in str(said("stop").exception), "the error of several pipelines says what each follows"
+    error = str(said("stop").exception)
+    assert error.startswith("2 pipelines are running: ")
+    assert "walk.mp4 at /" in error, "it says what each follows"
+    assert "(--endpoint)" in error
     monkeypatch.chdir(tmp_path)
     for name in ("walk.mp4", tmp_path / "walk.mp4", "./walk.mp4"):
         assert said("pause", "--source", name).exit_code == 0

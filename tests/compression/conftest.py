@@ -1,7 +1,5 @@
 """Streams of rows that the laws of the coreset are tried on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

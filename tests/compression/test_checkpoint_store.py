@@ -1,7 +1,5 @@
 """Checkpoints on disk: the last two, each whole or not at all, and what is done about one that is damaged."""
 
-from __future__ import annotations
-
 import errno
 import os
 
@@ -79,10 +77,7 @@ def test_an_incomplete_checkpoint_is_detected_and_the_previous_one_is_used(kept,
 def test_any_flipped_bit_is_detected(kept, rng):
     """What is loaded is the one or the other, and never anything between."""
     path, whole = newest(kept), newest(kept).read_bytes()
-    right = {
-        60: Forest.load(path, SETTINGS).counters(),
-        50: Forest.load(min(kept.iterdir()), SETTINGS).counters(),
-    }
+    right = {60: Forest.load(path, SETTINGS).counters(), 50: Forest.load(min(kept.iterdir()), SETTINGS).counters()}
     noticed = 0
     for place in np.concatenate([np.arange(64), rng.integers(0, len(whole), 60)]):
         flipped = bytearray(whole)

@@ -1,14 +1,12 @@
 """Laws of the forest: a message counts once, in order; a restart changes nothing; objects do not affect one another."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+from numpy.testing import assert_allclose, assert_equal
 
 from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
@@ -19,6 +17,7 @@ from catstream.messages import storage
 from catstream.messages.heads import APPEARANCE, EXTENT, TREES
 from catstream.messages.kinds import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows
 from catstream.settings import Settings
+from tests.learning import rows_of
 
 WIDTH = 20
 
@@ -72,14 +71,7 @@ def take(forest: Forest, messages: Iterator[Features], count: int) -> list[Sampl
 
 
 def assert_same(sample: Sample, other: Sample) -> None:
-    assert (sample.version, sample.frame, sample.object) == (other.version, other.frame, other.object)
-    assert_array_equal(sample.centres, other.centres)
-    assert sample.trees.keys() == other.trees.keys()
-    for name, summary in sample.trees.items():
-        expected = other.trees[name]
-        assert_array_equal(summary.rows, expected.rows)
-        assert_array_equal(summary.mean, expected.mean)
-        assert (summary.count, summary.levels) == (expected.count, expected.levels)
+    assert_equal(dataclasses.asdict(sample), dataclasses.asdict(other))
 
 
 def test_each_row_is_inserted_into_the_tree_of_its_label(settings, messages):
@@ -96,7 +88,7 @@ def assert_gives_the_loss(tree: CoresetTree, model: np.ndarray, parts: list[Trai
     """||A [w; b; -1]||^2 is the weighted squared error, and C keeps it within the energy dropped."""
     rows, weights = np.vstack([part.rows for part in parts]), np.concatenate([part.weights for part in parts])
     loss = float(weights @ (rows @ model[:WIDTH] + model[WIDTH] - labels) ** 2)
-    kept = np.vstack([*(node.rows for node in tree.nodes), tree.pending]).astype(np.float64)
+    kept = rows_of(tree).astype(np.float64)
     approximate = float(np.sum((kept @ model) ** 2))
     assert loss * (1 - 1e-5) - tree.dropped_energy * (model @ model) <= approximate <= loss * (1 + 1e-5)
 
@@ -257,22 +249,17 @@ def test_a_state_of_other_trees_is_rejected_and_not_reported_as_damage(settings,
 
 def test_an_object_of_several_is_learned_as_alone(settings, messages):
     """Only the numbers of its samples and its name differ: all objects share one count."""
-    several, anna, ben = Forest(settings), Forest(settings), Forest(settings)
-    found: dict[str, list[Sample]] = {"anna": [], "ben": []}
-    alone: dict[str, list[Sample]] = {"anna": [], "ben": []}
-    versions = []
+    several, alone, versions = Forest(settings), {"anna": Forest(settings), "ben": Forest(settings)}, []
     for seq in range(1, 80):
-        one, two = (dataclasses.replace(next(messages), seq=seq, frame=seq - 1) for _ in range(2))
-        for sample in several.take(merged(seq, anna=one, ben=two)):
-            found[sample.object].append(sample)
+        parts = {name: dataclasses.replace(next(messages), seq=seq, frame=seq - 1) for name in alone}
+        others = {name: sample for name, part in parts.items() for sample in alone[name].take(part)}
+        for sample in several.take(merged(seq, **parts)):
+            other = others.pop(sample.object)
+            assert_same(dataclasses.replace(sample, version=other.version, object=""), other)
             versions.append(sample.version)
-        alone["anna"] += anna.take(one)
-        alone["ben"] += ben.take(two)
+        assert not others, "each object has a sample when it has one alone"
     assert versions == list(range(1, len(versions) + 1))
     assert versions[-1] == several.version == several.counters()["version"]
-    for name in found:
-        for sample, other in zip(found[name], alone[name], strict=True):
-            assert_same(dataclasses.replace(sample, version=other.version, object=""), other)
 
 
 def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, messages):

@@ -7,8 +7,6 @@ y and every k <= n (Ghashami et al. 2016),
     max_y (||A y||^2 - ||C y||^2) <= (s_(k+1)^2 + s_(k+2)^2 + ...) / (n + 1 - k).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,6 +16,7 @@ from numpy.testing import assert_allclose
 from catstream.compression.reduce import energy, shrink
 from catstream.compression.tree import CoresetTree, FrequentDirections
 from catstream.errors import ProtocolError
+from tests.learning import rows_of
 
 SIZE = 16
 ROUNDING = 1e-5  # of float32, relative to ||A||^2
@@ -30,7 +29,7 @@ def sketched(rows: np.ndarray) -> FrequentDirections:
 
 
 def assert_within_the_bound(sketch: FrequentDirections, rows: np.ndarray) -> None:
-    kept, slack = np.vstack([*(node.rows for node in sketch.nodes), sketch.pending]), ROUNDING * energy(rows)
+    kept, slack = rows_of(sketch), ROUNDING * energy(rows)
     exact = rows.astype(np.float64)
     _, lengths, basis = np.linalg.svd(exact, full_matrices=False)
     kept = kept.astype(np.float64) @ basis.T  # in the span of A, which has all rows of C

@@ -14,8 +14,6 @@ at most that of the k strongest dropped ones. These are no stronger than s_(n+1)
 a (1 + epsilon) coreset in the paper's sense (section "Coresets") with epsilon = k / (n - k + 1).
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -29,9 +27,7 @@ SIZE = 16
 ROUNDING = 1e-5  # of float32, relative to ||A||^2
 
 matrices = arrays(
-    np.float32,
-    st.tuples(st.integers(1, 12), st.integers(1, 20)),
-    elements=st.floats(-100, 100, width=32),
+    np.float32, st.tuples(st.integers(1, 12), st.integers(1, 20)), elements=st.floats(-100, 100, width=32)
 )
 
 

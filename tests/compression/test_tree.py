@@ -1,4 +1,4 @@
-"""Laws of the coreset tree.
+"""Laws of the coreset tree, and of its hierarchical sample (paper, section "Coreset Appearance Model").
 
 A node's error, ||C Y||^2 + c - ||A Y||^2, is the sum of its two children's and that of their
 reduction, which `test_reduce.py` bounds by epsilon ||A Y||^2, epsilon = k / (n - k + 1). Leaves
@@ -9,8 +9,6 @@ have none, so that at level q, with all errors adding up and none negative,
 The first is sharper than the (1 + epsilon)^q of the paper (section "Coreset Tree").
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -19,9 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from catstream.compression.reduce import energy
+from catstream.compression.node import sample, spread
+from catstream.compression.reduce import energy, reduce
 from catstream.compression.tree import REDUCTIONS, CoresetTree
 from catstream.errors import ProtocolError
+from tests.learning import rows_of
 
 SIZE = 16
 ROUNDING = 1e-5  # of float32, relative to ||A||^2
@@ -42,11 +42,6 @@ def whole_numbers(count: int, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(-9, 10, (count, 6)).astype(np.float32)
 
 
-def summary(tree: CoresetTree) -> np.ndarray:
-    """All rows in memory, C."""
-    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
-
-
 def bits(tree: CoresetTree) -> dict[str, bytes]:
     arrays, metadata = tree.state()
     return {"metadata": repr(metadata).encode()} | {name: array.tobytes() for name, array in arrays.items()}
@@ -57,14 +52,11 @@ def assert_within_the_bound(tree, rows, subspaces, squared_distance):
     levels, dropped, slack = tree.nodes[0].level, tree.dropped_energy, ROUNDING * energy(rows)
     for basis in subspaces:
         k = basis.shape[1]
-        truth, approximation = squared_distance(rows, basis), squared_distance(summary(tree), basis)
+        truth, approximation = squared_distance(rows, basis), squared_distance(rows_of(tree), basis)
         assert truth - dropped - slack <= approximation <= truth + slack
         assert truth - slack <= approximation + dropped <= (1 + levels * k / (SIZE - k + 1)) * truth + slack
     assert tree.rows_seen == len(rows)
-    assert_allclose(energy(summary(tree)) + dropped, energy(rows), rtol=1e-12)
-
-
-# --- what it keeps ---------------------------------------------------------------------------------
+    assert_allclose(energy(rows_of(tree)) + dropped, energy(rows), rtol=1e-12)
 
 
 def test_distances_to_subspaces_stay_within_the_bound(stream, subspaces, squared_distance):
@@ -88,9 +80,6 @@ def test_sums_counts_and_leaves_are_exact(kind, count, seed):
     assert_array_equal(tree.sum, rows.sum(axis=0, dtype=np.float64) if count else 0)
 
 
-# --- what it costs ---------------------------------------------------------------------------------
-
-
 @given(st.integers(0, 300), seeds)
 def test_levels_strictly_fall_from_oldest_to_newest(count, seed):
     levels = [node.level for node in grown(whole_numbers(count, seed), size=4).nodes]
@@ -106,9 +95,6 @@ def test_memory_grows_with_the_logarithm_of_the_rows(rng):
         nodes = math.log2(p / n) + 1 if p >= n else 0
         assert len(tree.nodes) <= nodes
         assert tree.nbytes <= nodes * (4 * n * d + 8 * d) + 4 * n * d
-
-
-# --- the same, however it comes ------------------------------------------------------------------------
 
 
 @KINDS
@@ -147,9 +133,6 @@ def test_merging_keeps_the_form_of_a_tree(count, other_count, seed):
     assert (bits(one), bits(other)) == before
 
 
-# --- on disk --------------------------------------------------------------------------------------------
-
-
 @KINDS
 @pytest.mark.parametrize("count", [0, 3, 64, 103])
 def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
@@ -159,16 +142,6 @@ def test_a_saved_tree_continues_bit_for_bit(stream, count, kind):
     for each in (tree, loaded):
         each.insert(stream[count:])
     assert bits(loaded) == bits(tree)
-
-
-def test_rows_inserted_into_a_tree_are_not_in_its_copy(stream):
-    tree = grown(stream[:3])
-    copy, other = tree.copy(), tree.copy()
-    tree.insert(stream[3:])
-    assert bits(copy) == bits(grown(stream[:3]))
-    copy.insert(stream[3:])
-    assert bits(copy) == bits(tree)
-    assert bits(other) == bits(grown(stream[:3]))
 
 
 @KINDS
@@ -184,9 +157,6 @@ def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch
     assert bits(tree) == before
 
 
-# --- what it refuses ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "rows",
     [np.ones((3, 5)), np.ones(6), np.full((2, 6), np.nan), np.full((2, 6), np.inf)],
@@ -200,15 +170,64 @@ def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
     assert bits(tree) == before
 
 
-def test_a_state_whose_rows_are_no_table_is_rejected():
-    arrays, metadata = grown(np.ones((9, 6)), size=4).state()
-    with pytest.raises(ProtocolError, match="not the state of a coreset tree"):
-        CoresetTree.from_state(arrays | {"rows.0": arrays["rows.0"].reshape(-1)}, metadata)
-
-
 def test_trees_of_other_sizes_or_rows_are_rejected():
     tree = grown(np.ones((9, 6)), size=4)
     with pytest.raises(ProtocolError, match=r"size 4 .* size 5"):
         tree.merged(grown(np.ones((9, 6)), size=5))
     with pytest.raises(ProtocolError, match=r"length 6 .* length 7"):
         tree.merged(grown(np.ones((9, 7)), size=4))
+
+
+@given(st.integers(0, 600), st.sampled_from([1, 2, 5, 16]))
+def test_a_sample_has_at_most_2n_rows(count, size):
+    summary = grown(np.ones((count, 3)), size).sample()
+    assert len(summary.rows) <= 2 * size
+    assert len(summary.rows) >= size or count < size
+
+
+def test_a_node_gives_its_strongest_n_rows_times_2_to_the_level_below_the_top(stream):
+    tree = grown(stream)
+    rows, start = sample(tree.nodes, SIZE), 0
+    assert [node.level for node in tree.nodes] == [3, 2, 0]
+    for node, taken in zip(tree.nodes, [16, 8, 2], strict=True):
+        part = rows[start : start + taken].astype(np.float64)
+        _, strengths, directions = np.linalg.svd(node.rows.astype(np.float64), full_matrices=False)
+        first = (strengths[:, None] * directions)[:taken] * np.sqrt(taken / node.count)
+        # Equal up to a left rotation: the same distances to every subspace.
+        assert_allclose(part.T @ part, first.T @ first, atol=1e-5 * np.sum(first**2))
+        start += taken
+    assert start == len(rows)
+
+
+def test_each_row_weighs_one_original_row(rng):
+    """A stream of one row again and again is sampled as that row, whatever its age."""
+    row = rng.uniform(size=30).astype(np.float32)
+    rows = grown(np.tile(row, (SIZE * 13, 1))).sample().rows
+    assert_allclose(rows, np.tile(row, (len(rows), 1)), rtol=1e-4)
+
+
+@given(st.integers(1, 20), st.integers(0, 2**32 - 1))
+def test_spreading_is_a_rotation(count, seed):
+    rows = reduce(np.random.default_rng(seed).normal(size=(count, 12)).astype(np.float32), count)
+    turned = rows.copy()
+    spread(turned)
+    assert_allclose(turned.T @ turned, rows.T @ rows, atol=1e-4)
+    assert_allclose(turned @ rows[0], np.full(count, rows[0] @ rows[0] / np.sqrt(count)), atol=1e-3)
+
+
+def test_means_and_counts_are_those_of_all_rows_pending_ones_too(stream):
+    rows = stream[:205]
+    summary = grown(rows).sample()
+    assert summary.count == 205
+    assert_allclose(summary.mean, rows.mean(axis=0, dtype=np.float64), rtol=1e-6, atol=1e-7)
+    assert summary.levels == (3, 2)
+
+
+@given(st.lists(st.integers(0, 40), max_size=12), st.integers(0, 2**32 - 1))
+def test_a_sample_after_many_others_is_that_of_a_tree_that_made_none(cuts, seed):
+    rows = np.random.default_rng(seed).normal(size=(sum(cuts), 9)).astype(np.float32)
+    tree, start = CoresetTree(4), 0
+    for count in cuts:
+        tree.insert(rows[start : start + count])
+        start += count
+        assert_array_equal(tree.sample().rows, grown(rows[:start], size=4).sample().rows)

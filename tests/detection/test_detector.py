@@ -164,11 +164,6 @@ def test_a_box_of_twice_the_frame_is_a_start(scene):
     assert track.box.overlap(Box(-160, -120, 640, 480)) > 0.9
 
 
-def test_a_step_before_a_start_is_rejected(scene):
-    with pytest.raises(BoxError, match="call init"):
-        Follower().step(scene())
-
-
 def test_an_object_at_the_edge_stays_a_box_in_the_frame(scene):
     detector = started(scene)
     for x in range(60, -24, -6):

@@ -1,7 +1,5 @@
 """Laws of the likeness to an object."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

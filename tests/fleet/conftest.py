@@ -1,7 +1,5 @@
 """A fleet on a real cluster of two nodes that the tests of a process share: Ray uses one cluster in a process."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 
@@ -13,6 +11,8 @@ from catstream.video.live_demo import first_box
 
 FRAMES = 32
 LIVE = "demo:1"
+NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
+SOUTH = NODE | {"node_name": "south", "labels": {"site": "south"}}
 
 
 @pytest.fixture(scope="session")
@@ -45,9 +45,8 @@ def cluster(home):
         patch.setenv("RAY_AUTH_TOKEN_PATH", str(home / "cluster-token"))
         from ray.cluster_utils import Cluster
 
-        options = {"num_cpus": 1, "object_store_memory": 80 << 20}
-        cluster = Cluster(True, head_node_args=options | {"node_name": "north", "include_dashboard": False})
-        cluster.south = cluster.add_node(**options, node_name="south", labels={"site": "south"})
+        cluster = Cluster(True, head_node_args=NODE | {"node_name": "north", "include_dashboard": False})
+        cluster.south = cluster.add_node(**SOUTH)
         yield cluster
         cluster.shutdown()
 

@@ -1,7 +1,5 @@
 """A stream of a fleet without Ray: its pipeline, its state in the store, and its end."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The controller of a fleet, with a Ray of this file's own: what it starts, stops, stores and answers."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
@@ -339,10 +337,8 @@ def test_a_stream_that_is_not_placed_or_does_not_answer_is_said_long_before_it_i
     site._turn()
     gate, roof = site.status().streams.values()
     assert (gate.state, gate.node, gate.trouble) == ("running", "n1", "it has not answered for 50 s")
-    assert (roof.state, roof.trouble) == (
-        "starting",
-        "Ray has not started it for 50 s: `ray status` says what it needs",
-    )
+    unplaced = "Ray has not started it for 50 s: `ray status` says what it needs"
+    assert (roof.state, roof.trouble) == ("starting", unplaced)
 
 
 def test_followed_objects_and_clients_reach_a_stream_with_each_question(site, ray):

@@ -1,7 +1,5 @@
 """The manifest of `deploy/`: as closed as the threat model says, with the ports that the streams use."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import yaml

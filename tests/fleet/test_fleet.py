@@ -1,7 +1,5 @@
 """A fleet on Ray: streams that are started, moved, continued after a death, refused and removed."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -24,7 +22,7 @@ from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
 from catstream.wire.endpoint import fleets
 from catstream.wire.keys import allow
-from tests.fleet.conftest import LIVE
+from tests.fleet.conftest import LIVE, SOUTH
 
 pytestmark = pytest.mark.system
 
@@ -82,14 +80,8 @@ def test_a_fleet_on_this_machine_is_closed_to_other_machines_and_users_until_ctr
         other = {"RAY_AUTH_TOKEN_PATH": str(file.parent / "token"), "RAY_NUM_REDIS_GET_RETRIES": "2"}
         stranger = os.environ | module._VARIABLES | other
         program = f"import ray; ray.init({(folder / 'address').read_text()!r}); print('let in')"
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", program],
-            env=stranger,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
+        words = [sys.executable, "-P", "-c", program]
+        done = subprocess.run(words, env=stranger, capture_output=True, text=True, timeout=120, check=False)
         assert (done.returncode, "let in" in done.stdout) == (1, False)
         assert "token" in done.stderr.lower()
         started = [each for each in psutil.Process(up.pid).children(recursive=True) if "StreamActor" in each.name()]
@@ -174,9 +166,7 @@ def test_a_stream_runs_on_a_node_with_its_labels_and_continues_elsewhere_after_t
     until(lambda: (found := fleet.status().streams["gate"]).token > before.token and found.state == "running")
     assert fleet.status().streams["gate"].node == "north"
     until(lambda: fleet.status().nodes["south"].state == "dead")
-    cluster.south = cluster.add_node(
-        num_cpus=1, object_store_memory=80 << 20, node_name="south", labels={"site": "south"}
-    )
+    cluster.south = cluster.add_node(**SOUTH)
     until(lambda: fleet.status().nodes["south"].state == "alive")
 
 

@@ -1,7 +1,5 @@
 """The life of a stream: the table, and the laws of what happens to a stream on any cluster."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import hypothesis.strategies as st
@@ -17,16 +15,8 @@ NORTH = StreamSpec("gate", "demo:1", labels={"site": "north"})
 
 IDS = st.sampled_from(["1", "2", "3"])
 LABELS = st.sampled_from([{}, {"site": "north"}])
-NODES = st.lists(
-    st.builds(
-        lambda id_, labels, alive, draining: Node(f"n{id_}", id_, labels=labels, alive=alive, draining=draining),
-        IDS,
-        LABELS,
-        st.booleans(),
-        st.booleans(),
-    ),
-    unique_by=lambda node: node.id,
-)
+NODE = st.builds(Node, st.just("north"), IDS, labels=LABELS, alive=st.booleans(), draining=st.booleans())
+NODES = st.lists(NODE, unique_by=lambda node: node.id)
 SPECS = st.sampled_from([GATE, NORTH, StreamSpec("gate", "demo:2"), replace(GATE, cores=2.0)])
 
 

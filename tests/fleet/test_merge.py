@@ -1,13 +1,10 @@
 """Merging the saved models of streams: each frame counts once, in any order, within the bound of the coreset."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Box, Window
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
@@ -16,36 +13,30 @@ from catstream.errors import FleetError
 from catstream.features.layout import row_length
 from catstream.fleet.fleet import disjoint, merge_streams
 from catstream.fleet.store import Store
-from catstream.messages.heads import APPEARANCE, EXTENT
-from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
+from catstream.messages.heads import APPEARANCE
+from catstream.messages.kinds import Features
 from catstream.run.job import Job
 from catstream.run.learned import Learned
 from catstream.run.state import files
 from catstream.settings import Settings
+from tests.learning import features, rows_of
 
 SETTINGS = Settings(coreset={"size": 4})
-BOX = Box(1.0, 2.0, 30.0, 40.0)
-WINDOW = Window(0.0, 0.0, 40.0, 50.0)
 
-PARTS = st.dictionaries(
-    st.text("abcdef", min_size=1), st.tuples(st.sets(st.integers(0, 5), min_size=1), st.integers(0, 9))
-)
+PART = st.tuples(st.sets(st.integers(0, 5), min_size=1), st.integers(0, 9))
+PARTS = st.dictionaries(st.text("abcdef", min_size=1), PART)
 
 
 def stream(seed, frames=12):
-    """The features of an object in some frames: rows of the object around 1, and of a background around -1."""
+    """The features of an object in some frames."""
     rng = np.random.default_rng(seed)
-    labels = np.repeat(np.float32([1, 0]), 4)
-    for _ in range(frames):
-        rows = rng.normal(scale=0.2, size=(8, row_length())).astype(np.float32) + np.where(labels[:, None], 1, -1)
-        training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
-        yield ObjectFeatures(BOX, training, DetectorState(0, "confident", WINDOW, WINDOW, WINDOW))
+    return [features(rng) for _ in range(frames)]
 
 
-def learned(seed, frames=12, before=None):
-    compressor = Compressor(SETTINGS, "anna") if before is None else before.compressor(SETTINGS, "anna")
-    for frame, features in enumerate(stream(seed, frames)):
-        compressor.take(frame, features, compressor.version + 1)
+def learned(seed):
+    compressor = Compressor(SETTINGS, "anna")
+    for frame, each in enumerate(stream(seed)):
+        compressor.take(frame, each, compressor.version + 1)
     return Learned.of(compressor, SETTINGS)
 
 
@@ -67,11 +58,7 @@ def store(tmp_path):
     (tmp_path / "store").mkdir()
     for seed, name in enumerate(["door", "yard", "hall"]):
         put_state(tmp_path, name, seed)
-    return store_of(tmp_path)
-
-
-def store_of(folder):
-    return (folder / "store").as_uri()
+    return (tmp_path / "store").as_uri()
 
 
 def put_state(tmp_path, name, seed, frames=12):
@@ -80,14 +67,10 @@ def put_state(tmp_path, name, seed, frames=12):
     (folder / "trees").mkdir(parents=True)
     Job(f"{name}.mp4", settings=SETTINGS).save(folder)
     forest = Forest(SETTINGS)
-    for frame, features in enumerate(stream(seed, frames)):
-        forest.take(Features(frame + 1, frame, 0.0, {"anna": features}))
+    for frame, each in enumerate(stream(seed, frames)):
+        forest.take(Features(frame + 1, frame, 0.0, {"anna": each}))
     CheckpointStore(folder / "trees").save(forest)
-    Store(store_of(tmp_path)).stream(name).claim("here").write(files(folder), {})
-
-
-def coreset(tree):
-    return np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+    Store(str(tmp_path / "store")).stream(name).claim("here").write(files(folder), {})
 
 
 def test_the_newest_states_of_all_streams_are_merged_within_the_bound_and_only_a_new_model_is_stored(store, tmp_path):
@@ -99,7 +82,7 @@ def test_the_newest_states_of_all_streams_are_merged_within_the_bound_and_only_a
     tree = Learned.from_bytes(merged.model, "").trees["object"]
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(row_length(), 3)))[0].astype(np.float32)
     rows = [each.training[APPEARANCE].rows[:4] for seed in range(3) for each in stream(seed)]
-    truth, kept = energy(np.vstack(rows) @ basis), energy(coreset(tree) @ basis)
+    truth, kept = energy(np.vstack(rows) @ basis), energy(rows_of(tree) @ basis)
     assert tree.rows_seen == sum(map(len, rows))
     assert truth - tree.dropped_energy - 1e-5 * truth <= kept <= truth * (1 + 1e-5)
     assert merge_streams(store, streams[::-1], "anna", named=False).model == merged.model

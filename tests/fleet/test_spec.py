@@ -1,7 +1,5 @@
 """The file of a fleet: what it means, and a line for everything that is wrong with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -197,10 +195,7 @@ DEEP = b'{"name": "a", "streams": {"b": {"name": "b", "source": "0", "settings":
 
 
 @pytest.mark.parametrize(
-    "data",
-    [
-        *(b"", b"[]", b"{", b"{}", DEEP, b'{"name": "a", "every": 0}', b'{"name": "a", "streams": {"b": {}}}'),
-    ],
+    "data", [b"", b"[]", b"{", b"{}", DEEP, b'{"name": "a", "every": 0}', b'{"name": "a", "streams": {"b": {}}}']
 )
 def test_a_stored_state_that_is_damaged_is_an_error(data):
     with pytest.raises(FleetError, match="are damaged: apply the fleet file again"):

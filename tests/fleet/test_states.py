@@ -1,7 +1,5 @@
 """The fencing law of the states of a stream: random histories with pauses, lost answers, half writes, and kills."""
 
-from __future__ import annotations
-
 import json
 import queue
 import threading
@@ -267,10 +265,7 @@ class Fencing(RuleBasedStateMachine):
 
 
 def test_after_a_claim_no_older_holder_adds_a_state_and_nothing_acknowledged_is_lost():
-    run_state_machine_as_test(
-        Fencing,
-        settings=settings(max_examples=200, stateful_step_count=20, deadline=None),
-    )
+    run_state_machine_as_test(Fencing, settings=settings(max_examples=200, stateful_step_count=20, deadline=None))
 
 
 def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_from():

@@ -1,7 +1,5 @@
 """The store: the same laws in a folder and on an S3 server; full disks, lost servers, hidden credentials."""
 
-from __future__ import annotations
-
 import logging
 import os
 import resource
@@ -156,9 +154,8 @@ def test_a_full_disk_is_a_store_error_and_the_next_write_succeeds(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
-        with pytest.raises(
-            StoreError, match=r"streams/cam-7/0+1/0+2 of the store .* cannot be written: .*free some space"
-        ):
+        said = r"streams/cam-7/0+1/0+2 of the store .* cannot be written: .*free some space"
+        with pytest.raises(StoreError, match=said):
             claim.write({"state": bytes(5000)}, {"frame": 2})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

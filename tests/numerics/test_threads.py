@@ -1,6 +1,4 @@
-"""Linear algebra on one thread, inside a program that has set something else; and calls in threads."""
-
-from __future__ import annotations
+"""Linear algebra on one thread, whatever the program has set or imported: the same bits; and calls in threads."""
 
 import os
 import subprocess
@@ -9,13 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
 import cv2
-import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from catstream.numerics import threads
-from catstream.numerics.threads import _VARIABLES, Scratch, in_parallel, one_thread
+from catstream.numerics.threads import _VARIABLES, in_parallel, one_thread
 
 
 def counts():
@@ -44,9 +41,8 @@ with one_thread():
 
 def test_a_library_that_is_imported_inside_is_on_one_thread_too():
     environment = os.environ | dict.fromkeys(_VARIABLES, "2")
-    said = subprocess.run(
-        [sys.executable, "-c", FIRST_USE], env=environment, capture_output=True, text=True, check=True
-    )
+    program = [sys.executable, "-c", FIRST_USE]
+    said = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
     assert said.stdout == "{1}\n"
 
 
@@ -128,10 +124,46 @@ def test_the_first_error_is_raised(cores):
     assert set(ended) == ({0, 3} if cores > 1 else {0})
 
 
-def test_scratch_is_kept_for_a_size_and_no_two_threads_share_it():
-    scratch = Scratch(lambda size: (np.empty(size),))
-    (here,) = scratch.kept(3)
-    assert scratch.kept(3)[0] is here
-    assert scratch.kept(4)[0] is not here
-    with ThreadPoolExecutor(1) as pool:
-        assert pool.submit(lambda: scratch.kept(3)).result()[0] is not here
+#: Prints a digest of two models that a Tracker learns, merged.
+PROGRAM = """
+import sys
+from itertools import islice
+from hashlib import blake2b
+
+import catstream
+from catstream.video.source import open_source
+
+video, *boxes = sys.argv[1:]
+models = []
+with open_source(video) as source:
+    for box in boxes:
+        tracker = catstream.Tracker()
+        for number, frame in enumerate(islice(source, 25)):
+            tracker.update(frame.image) if number else tracker.init(frame.image, box)
+        models.append(tracker.learned())
+print(blake2b(catstream.merge(models).to_bytes()).hexdigest())
+"""
+
+ORDERS = {"catstream first": "", "catstream last": "import numpy, scipy.linalg, cv2, sklearn.linear_model\n"}
+
+
+def test_what_is_learned_has_the_same_bits_in_any_order_of_imports_and_on_any_number_of_cores(demo_video):
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        pytest.skip("this machine has one core")
+    path, boxes = demo_video(50)
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", imports + PROGRAM, path, *(",".join(map(str, boxes[i])) for i in (0, 25))],
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda some=some: os.sched_setaffinity(0, some),
+        )
+        for imports in ORDERS.values()
+        for some in (cores[:1], cores[:2])
+    ]
+    lines = [process.communicate()[0] for process in started]
+    assert [process.returncode for process in started] == [0] * 4
+    assert len(set(lines)) == 1, lines

@@ -1,18 +1,23 @@
 """What the tests of the pipeline share: a short video, and how to wait for processes."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from contextlib import ExitStack
 
 import cv2
+import numpy as np
 import psutil
 import pytest
 
 from catstream.video.source import open_source
 
 FRAMES = 32
+
+
+def share_found(tracks, boxes):
+    """The share of the tracks whose box is that of the object."""
+    found = [track.box is not None and track.box.overlap(box) > 0.5 for track, box in zip(tracks, boxes, strict=True)]
+    return np.mean(found)
 
 
 @pytest.fixture(scope="session")
@@ -60,11 +65,8 @@ def service():
     with ExitStack() as stack:
 
         def start(*arguments):
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "catstream.services", *map(str, arguments)],
-                stderr=subprocess.PIPE,
-                text=True,
-            )
+            words = [sys.executable, "-P", "-m", "catstream.services", *map(str, arguments)]
+            process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
             stack.callback(process.communicate)
             stack.callback(process.kill)
             return process

@@ -1,7 +1,5 @@
 """A disk that is full or read-only: tracking continues, it is reported, and nothing that was kept is damaged."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 

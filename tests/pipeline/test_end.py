@@ -1,7 +1,5 @@
 """The end of a run reaches every receiver, whatever was restarted before, and however slow the owner is."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """A whole pipeline where nobody comes in without a key."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import pytest
@@ -11,15 +9,6 @@ from catstream.errors import ServiceError, SilenceError
 from catstream.pipeline import Pipeline
 from catstream.services.start_server import NAMES
 from catstream.settings import Settings
-from catstream.wire.keys import allow, create
-
-
-@pytest.fixture
-def keys(folder):
-    """The folder of a pipeline's keys; beside it those of a client that may watch."""
-    create(folder / "keys")
-    allow(folder / "keys", "phone", "watch", output=folder / "phone")
-    return folder / "keys"
 
 
 def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video, folder, keys, tcp):
@@ -27,7 +16,7 @@ def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video,
     settings = Settings(run={"endpoint": tcp.replace("127.0.0.1", "0.0.0.0"), "keys": str(keys), "unstored_frames": 1})
     with (
         Pipeline(path, boxes[0], settings) as pipeline,
-        subscribe(tcp, "tracks", keys=str(folder / "phone"), timeout=0.3) as heard,
+        subscribe(tcp, "tracks", keys=str(folder / "anna"), timeout=0.3) as heard,
         subscribe(tcp, "health", keys=str(keys), timeout=60) as health,
     ):
         tracks = iter(pipeline)
@@ -46,9 +35,9 @@ def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video,
 
 def test_a_pipeline_does_not_start_while_the_key_of_a_client_cannot_be_read(video, keys):
     path, boxes = video
-    (keys / "clients" / "phone").write_bytes(b"")
+    (keys / "clients" / "anna").write_bytes(b"")
     with (
-        pytest.raises(ServiceError, match=r"clients/phone gives the role None"),
+        pytest.raises(ServiceError, match=r"clients/anna gives the role None"),
         Pipeline(path, boxes[0], {"run.keys": str(keys)}),
     ):
         pass

@@ -1,7 +1,5 @@
 """The three processes on a real video, from the first frame to the last."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -18,6 +16,7 @@ from catstream.settings import Settings
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
+from tests.pipeline.conftest import share_found
 
 #: A small window keeps the detector near the frame that a test has reached.
 SETTINGS = Settings(run={"unstored_frames": 16})
@@ -45,8 +44,7 @@ def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
 
 def test_the_object_is_followed_with_ever_newer_models(run, video):
     tracks, *_ = run
-    truth = zip(tracks, video[1], strict=True)
-    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
+    assert share_found(tracks, video[1]) > 0.8
     versions = [track.model_version for track in tracks]
     assert versions == sorted(versions)
     assert versions[0] == 0
@@ -172,9 +170,8 @@ def test_a_box_outside_the_first_frame_or_a_missing_source_is_rejected_before_an
 
 @pytest.mark.parametrize("frames", [[np.zeros((9, 9, 3), np.uint8)], iter(()), np.zeros((9, 9, 3), np.uint8)])
 def test_frames_in_memory_are_rejected_with_the_way_to_go(frames):
-    with pytest.raises(
-        VideoError, match=r"the number of a camera, got \w+: for frames in memory, call catstream.Tracker"
-    ):
+    said = r"the number of a camera, got \w+: for frames in memory, call catstream.Tracker"
+    with pytest.raises(VideoError, match=said):
         Pipeline(frames, (0, 0, 10, 10))
 
 

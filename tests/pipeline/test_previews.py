@@ -1,7 +1,5 @@
 """Pictures for those who look: small, of the newest frame, and none where nobody looks."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import cv2

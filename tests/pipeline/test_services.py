@@ -1,12 +1,9 @@
 """The processes by themselves: started by hand, in any order, and ended in any way."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from itertools import islice
 
@@ -30,17 +27,24 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
 
+@pytest.fixture
+def by_hand(service, folder):
+    """Starts processes of a run by hand, in an order; what is learned is kept in `folder`."""
+
+    def start(*source, box, order=("compressor", "trainer", "detector"), endpoint=folder, settings=()):
+        pairs = [word for pair in (f"run.endpoint={endpoint}", *settings) for word in ("--set", pair)]
+        words = {"compressor": ["--state", folder], "trainer": [], "detector": [*source, "--box", box]}
+        return [service(name, *pairs, *words[name]) for name in order]
+
+    return start
+
+
 @pytest.mark.parametrize(
     "order", [("detector", "trainer", "compressor"), ("trainer", "compressor", "detector")], ids=" ".join
 )
-def test_processes_started_manually_in_any_order_complete_a_run(video, folder, tcp, service, order):
+def test_processes_started_manually_in_any_order_complete_a_run(video, folder, tcp, by_hand, order):
     path, boxes = video
-    arguments = {
-        "compressor": ["--state", folder],
-        "trainer": [],
-        "detector": ["--resume", path, "--box", ",".join(map(str, boxes[0]))],
-    }
-    processes = [service(name, "--set", f"run.endpoint={tcp}", *arguments[name]) for name in order]
+    processes = by_hand("--resume", path, box=boxes[0], order=order, endpoint=tcp)
     assert [process.wait(120) for process in processes] == [0, 0, 0]
     assert CheckpointStore(folder / TREES).load(Settings()).seq == len(boxes)
 
@@ -53,13 +57,12 @@ def broken(video, tmp_path):
         for frame, _ in zip(source, range(9), strict=False):
             cv2.imwrite(str(tmp_path / f"{frame.number}.png"), frame.image)
     (tmp_path / "5.png").write_text("no image")
-    return tmp_path, ",".join(map(str, boxes[0]))
+    return tmp_path, boxes[0]
 
 
-def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, service):
+def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, by_hand):
     source, box = broken
-    arguments = {"compressor": ["--state", folder], "trainer": [], "detector": [source, "--box", box]}
-    processes = [service(name, "--set", f"run.endpoint={folder}", *given) for name, given in arguments.items()]
+    processes = by_hand(source, box=box)
     errors = [process.communicate(timeout=60)[1] for process in processes]
     assert [process.returncode for process in processes] == [3, 3, 3], errors
     assert "5.png' (frame 5): replace or remove it" in errors[-1]
@@ -88,16 +91,9 @@ def test_no_process_outlives_its_program(video, number, until, alive):
     until(lambda: not any(map(alive, pids)))
 
 
-def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(video, endless, folder, service, until):
-    _, boxes = video
-    arguments = {
-        "compressor": ["--state", folder],
-        "trainer": [],
-        "detector": [endless, "--box", ",".join(map(str, boxes[0]))],
-    }
+def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(video, endless, folder, by_hand, until):
     with Subscriber(TRACKS, Endpoint.parse(str(folder))) as tracks:
-        place = ["--set", f"run.endpoint={folder}"]
-        processes = [service(name, *place, *given) for name, given in arguments.items()]
+        processes = by_hand(endless, box=video[1][0])
         until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.frame >= 5)
         for process in processes:
             process.send_signal(signal.SIGTERM)
@@ -107,19 +103,11 @@ def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(vide
     assert end.totals["stored"] == end.totals["sent"]
 
 
-def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folder, service, until):
+def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folder, by_hand, until):
     path, boxes = video
-    arguments = {"compressor": ["--state", folder], "detector": [path, "--box", ",".join(map(str, boxes[0]))]}
-    place = [
-        "--set",
-        f"run.endpoint={folder}",
-        "--set",
-        "run.checkpoint_seconds=3600",
-        "--set",
-        "run.unstored_frames=2000",
-    ]
+    run = {"box": boxes[0], "settings": ["run.checkpoint_seconds=3600", "run.unstored_frames=2000"]}
     with Subscriber(HEALTH, Endpoint.parse(str(folder))) as health:
-        compressor, detector = (service(name, *place, *given) for name, given in arguments.items())
+        compressor, detector = by_hand(path, order=("compressor", "detector"), **run)
         # Without a trainer the detector stands still, with features that were taken and not stored.
         told = (report.counters for report in iter(lambda: health.receive(60), None) if report.process == "detector")
         taken = next(counters["taken"] for counters in told if counters["taken"])
@@ -127,7 +115,7 @@ def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folde
         assert compressor.wait(30) == 0
         stored = CheckpointStore(folder / TREES).load(Settings()).seq
         assert stored >= taken
-        service("compressor", *place, *arguments["compressor"])  # tells it, if the last answer was lost
+        by_hand(path, order=("compressor",), **run)  # tells it, if the last answer was lost
         until(lambda: next(told)["stored"] >= stored)
     assert detector.poll() is None
 
@@ -186,10 +174,10 @@ def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_o
     for resume in (False, True):
         supervisor = Supervisor(replace(job, resume=resume), folder)
         try:
-            before = runs_of_all(folder)
+            before = runs_of_all(folder, until)
             os.kill(killed := supervisor.pids["detector"], signal.SIGKILL)
             until(lambda killed=killed, found=supervisor: found.pids.get("detector", killed) != killed)
-            assert runs_of_all(folder) == before
+            assert runs_of_all(folder, until) == before
         finally:
             supervisor.stop()
         assert len(before) == 1, "the processes agree"
@@ -198,14 +186,11 @@ def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_o
     assert "" not in runs
 
 
-def runs_of_all(folder):
+def runs_of_all(folder, until):
     """The runs that the health reports of all processes are from."""
-    runs, deadline = {}, time.monotonic() + 60
+    runs = {}
     with Subscriber(HEALTH, Endpoint.parse(str(folder))) as reports:
-        while runs.keys() < set(NAMES) and time.monotonic() < deadline:
-            if (report := reports.receive(0.1)) is not None:
-                runs[report.process] = reports.run
-    assert runs.keys() == set(NAMES)
+        until(lambda: runs.keys() == set(NAMES), lambda: runs.update({reports.receive(60).process: reports.run}))
     return set(runs.values())
 
 

@@ -1,7 +1,5 @@
 """A running pipeline is told what to do: another object, a pause, the end; and begins with what was saved."""
 
-from __future__ import annotations
-
 import os
 import signal
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -23,6 +21,7 @@ from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
+from tests.pipeline.conftest import share_found
 
 #: A small window keeps the detector near the frame that a test has reached.
 SETTINGS = Settings(run={"unstored_frames": 16})
@@ -39,6 +38,16 @@ def steered(source, box=None, **options):
         ThreadPoolExecutor(1) as pool,
     ):
         yield pipeline, steering, pool
+
+
+def with_model(pipeline):
+    """The tracks up to the first one that a fourth model gave."""
+    tracks = []
+    for track in pipeline:
+        tracks.append(track)
+        if track.model_version >= 4:
+            break
+    return tracks
 
 
 def taken(pipeline, tracks, answer):
@@ -83,8 +92,7 @@ def test_without_a_box_the_first_frame_waits_and_in_a_pause_a_box_applies_to_the
         assert pipeline.restarts == 0
     assert [track.frame for track in tracks] == list(range(len(boxes)))
     assert [track.box for track in tracks[:2]] == [pytest.approx(box) for box in boxes[:2]]
-    truth = zip(tracks, boxes, strict=True)
-    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
+    assert share_found(tracks, boxes) > 0.8
     assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
 
 
@@ -108,12 +116,8 @@ def refuses_what_cannot_be_done(pipeline, steering):
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor")], ids=str)
 def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_whoever_dies(long_video, victims):
     path, boxes = long_video
-    tracks = []
     with steered(path, PATCH) as (pipeline, steering, pool):
-        for track in pipeline:
-            tracks.append(track)
-            if track.model_version >= 4:
-                break
+        tracks = with_model(pipeline)
         wanted = boxes[len(tracks) + SETTINGS.run.unstored_frames]  # the detector is as far ahead
         answer = taken(pipeline, tracks, pool.submit(steering.set_box, wanted))
         for victim in victims:
@@ -134,12 +138,8 @@ def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_w
 
 def test_a_moved_object_keeps_its_model_and_a_stop_command_stores_all(long_video):
     path, boxes = long_video
-    tracks = []
     with steered(path, boxes[0]) as (pipeline, steering, pool):
-        for track in pipeline:
-            tracks.append(track)
-            if track.model_version >= 4:
-                break
+        tracks = with_model(pipeline)
         answer = taken(pipeline, tracks, pool.submit(steering.set_box, boxes[len(tracks)], keep=True))
         taken(pipeline, tracks, pool.submit(steering.stop))
         tracks += pipeline
@@ -208,8 +208,7 @@ def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_vide
         tracks = list(pipeline)
     assert tracks[0].model_version == version
     assert "bootstrapping" not in {track.state for track in tracks}
-    truth = list(zip(tracks, boxes[40:], strict=True))
-    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
+    assert share_found(tracks, boxes[40:]) > 0.8
     versions = [track.model_version for track in tracks]
     assert versions == sorted(versions)
     assert versions[-1] > version
@@ -343,5 +342,4 @@ def test_an_object_that_is_searched_for_is_found_after_a_resume_without_the_file
         steering.resume()
         tracks = list(pipeline)
     assert [track.frame for track in tracks] == list(range(len(boxes)))
-    truth = zip(tracks, boxes, strict=True)
-    assert sum(track.box is not None and track.box.overlap(box) > 0.5 for track, box in truth) > 0.8 * len(tracks)
+    assert share_found(tracks, boxes) > 0.8

@@ -1,7 +1,5 @@
 """The watchdog: a long step has to be announced, and each object of a message is a turn."""
 
-from __future__ import annotations
-
 import signal
 from contextlib import ExitStack, closing
 

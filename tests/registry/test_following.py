@@ -1,7 +1,5 @@
 """A subscriber to a stream of a fleet stays attached when the stream moves, and returns each frame once."""
 
-from __future__ import annotations
-
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -12,22 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import catstream
-from catstream.box import Box
 from catstream.client.registry import FollowedStream
 from catstream.client.subscription import wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus, Track
+from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint, private_folder
 from catstream.wire.keys import allow, allowed, create, public_key, revoke, synchronise
 from catstream.wire.newest import Publisher
+from tests.wire.examples import present as track
 
 STOPPED = End(99, "it was stopped by a command")
-
-
-def track(seq, name=""):
-    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
 
 
 class Stream:
@@ -185,13 +179,13 @@ def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
 
 
 def test_a_client_of_the_fleet_may_do_at_each_stream_what_its_role_says_until_it_is_revoked(
-    stream, managing, fleet_keys, folder, tcp
+    stream, managing, keys, folder, tcp
 ):
     create(folder / "stream")
-    synchronise(folder / "stream", allowed(fleet_keys))
-    allow(fleet_keys, "carl", "watch", output=folder / "carl")  # the stream does not know him yet
+    synchronise(folder / "stream", allowed(keys))
+    allow(keys, "carl", "watch", output=folder / "carl")  # the stream does not know him yet
     anna, carl, server = str(folder / "anna"), str(folder / "carl"), public_key(folder / "stream")
-    with managing(stream.status, "", str(fleet_keys)):
+    with managing(stream.status, "", str(keys)):
         pipeline = stream.runs(str(folder / "stream"), tcp, server=server)
         with catstream.subscribe("fleet://cam-7", "tracks", timeout=60, keys=anna) as tracks:
             watched = stream.watched(tracks)
@@ -207,8 +201,8 @@ def test_a_client_of_the_fleet_may_do_at_each_stream_what_its_role_says_until_it
                     pytest.raises(ServiceError, match=r"rejects this key: .* which tracks requires"),
                 ):
                     next(rejected)
-            revoke(fleet_keys, "anna")
-            synchronise(folder / "stream", allowed(fleet_keys))
+            revoke(keys, "anna")
+            synchronise(folder / "stream", allowed(keys))
             stream.update(token=7)  # the pipeline was started again: she connects again
             with pytest.raises(ServiceError, match="rejects this key"):
                 watched.result(60)

@@ -1,7 +1,5 @@
 """The registry of a fleet: its state arrives whole, and only clients with a key of the fleet get an answer."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,7 +11,7 @@ from catstream.messages.kinds import FleetStatus, Listing, NodeStatus, Question,
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import find, fleets, meeting_place, running
-from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, public_key, revoke, synchronise
+from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, revoke, synchronise
 from catstream.wire.socket import rejects
 
 CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
@@ -43,14 +41,6 @@ def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
             with pytest.raises(ServiceError, match="the registry has sent no state of a fleet"):
                 registry.streams()
             served.result()
-
-
-def test_a_stream_that_does_not_run_has_no_endpoint(managing):
-    idle = replace(SITE, streams={"cam-7": StreamStatus("cam-7", "failed", trouble="there is no camera")})
-    with managing(idle), Registry() as registry:
-        assert registry.endpoint_of(registry.stream("cam-7")) is None
-        with pytest.raises(ServiceError, match="cam-7 runs nowhere, its state is failed: there is no camera"):
-            locate("fleet://cam-7")
 
 
 def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
@@ -103,54 +93,39 @@ def test_an_address_is_read_as_it_is_written():
             fleet_and_stream(wrong)
 
 
-def test_a_client_connects_to_a_stream_with_its_own_keys_and_the_public_key_of_the_stream(
-    fleet_keys, folder, tcp, managing
-):
-    create(folder / "stream")
-    server, anna = public_key(folder / "stream"), Keys.load(folder / "anna")
-    keyed = replace(SITE, streams={"cam-7": replace(CAM, endpoint="tcp://10.0.0.2:5700", server=server)})
-    with managing(keyed, tcp, str(fleet_keys)), Registry(tcp.removeprefix("tcp://"), str(folder / "anna")) as registry:
-        place = registry.endpoint_of(registry.stream("cam-7"))
-    assert place.keys == replace(anna, server=server.encode())
-    assert str(place) == "tcp://10.0.0.2:5700"
-
-
-def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(fleet_keys, folder, tcp, managing):
+def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(keys, folder, tcp, managing):
     address = tcp.removeprefix("tcp://")
     create(folder / "other")
-    with managing(SITE, tcp, str(fleet_keys)):
+    with managing(SITE, tcp, str(keys)):
         with Registry(address) as registry, pytest.raises(ServiceError, match="requires authentication"):
             registry.streams()
         with Registry(address, str(folder / "other"), timeout=0.5) as registry, pytest.raises(SilenceError):
             registry.streams()
         before = rejects()["rejected"]
-        revoke(fleet_keys, "anna")
+        revoke(keys, "anna")
         with Registry(address, str(folder / "anna")) as registry, pytest.raises(ServiceError, match="rejects this key"):
             registry.streams()
         assert rejects()["rejected"] > before
 
 
-def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(fleet_keys, folder):
+def test_a_stream_allows_exactly_the_clients_of_its_fleet_and_its_own_processes(keys, folder):
     stream = folder / "stream"
     create(stream)
     own = clients(stream)["pipeline"]
     allow(stream, "old", "control", output=folder / "old")
-    synchronise(stream, allowed(fleet_keys))
-    assert clients(stream) == {
-        "pipeline": own,
-        "fleet.pipeline": clients(fleet_keys)["pipeline"],
-        "anna": clients(fleet_keys)["anna"],
-    }
-    revoke(fleet_keys, "anna")
-    allow(fleet_keys, "anna", "control", output=folder / "new")
-    synchronise(stream, allowed(fleet_keys))
+    synchronise(stream, allowed(keys))
+    of_fleet = clients(keys)
+    assert clients(stream) == {"pipeline": own, "fleet.pipeline": of_fleet["pipeline"], "anna": of_fleet["anna"]}
+    revoke(keys, "anna")
+    allow(keys, "anna", "control", output=folder / "new")
+    synchronise(stream, allowed(keys))
     assert clients(stream)["anna"] == Client("control", Keys.load(folder / "new").public.decode())
     assert (stream / "clients" / "anna").stat().st_mode & 0o777 == 0o600
 
 
 @pytest.mark.parametrize("name", ["../server.key", ".hidden", ""])
-def test_a_client_whose_name_is_no_name_changes_nothing(fleet_keys, name):
-    before = clients(fleet_keys)
+def test_a_client_whose_name_is_no_name_changes_nothing(keys, name):
+    before = clients(keys)
     with pytest.raises(ServiceError, match="a client's name"):
-        synchronise(fleet_keys, {name: Client("watch", "k" * 40)})
-    assert clients(fleet_keys) == before
+        synchronise(keys, {name: Client("watch", "k" * 40)})
+    assert clients(keys) == before

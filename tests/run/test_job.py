@@ -1,10 +1,9 @@
-"""The file of a job: what a run is, for its processes and for whoever resumes it."""
-
-from __future__ import annotations
+"""The files of a run: what it is, for its processes and for whoever resumes it, and who may have its state."""
 
 import os
 import stat
-from dataclasses import replace
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,27 +12,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.box import Box
-from catstream.errors import ObjectError, ProtocolError, ServiceError, SettingsError
+from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import storage
 from catstream.run.job import Job, Results
+from catstream.run.state import files, locked, restore
 from catstream.settings import Settings
 
-JOB = Job(
-    "rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240), started=1e9
-)
+JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240))
 
 numbers = st.none() | st.integers(0, 10**6) | st.integers(0, 10**6).map(np.int64)
 paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
-files = st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path))
+model_files = st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path))
 jobs = st.builds(
     Job,
     source=st.text(),
     boxes=st.dictionaries(st.sampled_from(["", "anna"]), st.just(Box(1, 2, 30, 40))),
-    models=files,
+    models=model_files,
     part=st.builds(slice, numbers, numbers, numbers),
     settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
-    results=st.builds(Results, paths, st.booleans(), st.lists(st.text(min_size=1)).map(tuple), files),
+    results=st.builds(Results, paths, st.booleans(), st.lists(st.text(min_size=1)).map(tuple), model_files),
     state=paths,
     since=st.none() | st.floats(0, 1e9),
     resume=st.booleans(),
@@ -84,22 +82,45 @@ def test_a_field_of_another_type_is_an_error(tmp_path, field, value):
         Job.load(file)
 
 
-def test_a_run_is_continued_only_with_the_same_frames_and_training_settings():
-    JOB.check_fits(replace(JOB, settings=Settings(run={"lag_frames": 3})), Path("kept"))
-    with pytest.raises(SettingsError, match=r"frames 0 to the last, .* frames 3 to the last"):
-        JOB.check_fits(replace(JOB, part=slice(3, None)), Path("kept"))
-    with pytest.raises(SettingsError, match=r"started with coreset\.size=64, not 32"):
-        JOB.check_fits(replace(JOB, settings=Settings(coreset={"size": 32})), Path("kept"))
+def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path):
+    script = (
+        "import pathlib, time\nfrom catstream.run.state import locked\n"
+        f"with locked(pathlib.Path({str(tmp_path)!r})):\n    print(flush=True)\n    time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as owner:
+        owner.stdout.readline()
+        with pytest.raises(ServiceError, match="stop it, or give another folder"), locked(tmp_path):
+            pass
+        owner.kill()
+    with locked(tmp_path):
+        pass
 
 
-def test_an_object_has_a_box_or_a_model():
-    replace(JOB, models={"ben": Path("walker.safetensors")})
-    with pytest.raises(SettingsError, match=r"anna: a box gives .* give one of them"):
-        replace(JOB, models={"anna": Path("walker.safetensors")})
+def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_named(tmp_path, monkeypatch):
+    for name in ("trees/000001.safetensors", "desired_state.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    read_bytes = Path.read_bytes
+
+    def read(path):
+        if path.suffix == ".json":  # the detector stores a saved model, and then the state that names it
+            (tmp_path / "searched_models").mkdir(exist_ok=True)
+            (tmp_path / "searched_models" / "0a.safetensors").write_text("model")
+            path.write_text('{"model": "0a"}')
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read)
+    content = files(tmp_path)
+    assert b"0a" in content["desired_state.json"]
+    assert "searched_models/0a.safetensors" in content
 
 
-def test_a_job_has_at_most_as_many_objects_as_the_settings_allow():
-    boxes = {str(number): Box(1, 2, 30, 40) for number in range(9)}
-    replace(JOB, boxes=boxes, settings=Settings(run={"objects_most": 9}))
-    with pytest.raises(ObjectError, match=r"9 objects are more than 8: .*run\.objects_most=9"):
-        replace(JOB, boxes=boxes, settings=Settings(run={"objects_most": 8}))
+def test_the_files_of_a_state_are_restored_with_the_models_that_are_searched_for_and_the_newest_checkpoint(tmp_path):
+    names = ["desired_state.json", "job.safetensors", "searched_models/0af3.safetensors", "trees/000002.safetensors"]
+    for name in [*names, "trees/000001.safetensors", "log", "searched_models/.part"]:
+        (tmp_path / "old" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "old" / name).write_text(name)
+    content = files(tmp_path / "old")
+    assert sorted(content) == names
+    restore(tmp_path / "new", content)
+    assert all((tmp_path / "new" / name).read_text() == name for name in names)

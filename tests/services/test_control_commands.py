@@ -1,7 +1,5 @@
 """What each command changes, and what it is answered."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Laws of the decisions, in histories without processes: where a detector continues, its waits, what is stored."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The files of saved models: they are read as they were written, and a damaged one is missing."""
 
-from __future__ import annotations
-
 import signal
 import stat
 from contextlib import ExitStack, closing

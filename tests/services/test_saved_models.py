@@ -1,36 +1,26 @@
 """The coreset trees as files, for subscribers."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
-import numpy as np
 import pytest
 
-from catstream.box import Box, Window
 from catstream.compression.compressor import Compressor
-from catstream.features.layout import row_length
-from catstream.messages.heads import APPEARANCE, EXTENT
-from catstream.messages.kinds import DetectorState, ObjectFeatures, SavedModel, TrainingRows
+from catstream.messages.kinds import SavedModel
 from catstream.run.learned import Learned
 from catstream.services.compressor_process import SavedModels
 from catstream.settings import Settings
 from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.newest import Subscriber
+from tests.learning import features
 
 SETTINGS = Settings(coreset={"size": 4})
-WINDOW = Window(0.0, 0.0, 40.0, 50.0)
 
 
 def compressor(name, rng, frames=6):
     """The compressor of an object that was found in some frames."""
     found = Compressor(SETTINGS, name)
     for frame in range(frames):
-        labels = np.repeat(np.float32([1, 0]), 4)
-        rows = rng.normal(scale=0.2, size=(8, row_length())).astype(np.float32) + np.where(labels[:, None], 1, -1)
-        training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
-        state = DetectorState(0, "confident", WINDOW, WINDOW, WINDOW)
-        found.take(frame, ObjectFeatures(Box(1.0, 2.0, 30.0, 40.0), training, state), found.version + 1)
+        found.take(frame, features(rng), found.version + 1)
     return found
 
 

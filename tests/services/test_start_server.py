@@ -1,12 +1,10 @@
-"""The start server forks the processes of a program's pipelines, and ends with the program."""
-
-from __future__ import annotations
+"""The start server forks the processes of a program's pipelines, and ends with it; and the log of a process."""
 
 import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import psutil
@@ -29,8 +27,8 @@ def server(monkeypatch):
 
 
 @pytest.fixture
-def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before the server
-    """Starts a trainer, which runs until it is ended; its process, its watchdog and its log."""
+def start(server, folder, tmp_path, until):  # noqa: ARG001  its processes end before the server
+    """Starts a trainer, which takes turns until it is ended; its process, its watchdog and its log."""
     started = []
 
     def trainer(job=None):
@@ -40,6 +38,7 @@ def start(server, folder, tmp_path):  # noqa: ARG001  its processes end before t
         log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog()
         process = start_server().start("trainer", file, log.fileno(), watchdog.handle, restarted=False)
         started.append((process, watchdog, log))
+        until(lambda: job or watchdog.turns > 2)
         return started[-1]
 
     yield trainer
@@ -63,11 +62,10 @@ def has_ended(process):
 
 
 def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_server(
-    server, start, until, tmp_path, monkeypatch
+    server, start, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    started, watchdog, log = start()
-    until(lambda: watchdog.turns > 2)
+    started, _, log = start()
     process = psutil.Process(started.pid)
     assert process.ppid() == server.pid
     assert process.cwd() == str(tmp_path)
@@ -80,18 +78,16 @@ def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_se
     assert psutil.Process(server.pid).num_threads() == 1, "a fork copies only one"
 
 
-def test_a_current_folder_that_was_removed_is_no_obstacle(start, until, tmp_path, monkeypatch):
+def test_a_current_folder_that_was_removed_is_no_obstacle(start, tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    _, watchdog, _ = start()
-    until(lambda: watchdog.turns > 2)
+    assert start()[1].turns > 2
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 4), (signal.SIGKILL, -signal.SIGKILL)])
 def test_how_a_process_has_ended_is_known(start, until, number, code):
-    process, watchdog, _ = start()
-    until(lambda: watchdog.turns > 2)
+    process, *_ = start()
     assert process.poll() is None
     process.send_signal(number)
     assert until(process.poll) == code
@@ -106,22 +102,18 @@ def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_
 
 
 def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(server, start, until):
-    process, watchdog, _ = start()
-    until(lambda: watchdog.turns > 2)
+    process, *_ = start()
     running = psutil.Process(process.pid)
     os.kill(server.pid, signal.SIGKILL)
     assert until(process.poll) == -signal.SIGKILL
     until(lambda: has_ended(running))
-    again, watchdog, _ = start()
-    until(lambda: watchdog.turns > 2)
+    again, *_ = start()
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
 
 
 def test_nothing_outlives_a_program_that_is_killed(until):
-    program = (
-        "import time; from catstream.services.start_server import start_server; "
-        "print(start_server().pid, flush=True); time.sleep(600)"
-    )
+    program = "import time; from catstream.services.start_server import start_server; "
+    program += "print(start_server().pid, flush=True); time.sleep(600)"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as owner:
         server = psutil.Process(int(owner.stdout.readline()))
         owner.kill()
@@ -165,3 +157,22 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
     monkeypatch.setattr(sys, name, value, raising=False)
     with pytest.raises(ServiceError, match="run it with python"):
         start_server()
+
+
+def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
+    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
+        assert log.last_line() == "it logged nothing"
+        file.write(b"detector: one\nTraceback\ndetector: tw")
+        file.flush()
+        assert log.new_lines() == ["one"]
+        file.write(b"o\n")
+        file.flush()
+        assert log.new_lines() == ["two"]
+        assert log.last_line() == "two"
+
+
+def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_one(tmp_path):
+    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
+        file.write(b"detector: " + bytes(200_000) + b"\ndetector: the source is lost\n")
+        file.flush()
+        assert [line for _ in range(9) for line in log.new_lines()] == ["the source is lost"]

@@ -1,7 +1,5 @@
 """Formats that are made from a log."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from math import nan
@@ -61,10 +59,8 @@ def test_each_object_has_three_files_with_a_row_for_every_frame(tmp_path, layout
 
 def test_a_database_and_a_parquet_file_have_a_row_for_each_track(tmp_path):
     with closing(sqlite3.connect(made(tmp_path / "t.sqlite"))) as database:
-        rows = database.execute(
-            "SELECT frame, seq, seconds, state, x, w, score, model_version, pts, object FROM tracks"
-        )
-        assert rows.fetchall()[1:3] == [
+        columns = "frame, seq, seconds, state, x, w, score, model_version, pts, object"
+        assert database.execute(f"SELECT {columns} FROM tracks").fetchall()[1:3] == [
             (0, 1, 0.0, "present", 10.0, 30.5, 0.75, 4, None, ""),
             (2, 3, 0.08, "absent", None, None, 0.75, 4, 17.5, ""),
         ]

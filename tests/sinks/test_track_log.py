@@ -1,11 +1,8 @@
 """The log of a run: NDJSON and CSV hold every track at once, and are continued where a crash has cut them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
-import sys
 import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -73,15 +70,6 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
     assert list(read_frames(tmp_path / f"none{suffix}")) == []
 
 
-def test_standard_output_has_a_line_of_json_for_each_track(capfd, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", sys.__stdout__)
-    sink = open_sink("-", Origin())
-    for number in range(3):
-        sink.write(TrackedFrame([track(number)]))
-    sink.close()
-    assert [json.loads(line) for line in capfd.readouterr().out.splitlines()] == [track(k).to_dict() for k in range(3)]
-
-
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
 def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path, full, name):
     sink = open_sink(str(tmp_path / name), Origin())
@@ -101,12 +89,11 @@ def test_a_new_file_whose_first_line_the_disk_does_not_take_is_not_left(disk):
     assert [file.name for file in disk.iterdir()] == ["ballast"]
 
 
-def run_in(folder, *more, source="", video=False):
+def run_in(folder, *more):
     """The files of a run in a folder."""
     output = folder / "out"
-    return RunFiles(
-        Origin(source), output, [*places_of("walk", Results(output, video)), *(str(folder / name) for name in more)]
-    )
+    places = [*places_of("walk", Results(output, False)), *(str(folder / name) for name in more)]
+    return RunFiles(Origin(), output, places)
 
 
 def add(run, history, first=0, resume=False):
@@ -125,9 +112,8 @@ def rows_of(run):
 
 
 #: The objects of each frame: a few come, go and come again.
-HISTORIES = st.lists(
-    st.lists(st.sampled_from(["", "anna", "ben", "carl"]), min_size=1, unique=True), min_size=2, max_size=5
-)
+ALIVE = st.lists(st.sampled_from(["", "anna", "ben", "carl"]), min_size=1, unique=True)
+HISTORIES = st.lists(ALIVE, min_size=2, max_size=5)
 
 
 @settings(max_examples=120)
@@ -152,6 +138,7 @@ def test_an_ndjson_file_that_is_new_when_a_run_is_resumed_gets_the_frames_of_its
     add(more, [[""]] * 9, first=7, resume=True)
     for place in more.places:
         assert [frame.number for frame, _ in read_frames(Path(place))] == list(range(9))
+    assert RunFiles(Origin(), None, ["-"]).position() is None, "nothing says which frames there were"
 
 
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
@@ -165,19 +152,6 @@ def test_a_frame_counts_only_if_it_is_whole_at_each_byte_at_which_a_file_can_end
         log.write_bytes(data[:end])
         held = sum(line in data[:end] for line in tracks)
         assert run.position() == (3 if held == 8 else 2 if held >= 5 else 1 if held > 2 else 0)
-
-
-def test_a_resumed_run_continues_after_its_last_frame_and_draws_its_video_again(tmp_path):
-    source, _ = write(tmp_path, 12, (320, 240))
-    run = run_in(tmp_path, source=str(source), video=True)
-    add(run, [[""]] * 7)
-    assert run.position() == 7
-    add(run, [[""]] * 12, first=7, resume=True)
-    for log in run.places[:2]:
-        assert [frame.number for frame, _ in read_frames(Path(log))] == list(range(12))
-    with open_source(run.places[2]) as frames:
-        assert sum(1 for _ in frames) == 12
-    assert RunFiles(Origin(), None, ["-"]).position() is None, "nothing says which frames there were"
 
 
 def test_existing_files_are_replaced_only_if_requested_and_continued_only_by_their_own_run(tmp_path):

@@ -1,7 +1,5 @@
 """Expectation maximisation of the motion, against pykalman and its own laws."""
 
-from __future__ import annotations
-
 import numpy as np
 import pykalman
 import pytest
@@ -61,9 +59,7 @@ def test_likelihood_never_falls(rng, still):
 
 
 @pytest.mark.parametrize(
-    "centres",
-    [np.full((64, 2), 80.0), np.outer(np.arange(64.0), [3, -2])],
-    ids=["motionless", "steady"],
+    "centres", [np.full((64, 2), 80.0), np.outer(np.arange(64.0), [3, -2])], ids=["motionless", "steady"]
 )
 def test_perfect_motion_gives_small_positive_definite_covariances(centres):
     motion = learn_motion(centres)

@@ -1,7 +1,5 @@
 """What the tests of the page share: messages of a pipeline, and a page that is served."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from contextlib import ExitStack

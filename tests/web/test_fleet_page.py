@@ -1,7 +1,5 @@
 """The page of a fleet in a real browser: search, trouble first, the page of a stream and back, and a silent fleet."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 

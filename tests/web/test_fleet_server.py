@@ -1,7 +1,5 @@
 """The server of a fleet's page: what it shows of a fleet whose registry answers, and who may see it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re
@@ -12,7 +10,7 @@ from starlette.exceptions import HTTPException
 from catstream.web import feed
 from catstream.web.feed import FleetFeed
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import allow, allowed, create, public_key, synchronise
+from catstream.wire.keys import allowed, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
@@ -42,12 +40,10 @@ def source(page):
 
 
 @pytest.fixture
-def keyed(fleet, folder, tcp):
+def keyed(fleet, keys, folder, tcp):
     """Gives the fleet keys and a port, a client, and a stream with keys of its own, of which this is the folder."""
-    keys, stream = folder / "keys", folder / "stream"
-    create(keys)
+    stream = folder / "stream"
     create(stream)
-    allow(keys, "anna", "watch", output=folder / "anna")
     synchronise(stream, allowed(keys))
     fleet.listen, fleet.address = tcp, tcp.removeprefix("tcp://")
     fleet.keys, fleet.keys_of_client = str(keys), str(folder / "anna")

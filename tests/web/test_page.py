@@ -1,7 +1,5 @@
 """The page in a real browser: objects are drawn with the mouse, one is forgotten, one is tracked after a restart."""
 
-from __future__ import annotations
-
 import subprocess
 from time import sleep
 

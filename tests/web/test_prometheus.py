@@ -1,7 +1,5 @@
 """The metrics of a pipeline and of a fleet."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -19,9 +17,8 @@ def feed():
 def samples(feed):
     """The samples by metric: the labels and value of each."""
     found = {}
-    for name, labels, value in re.findall(
-        r"^(catstream_\w+)(?:\{(.*)\})? (.*)", prometheus.text(feed).decode(), re.MULTILINE
-    ):
+    lines = r"^(catstream_\w+)(?:\{(.*)\})? (.*)"
+    for name, labels, value in re.findall(lines, prometheus.text(feed).decode(), re.MULTILINE):
         found.setdefault(name, []).append((labels, float(value)))
     return found
 

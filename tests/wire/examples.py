@@ -1,14 +1,30 @@
-"""A valid message of any kind, made from its schema."""
-
-from __future__ import annotations
+"""Valid messages: of any kind, made from its schema, and the few that many tests send."""
 
 from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
 from catstream.box import Box, Window
-from catstream.messages.kinds import Command, Preview
+from catstream.messages.kinds import Command, Model, Preview, Track
 from catstream.messages.schema import Field, Named, fields
+from catstream.wire.socket import rejects
+
+
+def track(seq: int, name: str = "") -> Track:
+    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0, object=name)
+
+
+def present(seq: int, name: str = "") -> Track:
+    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
+
+
+def model(version: int, name: str = "") -> Model:
+    return Model(version, version, np.full(5, version, np.float32), 0.0, object=name)
+
+
+def rejected() -> int:
+    """How many messages this process has rejected until now."""
+    return rejects()["rejected"]
 
 
 def example(kind: type, full: bool = True, d: int = 5) -> Any:

@@ -1,7 +1,5 @@
 """Messages to bytes and back."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 import tracemalloc
@@ -41,6 +39,10 @@ def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
     return np.linspace(0.1, 0.9, int(np.prod(shape)), dtype=dtype).reshape(shape)
 
 
+def features(rows: TrainingRows) -> Features:
+    return Features(3, 2, 0.08, {"": ObjectFeatures(BOX, {"appearance": rows})})
+
+
 BOX = Box(4.5, 3.0, 20.0, 10.0)
 EXAMPLES = {name: example_of(kind) for name, kind in KINDS.items()}
 MESSAGES = pytest.mark.parametrize("message", EXAMPLES.values(), ids=EXAMPLES)
@@ -48,9 +50,9 @@ ALL = tuple(KINDS.values())
 FUZZ = settings(max_examples=300, suppress_health_check=[HealthCheck.too_slow])
 
 
-def packed(kind: str, **changes: object) -> bytes:
-    """An example as bytes, with some of its fields replaced on the wire."""
-    about = getattr(EXAMPLES[kind], "object", "")
+def packed(kind: str, about: object = None, **changes: object) -> bytes:
+    """An example as bytes, with some of its fields, or the object of its envelope, replaced on the wire."""
+    about = getattr(EXAMPLES[kind], "object", "") if about is None else about
     return msgpack.packb([VERSION, kind, about, "a run", fields_of(kind) | changes])
 
 
@@ -159,8 +161,7 @@ def test_arrays_arrive_read_only():
 
 def test_arrays_travel_row_by_row_whatever_their_layout():
     rows = TrainingRows(np.asfortranarray(array(3, 5)), array(3), array(3))
-    message = Features(3, 2, 0.08, {"": ObjectFeatures(BOX, {"appearance": rows})})
-    arrived = decode(encode(message), Features)
+    arrived = decode(encode(features(rows)), Features)
     np.testing.assert_array_equal(arrived.objects[""].training["appearance"].rows, array(3, 5))
 
 
@@ -210,15 +211,11 @@ REJECTED = {
     "a tree of no head": packed("sample", trees=TREES_SENT | {"unknown": TREES_SENT["loss"]}),
     "training rows of no group": of_anna(training={"unknown": {}}),
     "a name that is no name": packed("features", objects={"an na": {}}),
-    "a track of a name that is no name": msgpack.packb(
-        [VERSION, "track", "../x", "", fields_of("track") | {"object": "../x"}]
-    ),
-    "another object in the envelope": msgpack.packb([VERSION, "track", "ann", "", fields_of("track")]),
-    "an object in the envelope, and none in the fields": msgpack.packb(
-        [VERSION, "position", "anna", "", fields_of("position")]
-    ),
+    "a track of a name that is no name": packed("track", about="../x", object="../x"),
+    "another object in the envelope": packed("track", about="ann"),
+    "an object in the envelope, and none in the fields": packed("position", about="anna"),
     "lists in lists, as object": b"\x95\x04\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
-    "a number as object": msgpack.packb([VERSION, "track", 1, "", fields_of("track") | {"object": 1}]),
+    "a number as object": packed("track", about=1, object=1),
     "more objects than a map may have": packed("position", versions={f"o{i}": 1 for i in range(257)}),
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
@@ -263,10 +260,8 @@ def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
 @pytest.mark.parametrize(
     "message",
     [
-        Features(
-            1, 0, 0.0, {"": ObjectFeatures(BOX, {"extent": TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))})}
-        ),
-        Features(1, 0, 0.0, {"": ObjectFeatures(BOX, {"extent": TrainingRows(array(3, 5), array(4), array(3))})}),
+        features(TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))),
+        features(TrainingRows(array(3, 5), array(4), array(3))),
         dataclasses.replace(EXAMPLES["track"], score=float("nan")),
         dataclasses.replace(EXAMPLES["track"], seq=-1),
         dataclasses.replace(EXAMPLES["track"], object="an na"),
@@ -299,19 +294,11 @@ def test_lists_in_lists_take_no_memory(place):
         tracemalloc.stop()
 
 
+SHAPES = st.lists(st.integers(-2, 2**64 - 1) | st.integers(0, 3), max_size=3)
+PLAIN_ARRAYS = st.builds(plain, st.sampled_from(["<f4", "<f8", "|O", ">f4", ""]), SHAPES, st.binary(max_size=32))
+NUMBERS = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats()
 VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**63), 2**64 - 1)
-    | st.floats()
-    | st.text(max_size=8)
-    | st.binary(max_size=8)
-    | st.builds(
-        plain,
-        st.sampled_from(["<f4", "<f8", "|O", ">f4", ""]),
-        st.lists(st.integers(-2, 2**64 - 1) | st.integers(0, 3), max_size=3),
-        st.binary(max_size=32),
-    ),
+    NUMBERS | st.text(max_size=8) | st.binary(max_size=8) | PLAIN_ARRAYS,
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=8,
 )

@@ -1,7 +1,5 @@
 """Commands and their answers: each is carried out once, whatever gets lost, and whoever else talks."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 
@@ -161,9 +159,8 @@ def test_of_a_flood_of_commands_64_wait_the_others_are_rejected_and_stop_is_let_
         raw.send(encode(Command("99", "pause")))  # rejected before, so it may be sent again
         until(lambda: len(heard) == 66, turn)
     assert [command.id for command in heard] == [*map(str, range(64)), "stop", "99"]
-    assert {(answer.done, answer.reason) for answer in answers[:36]} == {
-        (False, "64 commands wait for the next frame: try again later")
-    }
+    reason = "64 commands wait for the next frame: try again later"
+    assert {(answer.done, answer.reason) for answer in answers[:36]} == {(False, reason)}
 
 
 def test_control_sends_each_command_with_an_id_of_its_own(endpoint, answering):

@@ -1,7 +1,5 @@
 """Where the processes meet, and who is kept out."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket
@@ -185,18 +183,6 @@ def test_a_pipeline_of_this_user_is_known_to_run_without_a_connection_to_it(fold
         assert not is_deserted(endpoint)
         with pytest.raises(BlockingIOError):
             detector.accept()
-
-
-def test_without_a_place_there_must_be_just_one_pipeline(folder, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))  # where no others run
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-    with pytest.raises(ServiceError, match="no pipeline of yours is running"):
-        find()
-    places = (private_folder(), private_folder())
-    with places[0] as one, places[1] as two, meeting_place("", one) as first:
-        assert find() == first
-        with meeting_place("", two), pytest.raises(ServiceError, match=r"2 pipelines are running: .*\(--endpoint\)"):
-            find()  # of the options that select one, only `--endpoint` is one of each command that comes here
 
 
 @pytest.mark.parametrize("text", ["", "run", "run\n", "http://run\n\n"])

@@ -3,8 +3,6 @@
 No process, no socket, no clock: the two state machines, a network that breaks and repeats frames, and a disk.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from unittest.mock import Mock
@@ -232,11 +230,6 @@ class Histories(RuleBasedStateMachine):
         if self.senders and self.resumed:
             assert self.sender.stored <= self.sender.acknowledged <= self.sender.taken <= self.sender.sent
 
-    @invariant()
-    def memory_is_bounded(self):
-        if self.senders:
-            assert len(self.sender._samples) <= 65536
-
     def teardown(self):
         """Once nothing is lost any more, everything that was sent is taken and stored."""
         if not self.senders:
@@ -387,12 +380,3 @@ def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sen
     assert (window.acknowledged, window.stored, window.taken) == (3, 3, 3)
     with pytest.raises(ProtocolError, match="another stream"):
         window.receive(Position(10, 10), now=0.0)
-
-
-def test_a_sample_counts_from_the_message_that_led_to_it_or_an_earlier_one():
-    window = filled(size=9, count=9)
-    for taken, versions in ((2, {"anna": 1}), (3, {"anna": 1}), (4, {"anna": 1, "ben": 2}), (9, {"ben": 2})):
-        window.receive(Position(0, taken, versions=versions), now=0.0)
-    first, second, third = {"anna": 1}, {"anna": 1, "ben": 2}, {"ben": 2}
-    assert [window.count_samples(seq) for seq in range(1, 10)] == [*[first] * 3, second, *[third] * 5]
-    assert not window._samples, "what was asked for is forgotten"

@@ -1,7 +1,5 @@
 """Who comes in, where a pipeline has keys: with real sockets, on every channel."""
 
-from __future__ import annotations
-
 import os
 import stat
 from contextlib import ExitStack, suppress
@@ -11,7 +9,7 @@ import zmq
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, Features, Position, Track
+from catstream.messages.kinds import Answer, Command, End, Features, Position
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, CONTROL, FEATURES, MODELS, TRACKS
 from catstream.wire.codec import encode
@@ -20,7 +18,7 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys, allow, clients, create, revoke
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.results import ResultsReceiver, ResultsSender
-from catstream.wire.socket import rejects
+from tests.wire.examples import rejected, track
 
 WINDOW = 4
 CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # name and role of some
@@ -33,14 +31,6 @@ OUTSIDE = [(name, who) for name in CHANNELS for who in ("none", "wrong", "revoke
     for who, role in CLIENTS.items()
     if ROLES.index(role) < ROLES.index(channel.role)
 ]
-
-
-def track(seq):
-    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0)
-
-
-def rejected():
-    return rejects()["rejected"]
 
 
 @pytest.fixture
@@ -262,14 +252,8 @@ def test_a_revoked_client_receives_until_its_connection_ends_and_cannot_reconnec
         with Publisher(TRACKS, place()) as tracks:
             until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.receive_all())))
             revoke(keys, "watcher")
-            until(
-                lambda: heard[-1].seq == 2,
-                lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())),
-            )
-            with (
-                Subscriber(TRACKS, place("watcher")) as another,
-                pytest.raises(ServiceError, match="rejects this key"),
-            ):
+            until(lambda: heard[-1].seq == 2, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
+            with Subscriber(TRACKS, place("watcher")) as another, pytest.raises(ServiceError, match="rejects this key"):
                 until(lambda: False, lambda: (tracks.send(track(3)), another.receive(0.02)))
         list(iter(lambda: reader.receive(0.05), None))  # what was on its way
         with Publisher(TRACKS, place()) as tracks, pytest.raises(ServiceError, match="rejects this key"):
@@ -332,7 +316,7 @@ def test_a_client_without_keys_gets_an_error_if_the_pipeline_requires_them(place
     listens = listener("tracks" if attach == "subscribe" else "control")
     endpoint = str(place("none"))
 
-    def rejected():
+    def attached():
         listens()
         if attach == "subscribe":
             with catstream.subscribe(endpoint, "tracks", timeout=0.2) as tracks, suppress(SilenceError):
@@ -342,4 +326,4 @@ def test_a_client_without_keys_gets_an_error_if_the_pipeline_requires_them(place
                 pipeline.pause()
 
     with pytest.raises(ServiceError, match=r"requires authentication.*--keys DIR"):
-        until(rejected)
+        until(attached)

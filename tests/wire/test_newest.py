@@ -1,7 +1,5 @@
 """Published messages about several objects: each subscriber gets those of its object, and each object's newest."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np
@@ -15,17 +13,9 @@ from catstream.wire.channels import MODELS, SAMPLES, TRACKS
 from catstream.wire.codec import encode, opening, topic_of
 from catstream.wire.endpoint import Endpoint, private_folder
 from catstream.wire.newest import Publisher, Subscriber
-from catstream.wire.socket import rejects
+from tests.wire.examples import model, rejected, track
 
 NAMES = st.just("") | st.from_regex(r"\w[\w.-]{0,63}", fullmatch=True)
-
-
-def model(version, name):
-    return Model(version, version, np.full(5, version, np.float32), 0.0, object=name)
-
-
-def track(name):
-    return Track(1, 0, 0.0, "absent", None, 0.0, 0, object=name)
 
 
 def joined(publisher, count, until):
@@ -39,7 +29,7 @@ def joined(publisher, count, until):
 @example("a" * 31, "a" * 32)
 @example("é" * 20, "é" * 64)
 def test_a_message_begins_with_the_topic_of_its_object_and_of_no_other(name, other):
-    data = encode(track(name))
+    data = encode(track(1, name))
     assert data.startswith(opening(Track))
     assert data.startswith(opening(Track, name))
     assert topic_of(data) == ("track", name)
@@ -185,7 +175,7 @@ def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_that_
 
 
 def test_a_flood_of_subscriptions_is_counted_and_the_others_are_served(endpoint, until):
-    before = rejects()["rejected"]
+    before = rejected()
     with Publisher(TRACKS, endpoint) as tracks, Subscriber(TRACKS, endpoint) as honest:
         joined(tracks, 1, until)
         with zmq.Context.instance().socket(zmq.SUB) as stranger:
@@ -193,8 +183,8 @@ def test_a_flood_of_subscriptions_is_counted_and_the_others_are_served(endpoint,
             stranger.connect(endpoint.address(TRACKS))
             for number in range(1500):
                 stranger.subscribe(opening(Track, f"o{number}"))
-            until(lambda: rejects()["rejected"] >= before + 1500 - 1023, tracks.serve_late_joiners)
+            until(lambda: rejected() >= before + 1500 - 1023, tracks.serve_late_joiners)
             assert len(tracks._subscribed) == 1024
-            tracks.send(track("anna"))
-            assert honest.receive(30) == track("anna")
+            tracks.send(track(1, "anna"))
+            assert honest.receive(30) == track(1, "anna")
         joined(tracks, 1, until)

@@ -3,8 +3,6 @@
 Run as a program, it writes the fields of the messages and the table of the heads: `make protocol`.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import select
@@ -36,6 +34,7 @@ from catstream.wire import codec
 from catstream.wire.channels import CHANNELS, REGISTRY, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
+from tests.wire.examples import track
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
@@ -51,9 +50,8 @@ def block(language):
 
 def listed(kind):
     """The list of the fields of a message: types and limits from its schema, meanings from its docstring."""
-    meanings = dict(
-        re.findall(r"^(\w+)(?: : .*\n +|  +)(\S.*(?:\n +\S.*)*)", inspect.cleandoc(kind.__doc__), re.MULTILINE)
-    )
+    parameters = r"^(\w+)(?: : .*\n +|  +)(\S.*(?:\n +\S.*)*)"
+    meanings = dict(re.findall(parameters, inspect.cleandoc(kind.__doc__), re.MULTILINE))
     rows = []
     for field in fields(kind):
         meaning = re.sub(r"\s+", " ", meanings[field.name]).replace("None", "nil").rstrip(".")
@@ -86,9 +84,8 @@ def kind_of(field):
         return "array of integers"
     if field.type is bytes:
         return f"bytes, at most {limits.max_length}"
-    return PLAIN[field.type] + (
-        f", at least {limits.ge}" if field.type is int and limits is not None and limits.ge else ""
-    )
+    least = f", at least {limits.ge}" if field.type is int and limits is not None and limits.ge else ""
+    return PLAIN[field.type] + least
 
 
 def names_of(named):
@@ -170,8 +167,7 @@ def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
         Publisher(TRACKS, endpoint) as tracks,
         subprocess.Popen([sys.executable, "-c", block("python"), address], stdout=subprocess.PIPE, text=True) as reader,
     ):
-        hello = Track(1, 0, 0.0, "absent", None, 0.0, 0)
-        until(lambda: heard(reader.stdout), lambda: tracks.send(hello))
+        until(lambda: select.select([reader.stdout], [], [], 0.05)[0], lambda: tracks.send(track(1)))
         for seq in range(2, 20):
             for name in ("anna", "ben"):
                 tracks.send(Track(seq, seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1, object=name))
@@ -181,11 +177,6 @@ def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
     assert [line for line in lines if "present" in line] == [
         f"{frame} {name} present [1.0, 2.0, 3.0, 4.0] 0.5" for frame in range(1, 19) for name in ("anna", "ben")
     ]
-
-
-def heard(stream):
-    """Whether there is something to read."""
-    return select.select([stream], [], [], 0.05)[0]
 
 
 if __name__ == "__main__":

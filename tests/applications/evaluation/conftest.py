@@ -1,7 +1,5 @@
 """A short sequence with truth, cut from the demo video."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

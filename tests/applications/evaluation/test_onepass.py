@@ -1,10 +1,12 @@
-"""One-pass evaluation: what is run, kept, found again, and refused."""
+"""One-pass evaluation: what is run, kept, found again, refused, and interrupted."""
 
-from __future__ import annotations
-
+import multiprocessing
+import os
 import re
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +18,8 @@ from catstream.applications.evaluation.accuracy import describe_flips, flips_of,
 from catstream.applications.evaluation.datasets import FIRST, Sequence, Start, jittered, spatial, temporal
 from catstream.applications.evaluation.onepass import evaluate, follow
 from catstream.applications.evaluation.runs import EvaluationRun, load, save
+from catstream.applications.workers import run_tasks, sigint_blocked
+from catstream.cli.common import INTERRUPTED
 from catstream.errors import CatstreamError, SettingsError
 from catstream.settings import Settings
 
@@ -24,11 +28,9 @@ SETTINGS = Settings()
 
 @pytest.fixture
 def run(sequence, found) -> EvaluationRun:
-    frames = len(sequence)
     found[0], found[9] = sequence.boxes[0], np.nan
-    return EvaluationRun(
-        "catstream", sequence, FIRST, found.round(4), np.linspace(1, 0.5, frames).round(6), np.full(frames, 0.02)
-    )
+    confidence, seconds = np.linspace(1, 0.5, len(sequence)).round(6), np.full(len(sequence), 0.02)
+    return EvaluationRun("catstream", sequence, FIRST, found.round(4), confidence, seconds)
 
 
 @pytest.fixture
@@ -108,14 +110,10 @@ def test_runs_from_changed_first_boxes_are_stored_beside_the_others(tmp_path, se
 
 
 @pytest.mark.parametrize(
-    "changed",
-    [
-        pytest.param(lambda sequence: sequence.boxes[:-1], id="fewer boxes"),
-        pytest.param(lambda sequence: sequence.boxes + 3, id="another first box"),
-    ],
+    "changed", [lambda boxes: boxes[:-1], lambda boxes: boxes + 3], ids=["fewer boxes", "another first box"]
 )
 def test_runs_with_another_ground_truth_are_repeated(tmp_path, sequence, counted, changed):
-    for boxes in (sequence.boxes, changed(sequence)):
+    for boxes in (sequence.boxes, changed(sequence.boxes)):
         evaluate([replace(sequence, boxes=boxes)], ["catstream"], SETTINGS, output=tmp_path)
     assert len(counted) == 2
 
@@ -186,9 +184,8 @@ def test_a_killed_evaluation_leaves_no_worker(tmp_path, sequence):
     script = tmp_path / "killed.py"
     script.write_text(f"""
 import signal
-from catstream.applications.evaluation.datasets import find_sequences
+from catstream.applications.evaluation.datasets import find_sequences, temporal
 from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.datasets import temporal
 from catstream.settings import Settings
 
 def done(run):
@@ -214,10 +211,8 @@ if __name__ == "__main__":
 def test_rows_are_means_over_the_runs_with_their_spread(sequence):
     runs = evaluate([sequence], ["catstream", "mil"], SETTINGS, starts=temporal(2))
     rows = rows_of(runs)
-    assert [(row.name, row.tracker, row.frames, row.runs) for row in rows] == [
-        ("walk", "catstream", 12, 2),
-        ("walk", "mil", 12, 2),
-    ]
+    facts = [(row.name, row.tracker, row.frames, row.runs) for row in rows]
+    assert facts == [("walk", "catstream", 12, 2), ("walk", "mil", 12, 2)]
     scores = [run.score().auc for run in runs[:2]]
     assert rows[0].auc == pytest.approx(np.mean(scores))
     assert rows[0].auc_spread == pytest.approx(np.std(scores))
@@ -241,7 +236,52 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
     rows = rows_of(map(with_success, (12, 9), starts)) + rows_of(map(with_success, (12, 10), starts))
     assert [row.flips for row in rows] == [True, False]  # 9 of 12 frames have the object: 0.33 and 0.22 are lost
     assert flips_of(rows[:1]) == {"catstream": ["walk"]}
-    assert describe_flips(rows[1:]) == [
-        "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
-    ]
+    said = "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
+    assert describe_flips(rows[1:]) == [said]
     assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}
+
+
+def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, tmp_path):
+    """The terminal sends it to all of them, of which the workers are at their imports."""
+    runs = ["--starts", 4, "--jobs", 2, "--output", tmp_path / "out"]
+    process = catstream("evaluate", walk, *runs, process_group=0)
+    family = psutil.Process(process.pid)
+    while len(family.children()) < 3 and process.poll() is None:  # two workers, and the tracker of their resources
+        pass
+    children = family.children()
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate()
+    assert "Traceback" not in errors
+    assert errors.splitlines()[-1].startswith("stopped: complete runs are in ")
+    assert process.returncode == INTERRUPTED
+    assert not psutil.wait_procs(children, timeout=10)[1]
+
+
+def test_ctrl_c_that_another_thread_receives_interrupts_only_after_all_workers_were_started():
+    started = []
+
+    def start_all(other):
+        with sigint_blocked():
+            for worker in range(2):
+                other.submit(signal.raise_signal, signal.SIGINT).result()
+                started.append(worker)
+
+    with ThreadPoolExecutor(1) as other:
+        other.submit(abs, 0).result()  # the thread exists, and does not block the signal
+        with pytest.raises(KeyboardInterrupt):
+            start_all(other)
+    assert started == [0, 1]
+
+
+def test_ctrl_c_ends_no_worker_because_the_caller_does():
+    """A worker that ended on its own would be reported as killed, also by a caller that ignores Ctrl-C."""
+    assert list(run_tasks(signal.raise_signal, [(signal.SIGINT,)] * 2, jobs=2)) == [None, None]
+
+
+def test_a_caller_that_stops_early_leaves_no_worker():
+    given = run_tasks(abs, [(-1,), (-2,), (-3,)], jobs=2)
+    assert next(given) in {1, 2, 3}
+    running = multiprocessing.active_children()
+    given.close()
+    assert len(running) == 2
+    assert not multiprocessing.active_children()

@@ -3,8 +3,6 @@
 The trained networks are not included: OpenCV's classes of their trackers and parameters are real, the answers made up.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from unittest.mock import create_autospec
 

@@ -1,17 +1,18 @@
-"""The report and the command: one file with all in it, and a table."""
-
-from __future__ import annotations
+"""The report and the command: one file with all in it, what made it, and a table."""
 
 import json
+import platform
 import re
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
 
+from catstream.applications.evaluation import runs as module
 from catstream.applications.evaluation.accuracy import MEASURES, write_report
 from catstream.applications.evaluation.datasets import FIRST
-from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.evaluation.runs import EvaluationRun, machine, provenance
 from catstream.settings import Settings
 
 
@@ -91,3 +92,31 @@ def test_a_report_that_cannot_be_written_is_an_error_of_one_line_after_the_table
     assert re.search(r"walk +mil +12", output)
     place = str(tmp_path / "report.html")
     assert (code, errors) == (1, f"catstream: cannot write {place!r} (Is a directory): give another place\n")
+
+
+def test_neither_command_nor_machine_tell_folders_or_the_host_name():
+    made = provenance(Settings(coreset={"size": 32}), ["catstream", "/home/me/walk", "--data=/home/me/walk"])
+    assert (made["command"], made["settings"]) == ("catstream walk --data=walk", ["coreset.size=32"])
+    told = machine()
+    assert {"processor", "cores", "memory_gb", "python", "opencv", "blas", "numpy"} <= told.keys()
+    assert platform.node() not in json.dumps(told)
+    assert (module._ROOT / "pyproject.toml").is_file(), "the commit is that of this checkout"
+
+
+def test_the_commit_is_that_of_the_checkout_and_dirty_if_the_code_was_changed(tmp_path, monkeypatch):
+    def git(*words):
+        subprocess.run(["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", *words], check=True)
+
+    monkeypatch.setattr(module, "_ROOT", tmp_path)
+    assert provenance(Settings())["commit"] is None
+    for folder in ("catstream", "benchmarks/results"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "catstream" / "code.py").touch()
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "first")
+    commit = provenance(Settings())["commit"]
+    (tmp_path / "benchmarks" / "results" / "speed.json").touch()
+    assert provenance(Settings())["commit"] == commit
+    (tmp_path / "catstream" / "code.py").write_text("changed")
+    assert provenance(Settings())["commit"] == f"{commit}-dirty"

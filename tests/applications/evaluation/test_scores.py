@@ -1,7 +1,5 @@
 """The measures: those of the benchmarks, number by number, and the laws they keep."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,13 +1,11 @@
 """What the tests of the search share: a model of the demo's dahlia, and one of its pagoda."""
 
-from __future__ import annotations
-
 import pytest
 
 from catstream.box import Box
 from catstream.run.learned import Learned
-from catstream.tracker import Tracker
 from catstream.video.source import open_source
+from tests.learning import learned_from
 
 
 @pytest.fixture(scope="session")
@@ -22,14 +20,7 @@ def model_files(once, video, demo_video):
 
     def learn(folder):
         for name, box in (("dahlia", demo_video(60)[1][0]), ("pagoda", Box(4, 60, 70, 70))):
-            tracker = Tracker()
-            with open_source(video, part=slice(16)) as frames:
-                for frame in frames:
-                    if frame.number:
-                        tracker.update(frame.image)
-                    else:
-                        tracker.init(frame.image, box)
-            tracker.learned().save(folder / f"{name}.model")
+            learned_from(video, box, slice(16)).save(folder / f"{name}.model")
 
     folder = once("found-models", learn)
     return [folder / "dahlia.model", folder / "pagoda.model"]

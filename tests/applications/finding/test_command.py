@@ -1,7 +1,5 @@
 """`catstream find`: its files, its report, and what happens after Ctrl-C."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,18 +1,25 @@
-"""The search of videos and images."""
-
-from __future__ import annotations
+"""Which files are searched, how their frames are, and which sightings are an interval."""
 
 import dataclasses
+import errno
 import shutil
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import catstream
-from catstream.applications.finding.find import File, Search, load_models
-from catstream.applications.finding.found import SearchLog
+from catstream.applications.finding.find import File, Scan, Search, Sighting, Step, find_files, load_models
+from catstream.applications.finding.found import FileResult, SearchLog
+from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoError
+from catstream.features.cells import Cells
+from catstream.features.pyramid import Pyramid
+from catstream.settings import RunSettings
+from catstream.video.frames import Frame
 from catstream.video.writer import VideoWriter
 
 
@@ -138,3 +145,155 @@ def test_models_without_a_file_or_with_one_name_are_errors(model_files, tmp_path
 def test_sizes_are_two_positive_numbers_in_order(model_files, appearing, sizes):
     with pytest.raises(SettingsError, match="the smaller one first, got"):
         catstream.find(model_files[0], appearing, sizes=sizes)
+
+
+def every_window(cells, weights, bias, least):
+    """As `Cells.respond_above`, with the score of every window computed to the end."""
+    scores = cells.respond(weights, bias)
+    return np.where(scores >= least, scores, -np.inf)
+
+
+@pytest.mark.parametrize("number", [0, 20, 40, 59])
+@pytest.mark.parametrize("threshold", [0.2, 0.5])
+def test_models_together_find_the_windows_of_each_models_plain_scan(learned, images, number, threshold, monkeypatch):
+    frame = Pyramid(images[number])
+    together = Scan(learned, threshold).windows(frame)
+    monkeypatch.setattr(Cells, "respond_above", every_window)
+    plain = [Scan([each], threshold).windows(frame)[0] for each in learned]
+    for ours, theirs in zip(together, plain, strict=True):
+        assert [each.score for each in ours] == pytest.approx([each.score for each in theirs], abs=1e-4)
+        np.testing.assert_allclose([each.window for each in ours], [each.window for each in theirs])
+
+
+def test_the_object_is_found_at_its_box(learned, images, demo_video):
+    for number in (20, 40, 59):
+        dahlia, _ = Scan(learned)(images[number])
+        assert dahlia[0].box.overlap(demo_video(60)[1][number]) > 0.6
+        assert dahlia[0].score > 0.7
+
+
+def test_every_sighting_reaches_the_threshold_and_overlaps_no_better_one(learned, images):
+    for found in Scan(learned, 0.1)(images[30]):
+        assert [each.score for each in found] == sorted((each.score for each in found), reverse=True)
+        assert all(each.score >= 0.1 for each in found)
+        assert all(a.window.overlap(b.window) < 0.3 for k, a in enumerate(found) for b in found[:k])
+
+
+def test_a_frame_without_the_object_or_smaller_than_a_window_has_no_sighting(learned, rng):
+    noise = rng.integers(0, 256, (240, 320, 3), np.uint8)
+    for image in (noise, np.full((240, 320, 3), 128, np.uint8), np.zeros((9, 12, 3), np.uint8)):
+        assert Scan(learned)(image) == [[], []]
+
+
+IMAGE = np.zeros((60, 80, 3), np.uint8)
+
+
+def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):
+    return Sighting(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
+
+
+def intervals_of(*steps):
+    """The intervals of the sightings of these steps."""
+    result = FileResult("walk.mp4", [], gap=1.0)
+    for number, step in enumerate(steps):
+        result.add(Step(Frame(number, step[0].time, IMAGE), step))
+    return result.intervals
+
+
+def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one():
+    alone = sighting(0.0), sighting(0.2, x=300.0), sighting(0.4, size=80.0), sighting(1.2), sighting(2.5)
+    assert [interval.count for interval in intervals_of(*([each] for each in alone))] == [4, 1]
+
+
+seen = st.tuples(st.floats(0, 30), st.sampled_from(["anna", "ben"]), st.floats(0.5, 1))
+
+
+@given(st.lists(seen, min_size=1, max_size=40))
+def test_every_sighting_is_in_one_interval_of_its_object(facts):
+    made = [sighting(time, name=name, score=score) for time, name, score in sorted(facts)]
+    found = intervals_of(*([each] for each in made))
+    assert sum(interval.count for interval in found) == len(made)
+    for name in ("anna", "ben"):
+        own = [interval for interval in found if interval.first.object == name]
+        assert all(one.last.time + 1.0 < other.first.time for one, other in pairwise(own))
+        for each in own:
+            within = [one for one in made if one.object == name and each.first.time <= one.time <= each.last.time]
+            assert (each.count, each.best.score) == (len(within), max(one.score for one in within))
+
+
+@pytest.fixture
+def tree(tmp_path, video):
+    """A folder with videos, images and other files."""
+    for place in ("clips/a.mp4", "clips/deep/b.MP4"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(video, tmp_path / place)
+    (tmp_path / "photos").mkdir()
+    for number in (10, 9, 1):
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), np.full((20 + number, 30, 3), number, np.uint8))
+    (tmp_path / "photos" / "notes.txt").write_text("no picture")
+    (tmp_path / ".hidden").mkdir()
+    shutil.copy(video, tmp_path / ".hidden" / "c.mp4")
+    return tmp_path
+
+
+def frames(file):
+    problems = []
+    searched = file.frames(0.0, RunSettings(), lambda _: None, problems.append)
+    return [(frame.number, name, frame.image.shape) for frame, name in searched], problems
+
+
+def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
+    found = find_files([tree, tree / "clips" / "a.mp4"])
+    kinds = [(str(file.path.relative_to(tree)), file.kind) for file in found]
+    assert kinds == [("clips/a.mp4", "video"), ("clips/deep/b.MP4", "video"), ("photos", "images")]
+
+
+def test_a_subfolder_that_may_not_be_read_is_reported_and_the_others_are_searched(tree, monkeypatch, caplog):
+    listed = type(tree).iterdir
+
+    def iterdir(folder):
+        if folder.name == "deep":
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(type(tree), "iterdir", iterdir)
+    assert [file.path.name for file in find_files([tree])] == ["a.mp4", "photos"]
+    assert caplog.messages == [f"{tree / 'clips' / 'deep'} is left out (Permission denied)"]
+
+
+def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
+    found, problems = frames(File(tree / "photos", "images"))
+    assert found == [(0, "1.png", (21, 30, 3)), (1, "9.png", (29, 30, 3)), (2, "10.png", (30, 30, 3))]
+    assert not problems
+
+
+def test_images_that_are_unreadable_or_gone_are_reported_and_the_others_are_read(tree):
+    (tree / "photos" / "9.png").write_bytes(b"no picture")
+    (tree / "photos" / "8.png").symlink_to("gone.png")
+    file = File(tree / "photos", "images")
+    assert file.signature[0] == 3
+    found, (gone, unreadable) = frames(file)
+    assert [name for _, name, _ in found] == ["1.png", "10.png"]
+    assert "8.png" in gone
+    assert "9.png" in unreadable
+
+
+def test_a_single_image_is_one_frame(tree):
+    (file,) = find_files([tree / "photos" / "10.png"])
+    assert frames(file)[0] == [(0, "", (30, 30, 3))]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("none.mp4", "no file or folder"),
+        ("empty", "neither images nor videos"),
+        ("0", "live"),
+        ("rtsp://a:b@c/d", "rtsp://c/d is a live"),
+    ],
+)
+def test_what_cannot_be_searched_is_an_error(tmp_path, name, message, monkeypatch):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(VideoError, match=message):
+        find_files([name])

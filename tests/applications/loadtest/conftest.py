@@ -1,7 +1,5 @@
 """What the tests of load tests share: tracks and models as an observer sees them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -40,20 +38,11 @@ def result() -> Callable[..., Result]:
 
     def made(*streams: list[float], followed: float = 1.0, success: float = 1.0, **others) -> Result:
         measures = []
-        for seconds in streams:
+        rates = {"success": success, "success_followed": success}
+        for seconds in map(np.array, streams):
             frames = np.arange(len(seconds))
-            measures.append(
-                Measures(
-                    due=100 + frames / 10,
-                    followed=frames < followed * len(seconds),
-                    track=np.array(seconds),
-                    model=np.array(seconds),
-                    without_track=0,
-                    success=success,
-                    success_followed=success,
-                    max_lag=3,
-                )
-            )
+            seen = {"due": 100 + frames / 10, "followed": frames < followed * len(seconds)}
+            measures.append(Measures(**seen, **rates, track=seconds, model=seconds, without_track=0, max_lag=3))
         facts = {"usage": {}, "received": [], "missed": [], "frozen": 0.0}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
 

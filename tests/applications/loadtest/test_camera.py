@@ -1,15 +1,15 @@
-"""A broadcast: each frame at its moment, known by its time stamp, none left out for a slow reader."""
-
-from __future__ import annotations
+"""What is shown: a broadcast of frames at their moments, none left out for a slow reader; objects and their truth."""
 
 import threading
 import time
 import urllib.error
 import urllib.request
+from itertools import combinations
 
 import numpy as np
 import pytest
 
+from catstream.applications.loadtest import crowd
 from catstream.applications.loadtest.camera import Broadcast, Schedule
 from catstream.video.frames import jpeg
 from catstream.video.source import open_source
@@ -83,3 +83,26 @@ def test_a_receiver_that_disconnects_ends_its_connection_only(broadcast, until, 
 def test_an_unknown_stream_is_an_http_404(broadcast):
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(broadcast.urls[0][:-1] + "7")
+
+
+def test_the_same_arguments_give_the_same_pixels():
+    for (image, boxes), (again, same) in zip(crowd.render(3, 4), crowd.render(3, 4), strict=True):
+        assert np.array_equal(image, again)
+        assert boxes == same
+
+
+@pytest.mark.parametrize("count", [2, 8, 16])
+def test_all_objects_begin_whole_in_the_picture_and_apart(count):
+    _, boxes = next(crowd.render(count, 2))
+    assert list(boxes) == list(crowd.NAMES[:count])
+    for box in boxes.values():
+        assert 0 <= box.x <= box.x + box.w <= crowd.SIZE[0]
+        assert 0 <= box.y <= box.y + box.h <= crowd.SIZE[1]
+    assert all(a.overlap(b) == 0 for a, b in combinations(boxes.values(), 2))
+
+
+def test_some_objects_leave_and_come_back():
+    seen = [boxes["carla"] is not None for _, boxes in crowd.render(3, 60)]
+    assert seen[0]
+    assert seen[-1]
+    assert not all(seen)

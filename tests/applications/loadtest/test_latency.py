@@ -1,7 +1,5 @@
 """Measures: every frame that was due counts once, and nothing gets better by being skipped."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The report: the figures and the limits that were not met, on one page that needs nothing else."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ElementTree
@@ -44,12 +42,8 @@ def test_the_report_begins_with_whether_the_rate_was_sustained(result, tmp_path,
 
 
 def test_every_stream_and_process_has_its_row(result, tmp_path):
-    run = result(
-        [0.01] * 50,
-        [0.02] * 50,
-        usage={"detector 0": [(0.5, 10**8)], "detector 1": [(0.7, 10**8)]},
-        errors=["stream 1: <it> died"],
-    )
+    usage = {"detector 0": [(0.5, 10**8)], "detector 1": [(0.7, 10**8)]}
+    run = result([0.01] * 50, [0.02] * 50, usage=usage, errors=["stream 1: <it> died"])
     page = write_report(tmp_path / "report.html", LoadTest([], False, [run])).read_text()
     for row in ("detector 0", "detector 1"):
         assert f'<td class="text">{row}</td>' in page
