@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 8.0
 _IDLE_SECONDS = 0.1
 _QUIET_SECONDS = 600.0  # the same reason of a loss is not logged again before
-_LONGEST_SEGMENT, _LONGEST_PLAYLIST = 20.0, 600.0  # seconds; of a segment, HLS recommends 6
+_LONGEST_SEGMENT, _LONGEST_PLAYLIST = 20.0, 60.0  # seconds; of a segment, HLS recommends 6
 _SLOW = "check the camera; if it is slow, raise run.open_seconds or run.silent_seconds"
 _ENDED, _SILENT, _NO_FRAME = "it ended", f"nothing arrives: {_SLOW}", f"data arrives, but no picture: {_SLOW}"
 
@@ -170,7 +170,7 @@ class LiveSource(Source):
             except Exception as error:  # an unexpected error must not end the thread silently
                 problem = str(error).replace(self._text, self._address)
             if is_other and self._format is None and _is_http(self._text):
-                self._format = "mjpeg"
+                self._format, opened = "mjpeg", 0.0 if count else opened
                 continue
             if is_invalid or (self._format and not count and problem == _ENDED):  # a page, for example
                 problem = "it sends no video that can be read"

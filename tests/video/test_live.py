@@ -273,6 +273,22 @@ def test_mjpeg_is_read_whatever_its_parts_say(served, caplog, part):
     assert not caplog.records
 
 
+def test_a_text_part_is_no_loss_also_long_after_the_beginning(served, caplog):
+    def send(request):
+        request.send_response(200)
+        request.end_headers()
+        for number in range(4000):
+            part = PARTS["text parts" if number % 80 == 79 else "standard"]
+            request.wfile.write(part % {b"size": len(jpeg(number)), b"jpeg": jpeg(number)})
+            time.sleep(0.02)
+
+    with open_source(f"{served(send)}/video", open_seconds=1) as source:
+        for _ in range(100):
+            next(source)
+        assert source.reopened == 0
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
 def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix):
     fetched = []
