@@ -108,7 +108,8 @@ class StreamSpec:
         check_fleet_name(name, "stream")
         with _errors_in(f"the stream {name}"):
             if not isinstance(table, Mapping):
-                raise FleetError(f"expected a table with a source, got {type(table).__name__}: write [streams.{name}]")
+                got = table if isinstance(table, int) else type(table).__name__  # a text may contain a password
+                raise FleetError(f"expected a table with a source, got {got}: write [streams.{name}]")
             values: dict[str, Any] = {"source": ""} | _checked(table, _STREAM)
             for one, several in (("box", "boxes"), ("model", "models")):
                 if one in values and several in values:
