@@ -255,7 +255,8 @@ def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]])
         try:
             checked[key] = msgspec.convert(value, kind)
         except msgspec.ValidationError:
-            shown = type(value).__name__ if key == "source" else reprlib.repr(value)  # that may contain a password
+            # A list of sources may contain a password.
+            shown = "a list" if key == "source" and isinstance(value, list) else reprlib.repr(value)
             raise FleetError(f"{key} must be {meaning}, got {shown}") from None
     return checked
 
