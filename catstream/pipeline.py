@@ -18,10 +18,10 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
 from catstream.errors import ProtocolError, ServiceError, SettingsError, without_password
-from catstream.messages.kinds import Track
+from catstream.messages.kinds import RunState, Track, run_state
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
 from catstream.run.job import Job, Models, Results, files_by_name
@@ -336,7 +336,8 @@ class Pipeline:
         """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees.
 
         And of the tracks that were received here (`rows`), and how often a process was restarted (`restarts`). If
-        frames of a file were left out, how many were `damaged`; of a live source, how many frames were `skipped`, and
+        frames of a file were left out, how many were `damaged`, and if they had
+        another size than the first one, how many were `scaled`; of a live source, how many frames were `skipped`, and
         how often it was `reopened`.
         """
         if self._supervisor is None or self._supervisor.end is None:
@@ -377,13 +378,16 @@ class Pipeline:
         return self.health.get("detector", {}).get("lost_seconds", 0.0)
 
     @property
-    def holding(self) -> str:
-        """Reason for which no frames are tracked: "paused", or "waiting" for a box; empty if they are tracked."""
-        counters = self.health.get("detector") or self._held_at_start
-        return next((name for name in ("waiting", "paused") if counters.get(name)), "")
+    def holding(self) -> RunState | Literal[""]:
+        """Reason for which no frames are tracked: the source is "lost", or the run is "waiting" for a box or "paused".
+
+        Empty if they are tracked.
+        """
+        state, _ = run_state(self.health.get("detector") or self._held_at_start)
+        return "" if state in ("running", "ended") else state
 
     @cached_property
-    def _held_at_start(self) -> dict[str, bool]:
+    def _held_at_start(self) -> dict[str, float]:
         """The reasons for which the run starts without tracking; those of a resumed run are in its folder."""
         waiting, paused = not self._job.boxes and not self._job.models, self._job.paused
         if self._resumed_job is not None and self._state is not None:

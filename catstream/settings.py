@@ -155,7 +155,7 @@ class BeliefSettings(_Group):
 
     weak_score: Annotated[
         float, _about("Score below which the object is lost: it is absent, and the whole frame is searched.")
-    ] = 0.3
+    ] = 0.4
     confident_score: Annotated[
         float,
         _about(
@@ -421,6 +421,7 @@ _PAPER: dict[str, Value] = {
     "teaching.colours": False,
     "teaching.other_backgrounds": 0.0,
     "teaching.mirrored": 0,
+    "belief.weak_score": 0.3,
     "belief.trusted_score": 0.0,
 }
 

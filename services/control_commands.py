@@ -62,8 +62,14 @@ def is_kept(command: Command, name: str, desired: DesiredState, detectors: Detec
     return command.keep and bool(known and known.model.version and each and each.begins <= detectors.seq)
 
 
-def _pause(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
-    return replace(desired, paused=True), answer(command, detectors, True, f"paused {_after(detectors)}")
+def _pause(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Changed:
+    """Pause until `resume`. A pause that ends by itself changes nothing that is kept, nor a pause until `resume`."""
+    desired = replace(desired, paused=desired.paused or command.seconds is None)
+    seconds = command.seconds or 0.0
+    if not desired.paused and seconds <= 0:
+        return _resume(command, desired, detectors, model)
+    limit = "" if desired.paused else f" for {seconds:g} s"
+    return desired, answer(command, detectors, True, f"paused{limit} {_after(detectors)}")
 
 
 def _resume(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from time import sleep
+from time import monotonic, sleep
 
 import cv2
 
@@ -19,7 +19,7 @@ from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError, without_password
 from catstream.features.pyramid import Pyramid
-from catstream.messages.kinds import Answer, Command, End, Features, Model, Tracks
+from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED
 from catstream.services.control_commands import STOPPED, answer, carried_out, check_room, is_kept, object_of
@@ -103,6 +103,7 @@ class DetectorLoop:
         self._arrived: dict[str, Model] = {}  # of objects that have not begun again yet
         self._begun: dict[str, Learned] = {}  # the saved models that objects begin with in the next message
         self._skipped = 0  # frames that were left out because the run was paused or waited for a box
+        self._paused_until = 0.0  # end of a pause that ends by itself, as its sender may be gone
         self._tracks = Tracks(0, 0, {})  # the last ones
         self._lost = False  # whether a message was given up, so that none may follow it
         self._kept: DesiredState | None = None  # in the file
@@ -127,7 +128,11 @@ class DetectorLoop:
     @property
     def _holds(self) -> bool:
         """Whether no frames are tracked, because the run is paused or waits for a box."""
-        return self.desired.holds and not self._is_repeating
+        return (self.desired.holds or self._is_paused) and not self._is_repeating
+
+    @property
+    def _is_paused(self) -> bool:
+        return self.desired.paused or monotonic() < self._paused_until
 
     def turn(self) -> None:
         """Process acknowledgements, models and commands, serve late joiners, and publish the health."""
@@ -208,7 +213,9 @@ class DetectorLoop:
         """
         given = self._begin_boxes(frame)
         if self._holds and not given:
-            self._show(self.detectors.seq, frame)  # the other objects, while a box is drawn
+            # The other objects, while a box is drawn. A live source goes on: where they are by now is not known.
+            live = self._source is not None and self._source.live
+            self._show(self.detectors.seq, frame, {} if live else self._tracks.tracks)
         while self._holds and not given and not self.end_reason and self._source is not None and not self._source.live:
             sleep(TURN_SECONDS)
             self.turn()
@@ -243,7 +250,7 @@ class DetectorLoop:
         tracks = replace(tracks, tracks={name: replace(each, pts=frame.pts) for name, each in tracks.tracks.items()})
         models = {name: replace(features.objects[name], model=each.to_bytes()) for name, each in self._begun.items()}
         self._tracks, self._begun = tracks, {}
-        self._show(tracks.frame, frame)
+        self._show(tracks.frame, frame, tracks.tracks)
         return tracks, replace(features, objects=features.objects | models)
 
     def send(self, tracks: Tracks, features: Features) -> None:
@@ -286,10 +293,10 @@ class DetectorLoop:
                 self._receive_models(TURN_SECONDS)
             self.turn()
 
-    def _show(self, number: int, frame: Frame) -> None:
-        """Show a frame with the last boxes of the objects, if somebody looks."""
-        tracks = self._tracks.tracks.items()
-        boxes = {name: each.box for name, each in tracks if each.box is not None and name in self.desired.objects}
+    def _show(self, number: int, frame: Frame, tracks: Mapping[str, Track]) -> None:
+        """Show a frame with the boxes of the objects that are tracked, if somebody looks."""
+        present = ((name, each.box) for name, each in tracks.items() if name in self.desired.objects)
+        boxes = {name: box for name, box in present if box is not None}
         self._outputs.previews.show(number, frame.image, boxes)
 
     # Commands
@@ -315,6 +322,8 @@ class DetectorLoop:
             return self._rejected(command, str(error))
         for name in self.detectors.detectors.keys() - self.desired.objects.keys():
             self.detectors.forget(name)
+        if command.verb == "resume" or (command.verb == "pause" and command.seconds is not None):
+            self._paused_until = monotonic() + (command.seconds or 0.0)
         self._ending = STOPPED if self.desired.stopped else self._ending
         return answered
 
@@ -425,8 +434,9 @@ class DetectorLoop:
             "stored": window.stored,
             "model_version": max((each.model_version for each in self._tracks.tracks.values()), default=0),
             "objects": len(self.desired.objects),
-            "paused": float(self.desired.paused),
+            "paused": float(self._is_paused),
             "waiting": float(not self.desired.objects),
+            "ended": float(self._process.has_ended),
         }
         return own | self._source_counters()
 
@@ -438,11 +448,13 @@ class DetectorLoop:
         return counters
 
     def _object_counters(self) -> dict[str, dict[str, float]]:
-        return {
-            name: {"model_version": each.model_version, "score": each.score, "present": float(each.box is not None)}
-            for name, each in self._tracks.tracks.items()
-            if name in self.desired.objects
-        }
+        """The counters of each object. While no frames are tracked, nothing is known of where it is."""
+        known = {name: each for name, each in self._tracks.tracks.items() if name in self.desired.objects}
+        found = {name: {"model_version": float(each.model_version)} for name, each in known.items()}
+        if run_state(self._counters())[0] == "running":
+            for name, each in known.items():
+                found[name] |= {"score": each.score, "present": float(each.box is not None)}
+        return found
 
 
 def _desired(process: Process, models: ModelFiles) -> DesiredState:

@@ -15,7 +15,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.errors import CatstreamError, StreamRewoundError
-from catstream.messages.kinds import Health
+from catstream.messages.kinds import Health, run_state
 from catstream.run.job import Job
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
@@ -145,7 +145,8 @@ class Process:
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own = counters() | rejects()
-            self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects()))
+            state = run_state(own)[0] if self.name == "detector" else None
+            self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects(), state))
         else:
             self._health.serve_late_joiners()
 

@@ -54,10 +54,10 @@ def pytest_xdist_auto_num_workers():
 
 @pytest.fixture(scope="session", autouse=True)
 def own_places(tmp_path_factory):
-    """A runtime folder and a folder of temporary files of our own: no other pipeline of this user is found there."""
+    """Folders of our own for what runs, is temporary, or is kept: no other pipeline of this user is found there."""
     tmp_path_factory.getbasetemp()  # stays after the tests, to be looked at
     with tempfile.TemporaryDirectory(prefix="cs-") as folder, pytest.MonkeyPatch.context() as patch:
-        for name, variable in (("run", "XDG_RUNTIME_DIR"), ("tmp", "TMPDIR")):
+        for name, variable in (("run", "XDG_RUNTIME_DIR"), ("tmp", "TMPDIR"), ("state", "XDG_STATE_HOME")):
             (Path(folder) / name).mkdir(mode=0o700)
             patch.setenv(variable, str(Path(folder) / name))
         patch.setattr(tempfile, "tempdir", None)  # it is read from TMPDIR again

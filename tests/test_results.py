@@ -35,6 +35,10 @@ def test_a_page_is_the_one_that_the_records_give(one):
     assert shown.count("\n") <= 200
 
 
+def test_the_tables_of_the_results_name_their_measure_and_number_of_runs():
+    assert all(part.measure for section in page.PAGES[0].sections for part in section.parts)
+
+
 @pytest.mark.parametrize("path", page.MARKED, ids=lambda path: path.name)
 def test_a_page_with_marks_has_the_figures_of_the_records(path):
     shown = path.read_text(encoding="utf-8")

@@ -14,6 +14,8 @@ from accuracy import MEANS, accuracy_command, described, means, spread, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark
 
+from catstream.applications.evaluation.accuracy import rows_of
+from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.compression.node import sample
 from catstream.compression.tree import CoresetTree
 from catstream.messages.kinds import Summary
@@ -21,6 +23,8 @@ from catstream.settings import PRESETS, Settings
 
 #: Training set -> success and precision in the paper.
 PAPER = {"root": (0.398, 0.434), "hierarchy": (0.524, 0.677)}
+
+ENDS = ("worst", "its success", "best", "its success")
 
 
 class RootTree(CoresetTree):
@@ -39,9 +43,18 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
             recipes[f"paper's way, {source}"] = Recipe(Settings.from_values(PRESETS["one-class-paper"]), tree)
         recipes[f"our settings, {source}"] = Recipe(Settings(), tree)
     runs = follow_all(options, videos(options), recipes)
-    rows = [(name, *means(found), spread(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()]
-    columns = ("learned from", *MEANS, "spread of AUC", "paper: success", "paper: precision")
+    rows = [
+        (name, *means(found), spread(found), *ends(found), *PAPER[name.split(", ")[1]]) for name, found in runs.items()
+    ]
+    columns = ("learned from", *MEANS, "spread of AUC", *ENDS, "paper: success", "paper: precision")
     yield Table("Root or hierarchy", columns, rows, f"{described(options)} of each sequence")
+
+
+def ends(runs: list[EvaluationRun]) -> Iterator[str | float]:
+    """Yield the names and the success of the worst and of the best sequence."""
+    ranked = sorted(rows_of(runs), key=lambda row: row.success)
+    for row in (ranked[0], ranked[-1]):
+        yield from (row.name, row.success)
 
 
 if __name__ == "__main__":

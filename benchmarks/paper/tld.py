@@ -21,6 +21,9 @@ from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.applications.evaluation.scores import score
 from catstream.settings import PRESETS, Settings
 
+#: Our settings, and presets.
+TRACKERS = ("defaults", "cat25", "cat10")
+
 #: Tracker -> success in the paper: mean of ten videos, and Panda.
 PAPER = {
     "cat25": (0.66, 0.58),
@@ -33,7 +36,7 @@ PAPER = {
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    variants = {"defaults": Settings(), **{name: Settings.from_values(PRESETS[name]) for name in ("cat25", "cat10")}}
+    variants = {name: Settings.from_values(PRESETS.get(name, {})) for name in options.trackers}
     found = videos(options, "TLD_")
     rows = []
     parts: list[tuple[str | float, ...]] = []
@@ -46,7 +49,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     rows += [(name, *nothing, *printed) for name, printed in PAPER.items() if name not in variants]
     names = [video.name.removeprefix("TLD_") for video in found]
     yield Table("Success on TLD", ("tracker", "mean", *names, "paper: mean of ten", "paper: Panda"), rows)
-    yield Table("Success by part of the video", ("tracker", "followed by", "mean", *names), parts)
+    if parts:
+        yield Table("Success by part of the video", ("tracker", "followed by", "mean", *names), parts)
 
 
 def by_part(tracker: str, runs: list[EvaluationRun], settings: Settings) -> Iterator[tuple[str | float, ...]]:
@@ -64,4 +68,6 @@ def by_part(tracker: str, runs: list[EvaluationRun], settings: Settings) -> Iter
 
 
 if __name__ == "__main__":
-    benchmark(figures, accuracy_command(__doc__))
+    parser = accuracy_command(__doc__)
+    parser.add_argument("--trackers", nargs="+", choices=TRACKERS, default=TRACKERS, help="default: all")
+    benchmark(figures, parser)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import wraps
@@ -23,7 +24,7 @@ from catstream.client.control import Control, control
 from catstream.client.registry import address_of, locate
 from catstream.client.subscription import Subscription, subscribe, wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Health
+from catstream.messages.kinds import Health, run_state
 from catstream.messages.names import UNNAMED, check_name, counted, split_name
 from catstream.run.job import Job
 from catstream.run.state import learned
@@ -39,6 +40,7 @@ from catstream.services.options import (
 from catstream.wire.channels import CHANNELS, PUBLIC
 from catstream.wire.endpoint import Endpoint
 
+_SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
 _PROCESSES = CHANNELS["health"].senders
 
 
@@ -120,7 +122,7 @@ def watch(
     with Subscription[Any](endpoint, channel, object=name, keys=keys) as messages:
         with suppress(KeyboardInterrupt):
             wait_for_pipeline(messages.endpoint, messages.keys, wait)
-            for message in messages:
+            for message in saying_why_silent(messages):
                 fields = msgspec.to_builtins(message, builtin_types=(bytes,), enc_hook=_described)
                 click.echo(json.dumps(fields, default=_described) if as_json else _line(fields))
                 seen += 1
@@ -128,6 +130,21 @@ def watch(
                     break
         reason = f": {messages.end.reason}" if messages.end is not None else ""
         click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
+
+
+def saying_why_silent(messages: Subscription[Any]) -> Iterator[Any]:
+    """Each message; the reason why none arrives is printed once, until there is another reason or a message."""
+    messages.timeout, said = _SILENT_SECONDS, ""
+    while True:
+        try:
+            for message in messages:
+                said = ""
+                yield message
+            return
+        except SilenceError as error:
+            before, said = said, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
+            if said != before:
+                click.echo(f"waiting: {error}", err=True)
 
 
 def _described(value: bytes | np.ndarray) -> dict[str, object]:
@@ -159,8 +176,9 @@ def _line(value: Any) -> str:
 def status(endpoint: str, keys: str, as_json: bool, wait: float) -> None:
     """Show the state of a running pipeline.
 
-    The exit code is 0 if all three processes sent a health report, else 1, so
-    that it can be the health check of a container.
+    The state is running, waiting (for a box), paused, or lost (the source). The
+    exit code is 0 if all three processes sent a health report, in each of these
+    states, else 1, so that it can be the health check of a container.
 
     "learning" are the messages that the compressor has not received, or not
     stored; "rejected" those that do not conform to the protocol; "reports" the
@@ -211,7 +229,6 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
     detector, history = counters["detector"], reports.get("detector", [])
     seconds = history[-1].time - history[0].time if history else 0.0
     rate = (history[-1].counters["sent"] - history[0].counters["sent"]) / seconds if seconds > 0 else None
-    state = "waiting for a box" if detector.get("waiting") else "paused" if detector.get("paused") else "tracking"
 
     def whole(process: str, *names: str) -> dict[str, int | None]:
         own = counters[process]
@@ -220,11 +237,11 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
     return {
         "endpoint": place,
         "ok": len(reports) == len(_PROCESSES),
-        "state": state if detector else None,
+        "state": newest["detector"].state if detector else None,
         "objects": {
             name: {
-                "state": "present" if each["present"] else "absent",
-                "score": round(each["score"], 2),
+                "state": ("present" if each["present"] else "absent") if "present" in each else None,
+                "score": round(each["score"], 2) if "score" in each else None,
                 "model_version": int(each["model_version"]),
                 "leaves": int(objects["compressor"][name]["leaves"]) if name in objects["compressor"] else None,
             }
@@ -252,7 +269,7 @@ def _format(summary: dict[str, Any]) -> str:
     size = (summary["bytes"] or 0) / 1e6
     lines = {
         "pipeline": at["endpoint"],
-        "state": at["state"],
+        "state": run_state(summary["processes"]["detector"]["counters"])[1] if summary["state"] else "-",
         "frames": f"{at['frames']}, {at['frames_per_second']} a second",
         "learning": f"{at['lag']} messages behind, {at['not_stored']} not stored",
         "model": at["model_version"],
@@ -260,8 +277,7 @@ def _format(summary: dict[str, Any]) -> str:
     if summary["bytes"] is not None:  # None before the first box
         lines["trees"] = f"{at['leaves']} leaves, {at['nodes']} nodes, level {at['level']}, {size:.1f} MB"
     if summary["skipped"] is not None:  # None for a file
-        lost = f"lost for {summary['lost_seconds']:.0f} s" if summary["lost_seconds"] else "available"
-        lines["source"] = f"{lost}, {counted(summary['skipped'], 'frame')} skipped"
+        lines["source"] = f"{counted(summary['skipped'], 'frame')} skipped"
         if summary["reopened"] is not None:  # a demo is never lost
             lines["source"] += f", reopened {counted(summary['reopened'], 'time')}"
     lines["rejected"] = counted(sum(summary["rejected"].values()), "message")

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 UP_SECONDS = 120.0  # limit for the streams to start, after which `up` waits no longer
 _SHOW_SECONDS = 0.5  # between two pictures of the status
-_STARTED = ("running", "waiting", "paused", "ended", "failed")
+_STARTED = ("running", "lost", "waiting", "paused", "ended", "failed")
 
 
 @click.group()

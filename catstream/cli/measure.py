@@ -83,6 +83,8 @@ def evaluate(
       precision  share of frames whose centre is at most 20 pixels off
       norm.      normalised precision: the same, relative to the size of the object
       F          F-score of VOT-LT, if the object is absent in some frames
+      noticed    frames without the object in which no box is reported
+      false      frames with the object in which no box is reported
 
     --starts, --shifts and --jitter make several runs of each sequence; mean and
     standard deviation are printed. With --output, results are stored in the
@@ -105,10 +107,10 @@ def evaluate(
     if attributes is not None and output is None and json_file is None:
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
-    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path)]
+    errors: list[CatstreamError] = []
+    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path, errors.append)]
     seen = {} if attributes is None else datasets.read_attributes(attributes)
 
-    errors: list[CatstreamError] = []
     try:
         columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
         with line_of(messages(), *columns) as progress:
@@ -140,7 +142,7 @@ def evaluate(
         shared = datasets.with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
         write_json(json_file, accuracy.to_json(rows, settings, shared))
         if output is not None:
-            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared)}")
+            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared, errors)}")
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
@@ -149,9 +151,9 @@ def evaluate(
 
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
     """Return a table of the sequences and the means."""
-    from catstream.applications.evaluation.accuracy import MEASURES, cells
+    from catstream.applications.evaluation.accuracy import HEADINGS, cells
 
-    numbers = ("frames", *MEASURES.values())
+    numbers = ("frames", *HEADINGS)
     made = table("sequence", "tracker", *numbers, right=numbers)
     for row in rows:
         made.add_row(row.name, row.tracker, str(row.frames), *cells(row))
@@ -221,9 +223,8 @@ def loadtest(
       catstream loadtest --find-limit --size 320x240
     """
     # Imported here so that --help and the other commands start faster.
-    from catstream.applications.loadtest.latency import percentiles
     from catstream.applications.loadtest.load_report import milliseconds, to_json, write_report
-    from catstream.applications.loadtest.load_test import Limit, Plan, run_load_test, violations
+    from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
 
     asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
     parameters = Plan(**plan)
@@ -242,8 +243,8 @@ def loadtest(
             if find_limit:
                 verdict = "; ".join(violations(asked, result)) or "met"
                 click.echo(
-                    f"{result.plan.rate:g} frames/s due, {result.followed:.1f} tracked, "
-                    f"p99 {milliseconds(percentiles(result.track)['p99'])} ms: {verdict}"
+                    f"{result.plan.rate:g} frames/s due; in the worst stream {result.followed:.1f} tracked, "
+                    f"p99 {milliseconds(KINDS['p99'].measure(result))} ms: {verdict}"
                 )
 
         load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
@@ -337,8 +338,8 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
     tracked = [frame.tracks[0].box for frame, _ in read_frames(tracks / "demo.ndjson")]
     found = np.array([box or (np.nan,) * 4 for box in tracked])
-    absent, nothing = np.isnan(truth).any(axis=1), np.isnan(found).any(axis=1)
-    click.echo(f"success rate: {score(found, truth).success:.3f} (overlap with the ground truth above 0.5)")
-    if absent.any():
-        click.echo(f"absence reported: {(absent & nothing).sum()} of {absent.sum()} frames")
+    result = score(found, truth)
+    click.echo(f"success rate: {result.success:.3f} (overlap with the ground truth above 0.5)")
+    if result.absence.absent:
+        click.echo(f"absence reported: {result.absence.noticed} of {result.absence.absent} frames")
     click.echo(f"annotated video: {tracks / 'demo.mp4'}")

@@ -273,7 +273,7 @@ class _Run:
             page = "the page" if self.view is not None else f"the page of catstream view {place}"
             ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
             console.print(f"waiting for a box: {ways}")
-        elif pipeline.holding:
+        elif pipeline.holding == "paused":
             console.print(f"paused: to continue, catstream resume {place}")
 
     def _write_tracks(
@@ -383,6 +383,8 @@ class RunProgress:
             lines.append(f"live: {skipped} skipped, lost and opened again {again}")
         if damaged := self._detector("damaged"):
             lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
+        if scaled := self._detector("scaled"):
+            lines.append(f"scaled: {counted(scaled, 'frame')} had another size than the first one")
         if totals := self._pipeline.totals:
             sent = counted(totals["sent"], "message")
             lines.append(f"features: {sent} sent, {totals['stored']} stored in the coreset trees")

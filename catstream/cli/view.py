@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import secrets
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from catstream.cli.attach import with_endpoint, with_fleet_address
+from catstream.messages.storage import write_atomically
 from catstream.services.options import Decorator, combined, with_keys
 
 if TYPE_CHECKING:
@@ -46,18 +49,33 @@ class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since c
 _OPEN = "none"
 
 
+def _token_of_user() -> str:
+    """The token of this user, which is made once, so that links stay valid; a new one if it cannot be kept."""
+    token = secrets.token_hex(16)
+    try:
+        home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+        file = home / "catstream" / "view-token"
+        if file.exists() and file.stat().st_uid == os.geteuid() and not file.stat().st_mode & 0o077:
+            return file.read_text(encoding="ascii").strip()
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_atomically(file, f"{token}\n".encode(), mode=0o600)
+    except (OSError, RuntimeError, ValueError):  # no home, or one that cannot be written to; not what is written here
+        pass
+    return token
+
+
 def with_token(prefix: str = "") -> Decorator:
-    """Add --PREFIXtoken; the argument `token` is a new random one if none is given, and None for "none"."""
+    """Add --PREFIXtoken; the argument `token` is that of the user if none is given, and None for "none"."""
     return combined(
         "token",
-        lambda token: None if token == _OPEN else token or secrets.token_hex(16),
+        lambda token: None if token == _OPEN else token or _token_of_user(),
         click.option(
             f"--{prefix}token",
             "token",
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
-            help="Token for access to the page, at least 16 characters; by default a random one. "
+            help="Token for access to the page, at least 16 characters; by default a random one for each user. "
             '"none" lets every user of this machine watch and control.',
         ),
     )
@@ -85,9 +103,10 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
     next one. Ctrl-C ends the server; the pipeline continues.
 
     Only users with the token can watch and control: open the printed link,
-    which ends with it. Each start makes a new token; give one of your own to
-    keep it, for example for Prometheus. The connection is not encrypted: from
-    other machines, use an ssh tunnel, or a proxy with TLS.
+    which ends with it. It is made once, and kept in the file
+    ~/.local/state/catstream/view-token; remove that for another one. The
+    connection is not encrypted: from other machines, use an ssh tunnel, or a
+    proxy with TLS.
 
     \b
     EXAMPLES

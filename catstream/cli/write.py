@@ -11,7 +11,7 @@ from typing import Any
 import click
 from rich.console import Console
 
-from catstream.cli.attach import wait_for_pipeline, with_endpoint, with_wait
+from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
@@ -73,7 +73,7 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in tracks:
+            for track in saying_why_silent(tracks):
                 run = run or tracks.run
                 if tracks.run != run and not tracks.endpoint.startswith("fleet://"):  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"

@@ -105,9 +105,13 @@ class Control:
         """
         return self.execute("forget", object)
 
-    def pause(self) -> Answer:
-        """Stop processing frames; the frames of a live source are counted as skipped."""
-        return self.execute("pause")
+    def pause(self, seconds: float | None = None) -> Answer:
+        """Stop processing frames; the frames of a live source are counted as skipped.
+
+        The pause lasts until `resume`. With `seconds`, it ends by itself so long after the last such command: a program
+        that repeats it and then dies leaves nothing paused. 0 seconds end a pause of this kind, and no other.
+        """
+        return self.execute("pause", seconds=seconds)
 
     def resume(self) -> Answer:
         """Continue processing frames."""
@@ -138,9 +142,10 @@ class Control:
         box: Box | None = None,
         keep: bool = False,
         model: bytes | None = None,
+        seconds: float | None = None,
     ) -> Answer:
         """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol."""
-        command = Command(uuid4().hex, verb, box, keep, check_name(object), model)
+        command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds)
         self._follow()
         first = min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
         answer = self._commands.ask(command, first)

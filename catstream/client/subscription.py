@@ -25,14 +25,15 @@ import zmq.asyncio
 
 from catstream.client.registry import FollowedStream, described, follow
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import End, Features, Health, Track
+from catstream.messages.kinds import End, Features, Health, Track, run_state
 from catstream.messages.names import check_name
-from catstream.wire.channels import PUBLIC, TRACKS
+from catstream.wire.channels import HEALTH, PUBLIC, TRACKS
 from catstream.wire.endpoint import Endpoint, Place, find
 from catstream.wire.newest import GapCounter, Subscriber
 
 REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a running pipeline sends one every second
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
+REASON_SECONDS = 2.0  #: before the end of a time-out, in which a health report says why nothing arrives
 DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
 
 Message = TypeVar("Message")
@@ -57,7 +58,9 @@ class Subscription(Generic[Message]):
     endpoint, keys : str
         Endpoint of the pipeline, or the address of the stream; folder of the client keys, empty if there are none.
     timeout : float or None
-        Seconds without a message after which iteration raises `SilenceError`; it may continue afterwards.
+        Seconds without a message after which iteration raises `SilenceError`; it may continue afterwards. With a
+        time-out of two seconds or more, the error says whether the run is paused, waits for a box or has lost its
+        source.
     place : Endpoint or None
         Endpoint of the connected pipeline; None if the stream of a fleet has not run yet.
 
@@ -92,6 +95,7 @@ class Subscription(Generic[Message]):
         # The end has a socket of its own: if this subscriber is slow, it could be among the messages that are dropped.
         self._messages: Subscriber[Any] | None = None
         self._ends: Subscriber[Any] | None = None
+        self._reports: Subscriber[Health] | None = None  # at the end of a silence
         self._has_run = False  # whether the pipeline was there before
         self._over = self._closed = False
         self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
@@ -187,12 +191,16 @@ class Subscription(Generic[Message]):
                 raise ServiceError("the subscription was closed, perhaps by another thread or task: make another one")
             if (message := self._receive()) is not None:
                 self._has_run = True
+                self._close_reports()
                 return message
             if self.end is None:
                 self._look_for_pipeline()
+            if self.end is None:
+                self._open_reports(deadline)
             if self.end is None and monotonic() >= deadline:
-                why = "is a pipeline running there?" if self._stream is None else described(self._stream.status)
-                raise SilenceError(f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {why}")
+                raise SilenceError(
+                    f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {self._why_silent()}"
+                )
             self._over = self.end is not None and monotonic() >= self._close_time
             # One object may have been forgotten before; the end of a fleet's stream may have no number.
             if self._over and self.end and self.end.seq and self._channel.keeps == "every" and self._about is None:
@@ -214,6 +222,26 @@ class Subscription(Generic[Message]):
         if self._ends is not None and self.end is None and (end := self._ends.receive(0)) is not None:
             self._pipeline_ended(end, DRAIN_SECONDS)
         return None
+
+    def _open_reports(self, deadline: float) -> None:
+        """Shortly before a deadline, subscribe to the health of the pipeline, whose last report arrives at once."""
+        has_time = self.timeout is not None and self.timeout >= REASON_SECONDS > deadline - monotonic()
+        if has_time and self._reports is None and self.place is not None and self._channel is not HEALTH:
+            self._reports = Subscriber(HEALTH, self.place)
+
+    def _close_reports(self) -> None:
+        if self._reports is not None:
+            self._reports.close()
+        self._reports = None
+
+    def _why_silent(self) -> str:
+        """The reason why no message arrives, as far as it is known."""
+        if self._stream is not None:
+            return described(self._stream.status)
+        reports = self._reports.receive_all() if self._reports is not None else []
+        states = [run_state(report.counters)[1] for report in reports if report.process == "detector"]
+        self._close_reports()  # the next ones would wait behind these
+        return f"the state of the pipeline is: {states[-1]}" if states else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
         """End after so many seconds; a stream of a fleet may continue with another pipeline."""
@@ -257,6 +285,7 @@ class Subscription(Generic[Message]):
             self._ends.close()
             self._rejected += self._messages.rejected
         self._messages = self._ends = None
+        self._close_reports()
 
 
 def subscribe(

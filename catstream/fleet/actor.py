@@ -51,9 +51,6 @@ _TRACKS_SECONDS = 0.1  # longest wait for a frame
 _STORING_SHARE = 0.1  # of the time, at most, in which states are stored
 _LATE = 3.0  # a state that is older than so many intervals is a trouble
 
-#: What a pipeline reports if no frames are tracked, as the state of a stream.
-_HOLDING: dict[str, StreamState] = {"waiting": "waiting", "paused": "paused"}
-
 _log = logging.getLogger(__name__)
 
 
@@ -259,7 +256,7 @@ class Stream:
                 self._present = {name for name, track in tracks.items() if track.box is not None}
                 models = {name: track.model_version for name, track in tracks.items()}
                 status = replace(status, frame=next(iter(tracks.values())).frame, models=models)
-            state = _HOLDING.get(pipeline.holding, "running" if self._has_tracked else "starting")
+            state: StreamState = pipeline.holding or ("running" if self._has_tracked else "starting")
             skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
             self._status = replace(status, state=state, skipped=skipped)
             self._pipeline_trouble = "; ".join(troubles)

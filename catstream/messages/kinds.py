@@ -12,7 +12,7 @@ The objects of a stream have names (`catstream.messages.names`); an object that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self
 
@@ -50,8 +50,11 @@ LARGEST_GIVEN_MODEL = 63 << 20
 #: Bytes at most of all saved models that objects begin with in one frame: one message contains them.
 LARGEST_GIVEN_MODELS = 200 << 20
 
-#: The state of a stream of a fleet: "waiting" is for a box.
-StreamState = Literal["starting", "running", "waiting", "paused", "moving", "stopping", "failed", "ended"]
+#: The state of a run, see `run_state`: "lost" is its source, "waiting" is for a box.
+RunState = Literal["running", "lost", "waiting", "paused", "ended"]
+
+#: The state of a stream of a fleet: that of its run, or why it has none.
+StreamState = Literal["starting", "running", "lost", "waiting", "paused", "moving", "stopping", "failed", "ended"]
 
 NodeState = Literal["alive", "draining", "dead"]
 
@@ -381,7 +384,9 @@ class Health:
     counters  counters of the process, by name
     trouble   description of a problem of the process, empty if there is none
     source    the video source without user and password; empty except for the detector
-    objects   counters of each object, by name
+    objects   counters of each object, by name; `score` and `present` only while frames are tracked
+    state     of the detector: "running" while frames are tracked. Otherwise the source is "lost", or the run is
+              "waiting" for a box, "paused" or "ended"; None for the other processes
     """
 
     process: Text
@@ -390,6 +395,27 @@ class Health:
     trouble: Text = ""
     source: Text = ""
     objects: ByObject[ByText[Number]] = field(default_factory=dict)
+    state: RunState | None = None
+
+
+def run_state(counters: Mapping[str, float]) -> tuple[RunState, str]:
+    """The state of a run by the counters of its detector: the name of the first that holds, and all in words.
+
+    Whatever shows whether a run tracks, and if not, why, takes it from here.
+
+    >>> run_state({"lost_seconds": 12.3, "paused": 1.0})
+    ('lost', 'source lost for 12 s, paused')
+    """
+    if counters.get("ended"):
+        return "ended", "ended"
+    holding: dict[RunState, str] = {}
+    if lost := counters.get("lost_seconds"):
+        holding["lost"] = f"source lost for {lost:.0f} s"
+    if counters.get("waiting"):
+        holding["waiting"] = "waiting for a box"
+    if counters.get("paused"):
+        holding["paused"] = "paused"
+    return next(iter(holding), "running"), ", ".join(holding.values()) or "running"
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,8 +425,8 @@ class End:
     seq     number of the last message before it, plus one
     reason  description of why the stream ended
     failed  whether it ended because of an error
-    totals  final counters, by name: `sent` and `stored` features messages, `damaged` and `skipped` frames, and how
-            often a live source was `reopened`
+    totals  final counters, by name: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
+            and how often a live source was `reopened`
     """
 
     seq: Integer
@@ -413,13 +439,15 @@ class End:
 class Command:
     """A control command to a running pipeline, anyone -> detector.
 
-    id      unique for each command: a command that is received twice is executed once and answered twice
-    verb    the action
-    box     for "set-box" only: box of the object in the next frame that is tracked; during a pause of a file, in the
-            frame that is held
-    keep    for "set-box": whether it is the same object, so that everything learned about it is kept
-    object  for "set-box", "search", "forget" and "save": name of the object
-    model   for "search" only: the saved model of the object, which is searched for from the next frame on
+    id       unique for each command: a command that is received twice is executed once and answered twice
+    verb     the action
+    box      for "set-box" only: box of the object in the next frame that is tracked; during a pause of a file, in the
+             frame that is held
+    keep     for "set-box": whether it is the same object, so that everything learned about it is kept
+    object   for "set-box", "search", "forget" and "save": name of the object
+    model    for "search" only: the saved model of the object, which is searched for from the next frame on
+    seconds  for "pause" only: time after which the pause ends by itself, unless the command is repeated; 0 ends it now.
+             A pause without it lasts until "resume"
     """
 
     id: Text
@@ -428,6 +456,7 @@ class Command:
     keep: bool = False
     object: ObjectName = ""
     model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] | None = None
+    seconds: Number | None = None
 
     def __post_init__(self) -> None:
         for name, verb in (("box", "set-box"), ("model", "search")):

@@ -105,7 +105,7 @@ def read_ahead(source: Source) -> Generator[Frame]:
 
 
 class UprightConverter:
-    """Converts frames that PyAV decoded to BGR arrays, and applies the rotation that phones store as metadata.
+    """Converts frames that PyAV decoded to BGR arrays, and turns and mirrors them as their metadata say.
 
     Create one for each source: setting up the conversion costs more than the conversion of a frame.
     """
@@ -117,7 +117,21 @@ class UprightConverter:
 
     def __call__(self, frame: VideoFrame) -> np.ndarray:
         image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
-        return np.ascontiguousarray(np.rot90(image, frame.rotation // 90))
+        matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+        if matrix is not None:
+            image = _displayed(image, np.frombuffer(matrix, np.int32).reshape(3, 3)[:2, :2])
+        return np.ascontiguousarray(image)
+
+
+def _displayed(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Turn and mirror an image by a display matrix, whose rows are the directions on the screen of the image's axes.
+
+    An angle between the multiples of 90 degrees is that of the nearest one; without directions, nothing is changed.
+    """
+    (right, _), (_, down) = matrix
+    if abs(right) < abs(matrix[0, 1]):
+        image, down, right = image.swapaxes(0, 1), matrix[0, 1], matrix[1, 0]
+    return image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
 
 
 def video_stream(container: InputContainer) -> Any:

@@ -7,6 +7,7 @@
 The text is one of these:
 
     a video file        any format that FFmpeg reads; every frame is read once, in order
+    an image file       its pages
     a folder            its images in natural order (2.png before 10.png), or those of its `img`, `color` or `rgb`
                         folder, or its only video; sequence folders of the public benchmarks open unchanged
     a pattern           images/%05d.png or images/*.png
@@ -41,6 +42,8 @@ import numpy as np
 from catstream.errors import VideoError, without_password
 from catstream.settings import RunSettings
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, video_stream
+from catstream.video.images import EXPECTED, IMAGES, ImageReader, first_pages, image_files, pages_of, visible
+from catstream.video.times import FrameClock
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame
@@ -48,15 +51,15 @@ if TYPE_CHECKING:
 #: All frames of a source.
 ALL_FRAMES = slice(None)
 
-#: Suffixes of the files in a folder that are read as images, and as videos. A file that is named may have any.
-_IMAGES = "avif bmp jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
+#: Suffixes of the files in a folder that are read as videos. A file that is named may have any that FFmpeg reads.
 _VIDEOS = (
-    "264 265 3g2 3gp asf avi divx dv f4v flv gif h264 h265 hevc m2t m2ts m2v m4v mjpeg mjpg mkv mov mp4 mpe mpeg mpg "
-    "mts mxf nut ogm ogv qt rm rmvb ts vob webm wmv wtv y4m"
+    "264 265 266 3g2 3gp amv apng asf av1 avc avi avs2 avs3 cavs dav dif divx drc dv dvd dvr-ms f4v flc fli flv gif "
+    "gxf h261 h263 h264 h265 h266 h26l hevc imx ismv ivf k3g lvf m1v m2p m2t m2ts m2v m4v mj2 mjpeg mjpg mk3d mkv mod "
+    "moflex mov mp2v mp4 mp4v mpe mpeg mpg mpv mpv2 mts mxf mxg nsv nut obu ogm ogv psp qt rcv rm rmvb roq swf tod tp "
+    "trp ts vc1 vdr viv vob vro vvc webm wm wmv wtv xesc y4m"
 )
-IMAGES, VIDEOS = ({f".{suffix}" for suffix in suffixes.split()} for suffixes in (_IMAGES, _VIDEOS))
+VIDEOS = {f".{suffix}" for suffix in _VIDEOS.split()}
 _FOLDERS = ("img", "imgs", "color", "rgb")
-_EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
 _LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|demo:.*|(?!(?i:file):)[a-zA-Z][\w+.-]+://.+", re.DOTALL)
 
 #: After so many errors of the container without a packet between them, a file is treated as ended.
@@ -74,6 +77,8 @@ class _FileSource(Source):
         wanted = range(sys.maxsize)[part]
         self._frames = reader.frames(wanted, start)
         self._first: Frame | None = next(self._frames, None)
+        if self._first is None and wanted[start:].start == 0:
+            raise VideoError(f"no frame of {name} can be decoded, as if it began after its only key frame: {EXPECTED}")
         if self._first is None:
             raise VideoError(
                 f"{name} has {reader.count() or 'no'} frames, numbered from 0, and none from frame "
@@ -90,8 +95,10 @@ class _FileSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`damaged`: number of packets, which is that of their frames, that were left out."""
-        return {"damaged": self._reader.damaged} if self._reader.damaged else {}
+        """`damaged`: number of packets, which is that of their frames, that were left out; `scaled`: frames of another
+        size than the first one, which were scaled to it."""
+        counts = {"damaged": self._reader.damaged, "scaled": self._reader.scaled}
+        return {name: count for name, count in counts.items() if count}
 
     def __next__(self) -> Frame:
         if self._first is not None:
@@ -164,32 +171,39 @@ def open_source(
     try:
         name, reader = _opened(Path(source_text(text)), settings)
     except OSError as error:
-        raise VideoError(f"cannot open {shown!r} ({error.strerror}): {_EXPECTED}") from None
+        raise VideoError(f"cannot open {shown!r} ({error.strerror}): {EXPECTED}") from None
     return _FileSource(name, reader, part, start)
 
 
 def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
     """Open a file, a folder or a pattern; return its name for results, and what reads it."""
     if path.is_dir():
-        name = path.resolve().name
+        name = _named(path)
         for folder in (*(path / inner for inner in _FOLDERS), path):
-            if folder.is_dir() and _visible(folder, IMAGES):
-                return name, _Images(image_files(folder), settings)
-        videos = _visible(path, VIDEOS)
+            if folder.is_dir() and visible(folder, IMAGES):
+                return name, _Images(first_pages(image_files(folder)), settings)
+        videos = visible(path, VIDEOS)
         if len(videos) == 1:
             return videos[0].stem, _Video(videos[0], settings)
         content = f"{len(videos)} videos" if videos else "neither images nor a video"
-        raise VideoError(f"the folder {str(path)!r} holds {content}: {_EXPECTED}")
+        raise VideoError(f"the folder {str(path)!r} holds {content}: {EXPECTED}")
     if path.is_file():
-        return path.stem, _Video(path, settings)
+        pages = pages_of(path)
+        return path.stem, _Images(pages, settings) if pages else _Video(path, settings)
     if re.search(r"%0?\d*d|[*?\[]", path.name):
-        return path.parent.resolve().name, _Images(image_files(path), settings)
+        return _named(path.parent), _Images(first_pages(image_files(path)), settings)
     if path.exists():
         raise VideoError(
             f"{str(path)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
             "write the video to a file, or serve it as a stream"
         )
-    raise VideoError(f"there is no video or folder {without_password(str(path))!r}: {_EXPECTED}")
+    raise VideoError(f"there is no video or folder {without_password(str(path))!r}: {EXPECTED}")
+
+
+def _named(folder: Path) -> str:
+    """The name of a folder of images for results; of the folder of images in a sequence, that of the sequence."""
+    folder = folder.resolve()
+    return (folder.name in _FOLDERS and folder.parent.name) or folder.name
 
 
 def source_text(source: object) -> str:
@@ -212,58 +226,37 @@ def source_text(source: object) -> str:
     return unquote(address.path)
 
 
-def image_files(path: Path) -> list[Path]:
-    """Return the image files in a folder, or those that match a pattern (%05d, *), in natural order, at least one."""
-    if path.is_dir():
-        files = _visible(path, IMAGES)
-    elif number := re.search(r"%0?(\d*)d", path.name):
-        digits = rf"\d{{{number[1]},}}" if number[1] else r"\d+"
-        name = re.escape(path.name[: number.start()]) + digits + re.escape(path.name[number.end() :])
-        files = [file for file in path.parent.glob("*") if re.fullmatch(name, file.name)]
-    else:
-        files = list(path.parent.glob(path.name))
-    files = [file for file in files if not file.name.startswith(".")]
-    if not files:
-        kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGES))
-        raise VideoError(f"there are no images at {str(path)!r}: {_EXPECTED} (images are {kinds})")
-    return sorted(files, key=natural_order)
-
-
-def _visible(folder: Path, kinds: set[str]) -> list[Path]:
-    """Return the files in a folder that have one of these suffixes and are not hidden."""
-    return [file for file in folder.iterdir() if file.suffix.lower() in kinds and not file.name.startswith(".")]
-
-
-def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which 10 comes after 2."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
 class _Images:
-    """Image files that are read as frames."""
+    """Images that are read as frames. `scaled` is the number of those that had another size than the first."""
 
     damaged, pixel_aspect = 0, Fraction(1)
 
-    def __init__(self, files: list[Path], settings: RunSettings) -> None:
-        self.files, self.settings, self.rate = files, settings, settings.image_rate
+    def __init__(self, pages: list[tuple[Path, int]], settings: RunSettings) -> None:
+        self.settings, self.rate, self.scaled = settings, settings.image_rate, 0
+        self._read_image = ImageReader(pages)
 
     def count(self) -> int:
-        return len(self.files)
+        return len(self._read_image.pages)
 
     def frames(self, wanted: range, start: int) -> Generator[Frame]:
         """Yield the frames with these numbers, from the one at index `start` on."""
-        numbers, resize = range(len(self.files))[wanted.start : wanted.stop : wanted.step], self.settings.resize
+        numbers, resize = range(self.count())[wanted.start : wanted.stop : wanted.step], self.settings.resize
         # The size is that of the first image of the run, if it is resumed too.
         shape = self._read(numbers[0]).shape if resize and start and numbers else None
         for index, number in enumerate(numbers[start:], start):
             image = self._read(number)
             shape = shape or image.shape
-            yield Frame(index, number / self.rate, _of_one_size(image, shape, resize, self.files[number], number))
+            scaled = _of_one_size(image, shape, resize, self._path(number), number)
+            self.scaled += scaled is not image
+            yield Frame(index, number / self.rate, scaled)
+
+    def _path(self, number: int) -> Path:
+        return self._read_image.pages[number][0]
 
     def _read(self, number: int) -> np.ndarray:
-        image = read_image(self.files[number])
+        image = self._read_image(number)
         if image is None:
-            name = str(self.files[number])
+            name = str(self._path(number))
             raise VideoError(f"cannot read the image {name!r} (frame {number}): replace or remove it")
         return image
 
@@ -280,85 +273,66 @@ def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: 
     )
 
 
-def read_image(path: Path) -> np.ndarray | None:
-    """Return an image as uint8 (h, w, 3), or None if it cannot be read; OpenCV's warnings are suppressed."""
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        # Not by cv2.imread, which crashes at a name that is not UTF-8, and decodes the half of a JPEG.
-        data = path.read_bytes()
-        return None if _is_cut_off(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):  # also if it is empty, or states more pixels than OpenCV reads
-        return None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
-def _is_cut_off(data: bytes) -> bool:
-    """Whether this is a JPEG in which no end of the image (FF D9) follows its first scan (FF DA)."""
-    place = 2
-    while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
-        place += 2 + int.from_bytes(data[place + 2 : place + 4])
-    return data.startswith(b"\xff\xd8\xff") and data[place : place + 1] == b"\xff" and b"\xff\xd9" not in data[place:]
-
-
 def prepare() -> None:
     """Import what reading a video needs."""
     import av.video.reformatter  # noqa: F401
 
 
 class _Video:
-    """A video file that is read once. `damaged` is the number of packets that were left out."""
+    """A video file that is read once. `damaged` is the number of packets that were left out, `scaled` that of frames
+    which had another size than the first."""
 
     def __init__(self, path: Path, settings: RunSettings) -> None:
         import av  # imported here because it takes 0.1 s and folders do not need it
 
-        self.path, self.settings, self.damaged = path, settings, 0
+        self.path, self.settings, self.damaged, self.scaled = path, settings, 0, 0
         try:
             # Text in the file, as its title, may be in any encoding.
             self.container = av.open(str(path.absolute()), metadata_errors="replace")
         except (av.FFmpegError, OSError) as error:
-            raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {_EXPECTED}") from None
+            raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {EXPECTED}") from None
         self.stream = video_stream(self.container)
         # FFmpeg opens any text file as a video of its text (format "tty").
         if self.stream is None or self.container.format.name == "tty":
             self.container.close()
-            raise VideoError(f"there is no video in {str(path)!r}: {_EXPECTED}")
+            raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
         self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
-        # A stream without a container, as raw H.264, has no time stamps, but may state its rate. An AVI has the times
-        # of decoding only, and FFmpeg gives them to pictures that are in another order.
-        has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
+        # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
+        # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
         self._is_avi = self.container.format.name == "avi"
+        self._has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
         self.pixel_aspect = self.stream.sample_aspect_ratio or Fraction(1)
-        self._clock = ("dts" if self._is_avi else "pts") if has_times else ""
-        self.rate = float((has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
+        self.rate = float((self._has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
 
     def count(self) -> int | None:
-        """Return the number of frames: the stated one, or else that of the packets."""
-        # The header of an AVI counts packets without data, which repeat the frame before, too.
-        if self.stream.frames and not self._is_avi:
-            return int(self.stream.frames)
+        """Return the number of frames: of the entries of the index that hold pictures, else that of the packets."""
         video = _Video(self.path, self.settings)
         with video.container:
+            index, stated = video.stream.index_entries, video.stream.frames
+            if 0 < stated <= len(index):
+                # Entries without data repeat the frame before; those that are discarded are before a cut.
+                return sum(entry.size > 0 and not entry.is_discard for entry in index) or None
             if self.path.stat().st_size > _MAX_COUNTED_BYTES:
-                return round((video.container.duration or 0) / 1e6 * self.rate) or None
-            return sum(1 for packet in video._packets() if not isinstance(packet, str)) - 1 or None
+                return stated or round((video.container.duration or 0) / 1e6 * self.rate) or None
+            return sum(not isinstance(packet, str) for packet in video._packets()) - 1 or None
 
     def frames(self, wanted: range, start: int) -> Generator[Frame]:
         """Yield the frames with these numbers, from the one at index `start` on."""
-        zero, time, shape, upright, rest = None, -1.0, None, UprightConverter(), wanted[start:]
+        shape, upright, rest = None, UprightConverter(), wanted[start:]
+        clock = FrameClock(self.rate, self.stream.time_base if self._has_times else None)
         with self.container:
             for number, frame in enumerate(self._decoded()):
-                ticks = getattr(frame, self._clock) if self._clock else None
-                zero = ticks if zero is None else zero
-                stated = number / self.rate if ticks is None else float((ticks - (zero or 0)) * self.stream.time_base)
-                # Where files were joined, the time stamps begin again, but time goes on.
-                time = stated if stated > time else time + 1 / self.rate
+                time = clock.time(number, None if self._is_avi else frame.pts, frame.dts)
                 if number in rest or (number in wanted and shape is None):
                     image = upright(frame)
-                    shape = shape or image.shape
-                    image = _of_one_size(image, shape, self.settings.resize, self.path, number)
+                    if shape is None:
+                        shape = image.shape
+                        if shape[0] != frame.height:  # it was turned
+                            self.pixel_aspect = 1 / self.pixel_aspect
+                    scaled = _of_one_size(image, shape, self.settings.resize, self.path, number)
+                    self.scaled += scaled is not image
                     if number in rest:
-                        yield Frame(wanted.index(number), time, image)
+                        yield Frame(wanted.index(number), time, scaled)
                 if number + 1 >= wanted.stop:  # damage after the part must not be an error
                     return
 

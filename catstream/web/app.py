@@ -4,10 +4,10 @@
 /events           updates of the page as server-sent events, at most ten per second
 /metrics          metrics for Prometheus
 /healthz          200 while this server runs
-/readyz           200 while all processes of the pipeline send health reports, or while the fleet answers
+/readyz           200 while the pipeline tracks, or the fleet answers; 503 with the reason otherwise
 /pictures/N.jpg   the picture of frame N of a pipeline
 /live.mjpeg       the newest pictures of a pipeline with their tracks drawn in, as an MJPEG stream
-/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ...} to a pipeline
+/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ..., "seconds": ...} to a pipeline
 /streams/NAME/    all of the above for the pipeline of a stream of a fleet
 """
 
@@ -110,7 +110,7 @@ class Site:
 
     async def _readyz(self, request: Request) -> Response:
         problem = self._feed_of(request).problem
-        return PlainTextResponse(f"{problem or 'ok'}\n", 503 if problem else 200)
+        return PlainTextResponse(f"{problem or 'running'}\n", 503 if problem else 200)
 
     async def _picture(self, request: Request) -> Response:
         preview = self._pipeline(request).dashboard.picture(request.path_params["frame"])
@@ -135,7 +135,8 @@ class Site:
         if command.object:
             check_name(command.object)
         try:
-            answer = await run_in_threadpool(feed.execute, command.verb, command.object, command.box, command.keep)
+            fields = command.verb, command.object, command.box, command.keep, command.seconds
+            answer = await run_in_threadpool(feed.execute, *fields)
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
             raise HTTPException(503, "the server of this page has ended\n") from None
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
@@ -198,6 +199,7 @@ class Command:
     object: str = ""
     box: Box | None = None
     keep: bool = False
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
         if (self.box is not None) != (self.verb == "set-box"):

@@ -9,7 +9,18 @@ from itertools import takewhile
 from typing import Any, Literal, TypeVar
 
 from catstream.messages.heads import TREES
-from catstream.messages.kinds import End, FleetStatus, Health, Model, NodeStatus, Preview, State, StreamStatus, Track
+from catstream.messages.kinds import (
+    End,
+    FleetStatus,
+    Health,
+    Model,
+    NodeStatus,
+    Preview,
+    State,
+    StreamStatus,
+    Track,
+    run_state,
+)
 from catstream.video.annotate import Colours
 
 Key = TypeVar("Key")
@@ -122,6 +133,7 @@ class Dashboard(Parts):
         self._arrivals: dict[int, float] = {}  # of the first track of each frame
         self._tracks: dict[int, dict[str, Track]] = {}  # by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
+        self._seq = 0  # of the newest track
 
     def attach(self, endpoint: str) -> None:
         """Expect messages from this endpoint from now on; the state is kept until the first one arrives."""
@@ -160,6 +172,25 @@ class Dashboard(Parts):
                 self.phase, self.reason = "ended", message.reason
                 self._mark_changed("status")
 
+    @property
+    def state(self) -> tuple[str, str]:
+        """The state of the pipeline, as a name and in words: that of its run while it runs, otherwise the phase."""
+        if self.phase != "running":
+            return {
+                "waiting": ("none", "no pipeline runs"),
+                "silent": ("silent", "the pipeline sends no messages"),
+                "ended": ("ended", "ended"),
+            }[self.phase]
+        counters = self.health["detector"].counters if "detector" in self.health else {"sent": 0.0}
+        if self._seq > counters.get("sent", 0.0):  # a frame was tracked since the report
+            return "running", "running"
+        return run_state(counters) if "detector" in self.health else ("starting", "starting")
+
+    @property
+    def _holds(self) -> bool:
+        """Whether no frames are tracked: where the objects are is not known."""
+        return self.state[0] in ("lost", "waiting", "paused")
+
     def rate(self, now: float) -> float:
         """Return the frames per second over the last two seconds."""
         recent = takewhile(lambda moment: now - moment <= RATE_SECONDS, reversed(self._arrivals.values()))
@@ -179,6 +210,9 @@ class Dashboard(Parts):
         return preview, [track for track in tracks if track.object in self.objects]
 
     def _add_track(self, track: Track, now: float) -> None:
+        if self._holds:
+            self._mark_changed("status")
+        self._seq = track.seq
         name, before = track.object, self.objects.get(track.object)
         if before is None or before.began not in (None, track.began):  # another object of this name begins
             self.objects[name] = ShownObject(self.colours.of(name))
@@ -208,6 +242,7 @@ class Dashboard(Parts):
         self.source = health.source or self.source
         if health.process == "detector":
             self._add_objects(health)
+            self._mark_changed("tracks")
         self._add_point(now)
         self._mark_changed("status", "trees")
 
@@ -215,7 +250,6 @@ class Dashboard(Parts):
         """Add the objects of the detector's report that have no track yet; drop those that it does not track."""
         if len(health.objects) != health.counters.get("objects"):  # it has no track of some objects yet
             return
-        before = set(self.objects)
         for name, counters in health.objects.items():
             if name not in self.objects:
                 version = int(counters.get("model_version", 0))
@@ -225,8 +259,6 @@ class Dashboard(Parts):
         for name in [name for name, each in self.objects.items() if name not in health.objects and each.seq <= sent]:
             del self.objects[name]
         self.colours.keep(self.objects)
-        if before != self.objects.keys():
-            self._mark_changed("tracks")
 
     def _add_point(self, now: float) -> None:
         if not self.objects or now - self._last_point < POINT_SECONDS:
@@ -234,23 +266,26 @@ class Dashboard(Parts):
         self._last_point = now
         objects = {
             name: (round(each.score, 3), each.model_latency, each.version, each.state != "absent")
-            for name, each in self.objects.items()
+            for name, each in ({} if self._holds else self.objects).items()
         }
         self._points.append((round(now, 3), self.rate(now), objects))
         self._mark_changed("points")
 
     def _status_part(self, _: int) -> dict[str, object]:
         counters = self.health["detector"].counters if "detector" in self.health else {}
-        return (
-            {name: getattr(self, name) for name in ("phase", "reason", "endpoint", "source")}
-            | {name: bool(counters.get(name)) for name in ("paused", "waiting")}
-            | {name: counters.get(name) for name in ("lost_seconds", "skipped")}
-        )
+        state, words = self.state
+        return {name: getattr(self, name) for name in ("phase", "reason", "endpoint", "source")} | {
+            "state": state,
+            "words": words,
+            "paused": bool(counters.get("paused")),
+            "skipped": counters.get("skipped"),
+        }
 
     def _tracks_part(self, _: int) -> dict[str, object]:
         frame, time = self._frame or (None, None)
         objects = [
-            {"name": name, "colour": each.colour, "state": each.state, "score": each.score, "version": each.version}
+            {"name": name, "colour": each.colour, "version": each.version}
+            | {"state": None if self._holds else each.state, "score": None if self._holds else each.score}
             for name, each in self.objects.items()
         ]
         return {"frame": frame, "time": time, "objects": objects}

@@ -56,7 +56,7 @@ class Feed(ABC):
     @property
     @abstractmethod
     def problem(self) -> str:
-        """What is missing until everything runs; empty if nothing is. It names no address, and no stream."""
+        """Why no frames are tracked, or the fleet is not seen; empty otherwise. It names no address, and no stream."""
 
     @abstractmethod
     def pipeline(self, stream: str) -> PipelineFeed:
@@ -127,15 +127,18 @@ class PipelineFeed(Feed):
     def problem(self) -> str:
         since, last = monotonic() - SILENCE_SECONDS, self.dashboard.last_reports
         silent = [name for name in CHANNELS["health"].senders if name not in last or last[name] < since]
-        return f"no health report from: {', '.join(silent)}" if silent else ""
+        state, words = self.dashboard.state
+        if silent and state != "ended":
+            return f"no health report from: {', '.join(silent)}"
+        return "" if state == "running" else words
 
     def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
         return self
 
-    def execute(self, verb: Verb, object: str, box: Box | None, keep: bool) -> Answer:
+    def execute(self, verb: Verb, object: str, box: Box | None, keep: bool, seconds: float | None) -> Answer:
         """Send a command to the pipeline, and wait for its answer."""
         with Control(self._place or self._endpoint, keys=self._keys) as pipeline:
-            return pipeline.execute(verb, object, box=box, keep=keep)
+            return pipeline.execute(verb, object, box=box, keep=keep, seconds=seconds)
 
     def _feed(self) -> None:
         self._place = locate(self._endpoint, self._keys)

@@ -2,6 +2,7 @@
 
 Each counter of the health reports is a metric `catstream_PROCESS_COUNTER`, with the label `object` if it is one of each
 object; it begins again at 0 with a restarted process, which `rate` and `increase` of Prometheus take into account.
+Each metric of a pipeline names its source, without user and password.
 """
 
 from __future__ import annotations
@@ -31,17 +32,23 @@ def text(feed: Feed) -> bytes:
 
 
 def _of_pipeline(feed: PipelineFeed) -> Iterator[_Sample]:
-    """The samples of a pipeline; only `up` while it does not run."""
-    running = feed.dashboard.phase == "running"
-    yield "up", running, {}
-    for process, report in feed.dashboard.health.items() if running else ():
-        yield f"{process}_age_seconds", max(0.0, time() - report.time), {}
+    """The samples of a pipeline; only `up` and `state` while it does not run."""
+    dashboard = feed.dashboard
+    running, of = dashboard.phase == "running", {"source": dashboard.source}
+    yield "up", running, of
+    yield "state", 1, of | {"state": dashboard.state[0]}
+    if running and "detector" in dashboard.health:
+        counters = dashboard.health["detector"].counters
+        yield "paused", counters.get("paused", 0.0), of
+        yield "source_lost_seconds", counters.get("lost_seconds", 0.0) if dashboard.state[0] == "lost" else 0.0, of
+    for process, report in dashboard.health.items() if running else ():
+        yield f"{process}_age_seconds", max(0.0, time() - report.time), of
         of_objects = {counter for counters in report.objects.values() for counter in counters}
         for counter in report.counters.keys() - of_objects:  # their sums are left to Prometheus
-            yield f"{process}_{counter}", report.counters[counter], {}
+            yield f"{process}_{counter}", report.counters[counter], of
         for name, counters in report.objects.items():
             for counter, value in counters.items():
-                yield f"{process}_{counter}", value, {"object": name}
+                yield f"{process}_{counter}", value, of | {"object": name}
 
 
 def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:

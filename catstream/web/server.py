@@ -23,7 +23,7 @@ from catstream.errors import ServiceError
 from catstream.web.app import Site
 
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
-_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline runs
+_PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline tracks, or why not
 
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")

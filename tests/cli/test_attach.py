@@ -10,6 +10,7 @@ import time
 import pytest
 
 from catstream.cli.attach import _format, _summary
+from catstream.client.control import control
 from catstream.features.layout import row_length
 from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline
@@ -105,6 +106,18 @@ def test_each_message_is_one_line(resting, succeed, channel, word):
     assert word in line
 
 
+def test_watch_says_why_nothing_arrives(resting, catstream):
+    with control(resting.endpoint, timeout=SECONDS) as steering:
+        steering.pause()
+        try:
+            process = catstream("watch", "tracks", "--endpoint", resting.endpoint)
+            said = process.stderr.readline()
+        finally:
+            steering.resume()
+    assert said.startswith("waiting: no tracks arrived from")
+    assert said.endswith("the state of the pipeline is: paused\n")
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_is_no_error(resting, catstream, number):
     process = catstream("watch", "health", "--endpoint", resting.endpoint)
@@ -158,11 +171,11 @@ def test_the_lines_of_status_that_depend_on_the_source_and_the_trees():
     counters = {"sent": 9.0, "taken": 9.0, "stored": 9.0, "skipped": 2.0}
     reports = {"detector": [Health("detector", 1.0, counters)], "compressor": [Health("compressor", 1.0, {"seq": 1.0})]}
     lines = _format(_summary("run", reports)).splitlines()
-    assert "source     available, 2 frames skipped" in lines, "a demo is never opened again"
+    assert "source     2 frames skipped" in lines, "a demo is never opened again"
     assert not [line for line in lines if line.startswith("trees")], "there are none before the first box"
     counters["reopened"] = counters["skipped"] = 1.0
     trees = {"leaves": 7.0, "nodes": 5.0, "level": 1.0, "bytes": 4.6e6}
     reports["compressor"] = [Health("compressor", 1.0, trees)]
     lines = _format(_summary("run", reports)).splitlines()
-    assert "source     available, 1 frame skipped, reopened 1 time" in lines
+    assert "source     1 frame skipped, reopened 1 time" in lines
     assert "trees      7 leaves, 5 nodes, level 1, 4.6 MB" in lines

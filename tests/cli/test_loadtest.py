@@ -11,7 +11,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     limits = ["--limit", "max=0", "--limit", "missed=1"]
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
     assert code == 1
-    broken = r"catstream: broken: max is .*, limit at most 0 \(seconds from a frame to its track\)"
+    broken = r"catstream: broken: max is .*, limit at most 0 ms \(from a frame to its track\)"
     assert re.fullmatch(broken, errors.splitlines()[-1])
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
     assert "met: missed" in output

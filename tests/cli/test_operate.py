@@ -66,7 +66,7 @@ def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, stee
     source, box = video
     run = catstream("track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={tmp_path / 'run'}")
     assert steer("pause") == (0, "paused before the first frame")
-    assert status()["state"] == "waiting for a box"
+    assert status()["state"] == "waiting"
     assert steer("set-box", "400,10,20,20")[0] == 1
     code, answer = steer("set-box", box)
     assert (code, answer) == (0, f"the object begins at {box} in frame 0")
@@ -100,7 +100,7 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert steer("set-box", "an na=1,2,30,40")[0] == 1
     assert steer("forget", "anna")[1].startswith("anna is no longer tracked after frame")
     assert steer("forget")[1].endswith("no object is left, so the run waits for a box")
-    assert status()["state"] == "waiting for a box"
+    assert status()["state"] == "waiting"
     assert steer("stop")[0] == 0
     assert {track.object for track in run.result(120)} == {"anna", "ben"}
 

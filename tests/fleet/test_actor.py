@@ -14,6 +14,7 @@ from catstream.fleet.actor import PORTS, Stream, free_ports
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
 from catstream.video.live_demo import first_box
+from catstream.video.source import open_source
 
 FRAMES = 60
 LIVE = "demo:1"
@@ -148,6 +149,18 @@ def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until,
         assert (uploads(), stream.report()[0].trouble) == (0, "")
         Store(store).stream("gate").claim("another node")
         until(lambda: stream.report()[1])
+
+
+def test_a_stream_that_has_lost_its_source_says_so(store, camera, demo_video, until):
+    path, boxes = demo_video(FRAMES)
+    with open_source(path) as film:
+        image = next(film).image
+    gate = camera(lambda _: image)
+    with started(StreamSpec("gate", gate.url, {"": boxes[0]}), store) as stream:
+        until(lambda: stream.report()[0].state == "running")
+        gate.leave()
+        lost = until(lambda: (found := stream.report()[0]).state == "lost" and found)
+    assert lost.trouble.startswith("its source has been lost for ")
 
 
 def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):

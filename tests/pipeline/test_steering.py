@@ -12,7 +12,7 @@ import zmq
 
 from catstream.client.control import control
 from catstream.client.subscription import subscribe
-from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError
+from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError, SilenceError
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
@@ -238,6 +238,23 @@ def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, r
     assert {track.state for track in tracks[:5]} == {"absent"}
     assert tracks[-1].state == "present"
     assert tracks[-1].box.overlap(video[1][19].scaled(1.9).centred(*(1.9 * c for c in video[1][19].centre))) > 0.5
+
+
+def test_a_pause_with_a_limit_ends_by_itself_and_whoever_attaches_meanwhile_is_told_why_nothing_arrives(endless, video):
+    with steered(endless, video[1][0]) as (pipeline, steering, _):
+        told(pipeline, lambda counters: counters["sent"])
+        steering.pause(seconds=600)
+        silence = pytest.raises(SilenceError, match="the state of the pipeline is: paused")
+        with subscribe(pipeline.endpoint, "tracks", timeout=3) as tracks, silence:
+            next(tracks)
+        with subscribe(pipeline.endpoint, "health", timeout=SECONDS) as health:
+            report = next(each for each in health if each.state == "paused")
+        assert report.objects[""].keys() == {"model_version"}, "where it is is not known"
+        steering.pause(seconds=0.5)
+        told(pipeline, lambda counters: not counters["paused"])
+        with subscribe(pipeline.endpoint, "health", timeout=SECONDS) as health:
+            report = next(each for each in health if each.state == "running")
+        assert report.objects[""].keys() == {"model_version", "score", "present"}
 
 
 def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera):

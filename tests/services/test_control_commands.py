@@ -50,6 +50,21 @@ def test_pause_resume_and_stop_change_one_thing_each(tracked):
     assert carried_out(command("pause"), before, tracked)[1].reason == "paused before the first frame"
 
 
+def test_a_pause_with_a_limit_is_not_kept_and_changes_no_pause_without_one(tracked):
+    until_resume, told = replace(desired("anna"), paused=True), {}
+    for before in (desired("anna"), until_resume):
+        for seconds in (30.0, 0.0):
+            after, answer = carried_out(command("pause", seconds=seconds), before, tracked)
+            assert after == before
+            told[before.paused, seconds] = answer.reason
+    assert told == {
+        (False, 30.0): "paused for 30 s after frame 6",
+        (False, 0.0): "resumed after frame 6",
+        (True, 30.0): "paused after frame 6",
+        (True, 0.0): "paused after frame 6",
+    }
+
+
 def test_a_search_begins_its_object_in_the_next_frame_in_the_place_of_another_one(tracked):
     after, answer = carried_out(command("search", "anna"), desired("anna", "ben"), tracked, SAVED)
     assert after.objects == {"ben": DesiredObject(BOX, 1), "anna": replace(SAVED, begins=8)}

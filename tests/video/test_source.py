@@ -332,7 +332,9 @@ def test_a_video_that_changes_its_size_ends_there_or_is_scaled(video, tmp_path):
     path.write_bytes(path.read_bytes() + large.read_bytes())
     good, message = broken(path)
     assert (good, "(frame 30) is 320x240, the first 160x120" in message) == (list(range(30)), True)
-    assert numbers(open_source(path, resize=True)) == list(range(40))
+    source = open_source(path, resize=True)
+    assert numbers(source) == list(range(40))
+    assert source.counters == {"scaled": 10}
 
 
 def test_a_video_without_its_index_is_an_error(video):
@@ -342,18 +344,58 @@ def test_a_video_without_its_index_is_an_error(video):
         open_source(path)
 
 
-@pytest.mark.parametrize("rotation", [90, 180, 270])
-def test_rotated_videos_of_phones_are_upright(video, rotation):
-    with open_source(video("a.mp4", frames=1, rotation=rotation)) as source:
-        frame = next(source)
-    assert number_of(np.rot90(frame.image, -rotation // 90)) == 0
-    assert frame.image.flags.c_contiguous
-    assert source.size == ((160, 120) if rotation == 180 else (120, 160))
+#: Directions on the screen of the axes of the stored picture, and what is seen of an array.
+DISPLAYED: dict[str, tuple[tuple[int, ...], Callable[[np.ndarray], np.ndarray]]] = {
+    "turned left": ((0, -1, 1, 0), np.rot90),
+    "turned right": ((0, 1, -1, 0), lambda stored: np.rot90(stored, -1)),
+    "upside down": ((-1, 0, 0, -1), lambda stored: stored[::-1, ::-1]),
+    "mirrored": ((-1, 0, 0, 1), lambda stored: stored[:, ::-1]),
+    "mirrored and upside down": ((1, 0, 0, -1), lambda stored: stored[::-1]),
+    "mirrored and turned": ((0, 1, 1, 0), lambda stored: stored.swapaxes(0, 1)),
+    "without directions": ((0, 0, 0, 0), lambda stored: stored),
+}
+
+
+@pytest.mark.parametrize(("matrix", "seen"), DISPLAYED.values(), ids=DISPLAYED)
+def test_videos_are_turned_and_mirrored_as_their_display_matrix_says(video, matrix, seen):
+    path = video("a.mp4", frames=1)
+    with open_source(path) as source:
+        stored = next(source).image
+    data, (a, b, c, d) = path.read_bytes(), (65536 * each for each in matrix)
+    place = data.index(b"tkhd") + 44
+    path.write_bytes(data[:place] + struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30) + data[place + 36 :])
+    with open_source(path) as source:
+        image = next(source).image
+    np.testing.assert_array_equal(image, seen(stored))
+    assert image.flags.c_contiguous
+    assert source.size == image.shape[1::-1]
+
+
+def test_the_aspect_of_pixels_is_that_of_the_frame_as_it_is_turned(tmp_path):
+    for rotation in (0, 90):
+        with av.open(str(tmp_path / "a.mp4"), "w") as container:
+            stream: Any = container.add_stream("mpeg4", rate=25)
+            stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+            stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
+            stream.set_display_rotation(rotation)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(0), format="bgr24")))
+            container.mux(stream.encode(None))
+        with open_source(tmp_path / "a.mp4") as source:
+            assert source.pixel_aspect == (Fraction(3, 4) if rotation else Fraction(4, 3))
 
 
 def test_a_start_after_the_end_is_an_error(video):
     with pytest.raises(VideoError, match="has 5 frames, numbered from 0, and none from frame 5 on"):
         open_source(video("a.avi", frames=5), start=5)
+
+
+def test_a_video_without_a_frame_that_can_be_decoded_is_an_error_that_says_so(video):
+    path = video("a.mp4", frames=5)
+    data = path.read_bytes()
+    first, last = data.index(b"mdat") + 4, data.index(b"moov") - 4
+    path.write_bytes(data[:first] + bytes(last - first) + data[last:])
+    with pytest.raises(VideoError, match="no frame of a can be decoded"):
+        open_source(path, skip_damaged=True)
 
 
 def test_a_closed_source_has_no_frames(video):
@@ -379,6 +421,8 @@ OPENED = {
     },
     "without hidden files": ([".0000.png", "0001.png"], "walk", [1]),
     "digits that are not decimal": (["²2.png", "²10.png"], "walk", [0, 1]),
+    "the images of a sequence": (["img/1.jpg", "img/2.jpg"], "walk/img", [0, 1]),
+    "a pattern in a sequence": (["rgb/1.jpg", "rgb/2.jpg"], "walk/rgb/%d.jpg", [0, 1]),
     "names that are not UTF-8": ([f"{LATIN}/1{LATIN}.png", f"{LATIN}/2{LATIN}.png"], f"walk/{LATIN}", [0, 1]),
 }
 
@@ -413,7 +457,6 @@ UNREADABLE = {
     "empty": (b"", ["cannot read the image"]),
     "a JPEG that is cut off": (cv2.imencode(".jpg", numbered(3))[1].tobytes()[:-500], ["cannot read the image"]),
     "of more pixels than OpenCV reads": (HUGE, ["cannot read the image"]),
-    "of floats": (cv2.imencode(".tiff", np.zeros((20, 30, 3), np.float32))[1].tobytes(), ["cannot read the image"]),
 }
 
 
@@ -473,6 +516,44 @@ def test_grey_images_are_expanded(tmp_path):
     assert image.shape == (20, 30, 3)
     assert image.dtype == np.uint8
     assert (image == 77).all()
+
+
+#: How 0, 1, 2 ... 255 is stored in an image of more than 8 bits.
+DEEP: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "16 bits of a thermal camera": (".png", lambda grey: 29500 + 2 * grey.astype(np.uint16)),
+    "floats": (".tif", lambda grey: 20 + grey.astype(np.float32) / 64),
+    "coloured floats": (".tif", lambda grey: np.dstack([20 + grey / 64] * 3)),
+    "floats without a value": (".tif", lambda grey: np.where(grey == 7, np.nan, grey).astype(np.float32)),
+}
+
+
+@pytest.mark.parametrize(("suffix", "stored"), DEEP.values(), ids=DEEP)
+def test_images_of_more_than_8_bits_are_scaled_by_the_range_of_the_first_one(tmp_path, suffix, stored):
+    first = np.arange(256, dtype=np.uint8).repeat(20).reshape(64, 80)
+    for number, grey in enumerate([first, first // 2 + 30, first[::-1]]):
+        cv2.imwrite(str(tmp_path / f"{number}{suffix}"), stored(grey))
+    for start in (0, 1):
+        with open_source(tmp_path, start) as source:
+            second = [frame.image for frame in source][1 - start]
+        wanted = np.where(first // 2 + 30 == 7, 0, first // 2 + 30)
+        np.testing.assert_array_equal(second, np.dstack([wanted] * 3))
+
+
+def test_an_image_file_with_several_pages_is_read_whole_and_in_a_folder_its_first_page_is(tmp_path, caplog):
+    pages = [numbered(number) for number in range(40)]
+    animation = cv2.Animation()
+    animation.frames, animation.durations = pages, np.full(40, 40, np.int32)
+    cv2.imwritemulti(str(tmp_path / "a.tif"), pages)
+    for suffix in ("webp", "png", "gif"):
+        cv2.imwriteanimation(str(tmp_path / f"a.{suffix}"), animation)
+    for suffix in ("tif", "webp", "png", "gif"):
+        source = open_source(tmp_path / f"a.{suffix}")
+        assert source.frames == 40
+        assert numbers(source) == list(range(40))
+    assert numbers(open_source(tmp_path / "a.tif", 2, part=slice(30, None, 3))) == [36, 39]
+    assert not caplog.messages
+    assert numbers(open_source(tmp_path / "*.tif")) == [0]
+    assert "a.tif has 40 pages" in caplog.messages[0]
 
 
 def test_images_before_the_first_frame_are_not_read(images):

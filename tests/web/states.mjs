@@ -9,8 +9,8 @@ const PAGES = process.env.EVERY_SIZE
   ? [["light", DESKTOP], ["dark", PHONE], ["light", PHONE], ["dark", DESKTOP]] : [["light", DESKTOP], ["dark", PHONE]];
 
 const status = {
-  phase: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4", paused: false,
-  waiting: false, lost_seconds: 0, skipped: null,
+  phase: "running", reason: "", endpoint: "/tmp/catstream-a1", source: "/videos/walk.mp4",
+  state: "running", words: "running", paused: false, skipped: null,
 };
 const anna = { name: "anna", colour: "#ff922b", state: "present", score: 0.93, version: 12 };
 const ben = { name: "constructor", colour: "#3586ff", state: "present", score: 0.61, version: 9 };
@@ -30,20 +30,20 @@ const all = {
   trees: trees(13, 22, 9, 0),
 };
 const several = { tracks: tracks(anna, ben, carl), picture: { frame: 210, width: 320, height: 240, boxes: { anna: box, [ben.name]: [30, 4, 50, 90] } } };
+const paused = { state: "paused", words: "paused", paused: true };
 const changed = (more, state = "present") => ({ status: { ...status, ...more }, tracks: unnamed(state) });
 
 //: What the page is told in each state, after it was told all; what is done there; in that order.
 const STATES = {
-  "no pipeline": { pipeline: 0, status: { ...status, phase: "waiting", source: "", endpoint: "", reason: "no pipeline of yours is running" },
+  "no pipeline": { pipeline: 0, status: { ...status, phase: "waiting", state: "none", source: "", endpoint: "", reason: "no pipeline of yours is running" },
     ...nothing },
-  "waiting for a box": { ...all, ...changed({ waiting: true }), tracks: tracks() },
-  "the first tracks": { tracks: unnamed("present") }, // before a status
+  "waiting for a box": { ...all, ...changed({ state: "waiting", words: "waiting for a box" }), tracks: tracks() },
   bootstrapping: { ...all, ...changed({}, "bootstrapping") },
   present: { ...all },
   absent: changed({}, "absent"),
-  "paused, present": changed({ paused: true }),
-  "paused, absent": changed({ paused: true }, "absent"),
-  lost: changed({ lost_seconds: 12, skipped: 40 }, "absent"),
+  paused: changed(paused, null),
+  lost: changed({ state: "lost", words: "source lost for 12 s", skipped: 40 }, null),
+  "lost, of several": { tracks: tracks(...[anna, ben].map((one) => ({ ...one, state: null, score: null }))) },
   silent: changed({ phase: "silent" }),
   "another pipeline": { pipeline: 2, status: { ...status, source: "rtsp://10.0.0.7/stream1", endpoint: "run" }, ...nothing },
   "three objects": { ...all, ...several },
@@ -54,7 +54,7 @@ const STATES = {
   drawing: { ...all },
   "drawing the next one while the answer comes": {},
   "cancelled, begun and cancelled": {},
-  "cancelled during a pause": changed({ paused: true }),
+  "cancelled during a pause": changed(paused),
   stopping: {},
   "the end": changed({ phase: "ended", reason: "the source has ended" }),
   "the end, and of the server": { closed: true },
@@ -76,7 +76,7 @@ const draw = async (page, viewport) => {
   }
   await page.waitForSelector("#follow:not([disabled])");
 };
-const paused = (page) => page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.");
+const pausing = (page) => page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.");
 let answered = null; // what the answer to a command waits for
 const doing = {
   drawing: draw,
@@ -108,12 +108,12 @@ const doing = {
     answered = new Promise((resolve) => { answer = resolve; });
     for (const key of ["Escape", "Enter"]) await page.press("#stage", key);
     answer();
-    await paused(page);
+    await pausing(page);
     await page.press("#stage", "Escape");
   },
   "cancelled during a pause": async (page) => {
     await page.press("#stage", "Enter");
-    await paused(page);
+    await pausing(page);
     await page.press("#stage", "Escape");
   },
   stopping: async (page) => {
@@ -157,7 +157,7 @@ await withBrowser(executablePath, profile, async (browser) => {
       await doing[name]?.(page, viewport);
       seen.push({ state: name, scheme, pill: await page.locator("#state").innerText(), overlay: await page.locator("#overlay").textContent(),
         source: await page.locator("#source").textContent(), frame: await page.locator("#frame").textContent(),
-        objects: await page.locator(".objects b").allTextContents(), chosen: await page.locator('.choose[aria-pressed="true"] b').allTextContents(),
+        objects: await page.locator(".objects b").allTextContents(), scores: await page.locator(".objects .score").allTextContents(), chosen: await page.locator('.choose[aria-pressed="true"] b').allTextContents(),
         charts: await page.locator("#charts-title").innerText(), name: await page.locator("#name").inputValue(), sent: sent.at(-1) ?? null,
         message: await page.locator("#message").textContent(), loud: await page.locator("#watching .main").allInnerTexts(), role: await page.locator("#role").inputValue(),
         header: await page.locator("header").innerText(), keys: await page.locator(".keys").isVisible(),

@@ -66,17 +66,48 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
 
 
-def test_a_process_is_silent_some_seconds_after_its_last_report_also_if_none_of_another_one_arrives():
+HOLDING = {
+    "paused": ({"paused": 1.0}, "paused"),
+    "waiting": ({"waiting": 1.0, "paused": 1.0}, "waiting for a box, paused"),
+    "lost": ({"lost_seconds": 12.3}, "source lost for 12 s"),
+}
+
+
+@pytest.mark.parametrize(
+    ("state", "counters", "words"), [(state, *told) for state, told in HOLDING.items()], ids=HOLDING
+)
+def test_while_no_frames_are_tracked_the_page_says_why_and_nothing_of_where_the_objects_are(
+    dashboard, facts, state, counters, words
+):
+    told = {}
+    dashboard.take(facts.tracking(3, "anna"), 0.0)
+    dashboard.take(facts.track(2, name="anna"), 0.1)
+    dashboard.updates(told)
+    dashboard.take(Health("detector", 1.0, {"sent": 3.0, **counters}), 1.0)
+    parts = dashboard.updates(told)
+    assert (parts["status"]["state"], parts["status"]["words"]) == (state, words)
+    assert [(one["state"], one["score"]) for one in parts["tracks"]["objects"]] == [(None, None)]
+    assert parts["points"][-1][2] == {}
+    dashboard.take(facts.track(3, name="anna"), 1.4)
+    parts = dashboard.updates(told)
+    assert parts["status"]["state"] == "running", "a track is newer than the report"
+    assert [one["state"] for one in parts["tracks"]["objects"]] == ["present"]
+
+
+def test_ready_is_what_tracks_and_a_process_is_silent_some_seconds_after_its_last_report():
     feed, everyone = PipelineFeed("run"), "no health report from: detector, compressor, trainer"
     assert feed.problem == everyone
-    for ago, names, problem in (
-        (SILENCE_SECONDS + 1.0, ("detector", "compressor", "trainer"), everyone),
-        (0.0, ("compressor", "trainer"), "no health report from: detector"),
-        (0.0, ("detector",), ""),
+    for ago, names, more, problem in (
+        (SILENCE_SECONDS + 1.0, ("detector", "compressor", "trainer"), {}, everyone),
+        (0.0, ("compressor", "trainer"), {}, "no health report from: detector"),
+        (0.0, ("detector",), {}, ""),
+        *((0.0, ("detector",), counters, words) for counters, words in HOLDING.values()),
     ):
         for name in names:
-            feed.dashboard.take(Health(name, 1.0, {"sent": 1.0}), monotonic() - ago)
+            feed.dashboard.take(Health(name, 1.0, {"sent": 1.0, **more}), monotonic() - ago)
         assert feed.problem == problem
+    feed.dashboard.take(End(2, "cannot read /home/me/secret.mp4", failed=True), monotonic())
+    assert feed.problem == "ended", "who has no token is told no name of a file"
 
 
 def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, facts):

@@ -1,6 +1,7 @@
 """The metrics of a pipeline and of a fleet."""
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -24,18 +25,19 @@ def samples(feed):
 
 
 def test_each_counter_of_a_process_is_a_metric_with_the_object_as_its_label(feed, facts):
-    report = facts.tracking(6.0, "anna", "ben")
+    report = replace(facts.tracking(6.0, "anna", "ben"), source="rtsp://door/1")
     report.counters.update(taken=5.0, model_version=3.0)
     learned = {"anna": {"rows": 3.0, "loss_leaves": 1.0}, "ben": {"rows": 4.0, "loss_leaves": 2.0}}
     feed.dashboard.take(report, 0.0)
     feed.dashboard.take(Health("compressor", 1.0, {"rows": 7.0, "stored": 4.0}, objects=learned), 0.0)
     feed.dashboard.take(Health("trainer", 1.0, {"rejected": 2.0}, objects={"": {"trained": 5.0}}), 0.0)
     found = samples(feed)
-    assert found["catstream_detector_sent"] == [("", 6.0)]
-    assert found["catstream_compressor_stored"] == [("", 4.0)]
-    assert found["catstream_detector_score"] == [('object="anna"', 0.75), ('object="ben"', 0.75)]
-    assert found["catstream_compressor_rows"] == [('object="anna"', 3.0), ('object="ben"', 4.0)], "no sum among them"
-    assert found["catstream_trainer_trained"] == [('object=""', 5.0)]
+    of, anna, ben = (f'{name}source="rtsp://door/1"' for name in ("", 'object="anna",', 'object="ben",'))
+    assert found["catstream_detector_sent"] == [(of, 6.0)]
+    assert found["catstream_compressor_stored"] == [(of, 4.0)]
+    assert found["catstream_detector_score"] == [(anna, 0.75), (ben, 0.75)]
+    assert found["catstream_compressor_rows"] == [(anna, 3.0), (ben, 4.0)], "no sum among them"
+    assert found["catstream_trainer_trained"] == [(f'object="",{of}', 5.0)]
     assert found["catstream_trainer_age_seconds"][0][1] > 0
 
 
@@ -43,9 +45,32 @@ def test_a_pipeline_that_does_not_run_has_no_old_values(feed, facts):
     feed.dashboard.take(facts.tracking(6.0, "anna"), 0.0)
     assert "catstream_detector_score" in samples(feed)
     feed.dashboard.mark_silent("nothing came", 5.0)
-    assert samples(feed) == {"catstream_up": [("", 0.0)], "catstream_viewers": [("", 0.0)]}
+    assert samples(feed) == {
+        "catstream_up": [('source=""', 0.0)],
+        "catstream_state": [('source="",state="silent"', 1.0)],
+        "catstream_viewers": [("", 0.0)],
+    }
     feed.dashboard.take(facts.track(7, name="anna"), 6.0)
-    assert samples(feed)["catstream_up"] == [("", 1.0)]
+    assert samples(feed)["catstream_up"] == [('source=""', 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("counters", "state", "paused", "lost"),
+    [
+        ({}, "running", 0.0, 0.0),
+        ({"paused": 1.0}, "paused", 1.0, 0.0),
+        ({"waiting": 1.0}, "waiting", 0.0, 0.0),
+        ({"lost_seconds": 12.0}, "lost", 0.0, 12.0),
+        ({"lost_seconds": 12.0, "paused": 1.0}, "lost", 1.0, 12.0),
+    ],
+)
+def test_the_state_is_a_metric_and_alerts_on_a_lost_source_or_a_pause_need_no_other(
+    feed, counters, state, paused, lost
+):
+    feed.dashboard.take(Health("detector", 1.0, {"sent": 6.0, **counters}), 0.0)
+    found = samples(feed)
+    assert found["catstream_state"] == [(f'source="",state="{state}"', 1.0)]
+    assert [found[f"catstream_{name}"][0][1] for name in ("paused", "source_lost_seconds")] == [paused, lost]
 
 
 def test_each_number_of_a_stream_and_of_a_node_is_a_metric_with_their_names_as_labels(fleet):

@@ -117,9 +117,9 @@ def test_the_server_is_healthy_alone_and_ready_while_all_processes_report(page, 
     assert page.get("/readyz").status_code == 503
     until(lambda: answer("detector", "compressor", "trainer").status_code == 200)
     shown = page.get("/metrics").text
-    assert "\ncatstream_up 1.0\n" in shown
-    assert "\ncatstream_detector_sent 3.0\n" in shown
-    assert "\ncatstream_trainer_rejected 1.0\n" in shown
+    assert '\ncatstream_up{source=""} 1.0\n' in shown
+    assert '\ncatstream_detector_sent{source=""} 3.0\n' in shown
+    assert '\ncatstream_trainer_rejected{source=""} 1.0\n' in shown
     until(lambda: answer("detector", "compressor").status_code == 503)
     assert answer("detector", "compressor").text == "no health report from: trainer\n"
 
@@ -147,7 +147,7 @@ def test_pictures_are_subscribed_only_while_a_page_is_open(page, updates, pipeli
         pipeline["previews"].send(facts.preview(next(frames)))
         return True
 
-    until(lambda: turn() and page.get("/metrics").text.count("\ncatstream_up 1.0\n"))
+    until(lambda: turn() and page.get("/metrics").text.count('\ncatstream_up{source=""} 1.0\n'))
     assert not pipeline["previews"].has_subscribers
     frame = updates("picture", turn)["frame"]
     assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
@@ -218,7 +218,7 @@ def test_a_command_names_its_object_and_the_reason_of_a_rejected_one_is_answered
 ):
     def attached():
         pipeline["detector"].send(Health("detector", time.monotonic(), {}))
-        return "\ncatstream_up 1.0\n" in page.get("/metrics").text
+        return '\ncatstream_up{source=""} 1.0\n' in page.get("/metrics").text
 
     def told(verb, name, **more):
         answer = page.post("/control", json={"verb": verb, "object": name, **more})

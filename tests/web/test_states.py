@@ -12,6 +12,7 @@ from catstream.web.server import Server
 
 pytestmark = pytest.mark.system
 
+RESUMED = {"verb": "pause", "seconds": 0}
 SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgetting", "two objects")
 
 
@@ -28,7 +29,7 @@ def seen(script_of_browser, tmp_path):
 
 
 def test_each_state_of_the_page_is_accessible_and_correct(seen):
-    assert len(seen) == 46
+    assert len(seen) == 44
     assert {key: state["violations"] for key, state in seen.items() if state["violations"]} == {}, "found by axe"
     assert {key for key, state in seen.items() if state["wide"] > 0} == set(), "wider than its window"
     wide, phone = seen["light", "present"], seen["dark", "present"]
@@ -38,16 +39,17 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
         assert seen[scheme, "lost"]["source"] == "walk.mp4, 40 frames skipped"
         assert seen[scheme, "present"]["loud"] == [], "all is well"
         assert {tuple(seen[scheme, name]["loud"]) for name in ("waiting for a box", "absent")} == {("Draw a box",)}
-        assert seen[scheme, "waiting for a box"]["pill"] == "waiting for a box"
-        assert seen[scheme, "the first tracks"]["pill"] == "present"
+        held = {"waiting for a box": "waiting for a box", "paused": "paused", "lost": "source lost for 12 s"}
+        assert {name: seen[scheme, name]["pill"] for name in held} == held
+        assert seen[scheme, "lost"]["overlay"] == "Source lost for 12 s: this is the last picture."
+        assert seen[scheme, "lost, of several"]["scores"] == ["–", "–"]
         pictures = [seen[scheme, name]["loaded"] for name in ("waiting for a box", "bootstrapping", "present")]
         assert pictures == sorted(set(pictures)), "the frames of a paused live source have one number"
         assert seen[scheme, "three objects"]["header"].startswith("2 of 3 present"), "the state is first"
         assert len(seen[scheme, "three objects"]["lines"]) == 1, "colours are those of objects"
         assert [seen[scheme, name]["role"] for name in ("drawing one more", "drawing")] == ["new", "new"]
-        assert seen[scheme, "cancelled, begun and cancelled"]["sent"] == {"verb": "resume"}
-        assert seen[scheme, "cancelled during a pause"]["sent"] == {"verb": "pause"}
-        assert seen[scheme, "cancelled during a pause"]["message"] == ""
+        assert seen[scheme, "cancelled, begun and cancelled"]["sent"] == RESUMED
+        assert seen[scheme, "cancelled during a pause"]["sent"] == RESUMED, "only the pause of this page"
         check_several(*(seen[scheme, name] for name in SEVERAL))
         check_another_pipeline(seen[scheme, "another pipeline"])
         check_end(seen[scheme, "the end"], seen[scheme, "the end, and of the server"])
@@ -59,9 +61,9 @@ def check_several(three, chosen, drawing, forgetting, two):
     assert three["chosen"] == ["anna"]
     assert three["charts"] == "The last two minutes of anna"
     assert chosen["charts"] == "The last two minutes of constructor"
-    assert (drawing["name"], drawing["sent"]) == ("object-4", {"verb": "pause"})
+    assert (drawing["name"], drawing["sent"]) == ("object-4", {"verb": "pause", "seconds": 30})
     assert forgetting["name"] == "dora", "as it was typed"
-    assert forgetting["sent"] == {"verb": "resume"}, "nothing is dropped before it is confirmed"
+    assert forgetting["sent"] == RESUMED, "nothing is dropped before it is confirmed"
     assert two["sent"] == {"verb": "forget", "object": "constructor"}
     assert (len(two["objects"]), two["chosen"]) == (2, ["anna"])
 

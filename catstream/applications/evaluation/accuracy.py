@@ -14,6 +14,7 @@ import numpy as np
 from catstream.applications.evaluation.runs import EvaluationRun, provenance
 from catstream.applications.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.applications.page import SHARES, Axis, plot, table, write_page
+from catstream.errors import CatstreamError
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 
@@ -27,6 +28,12 @@ MEASURES = {
     "fps": "frames/s",
 }
 
+#: The counts of a row, which are added up: see `scores.Absence`.
+COUNTS = ("absent", "noticed", "present", "false")
+
+#: The headings of `cells`.
+HEADINGS = (*list(MEASURES.values())[:-1], "noticed", "false", MEASURES["fps"])
+
 #: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
 FLIP = 0.25
 
@@ -37,9 +44,10 @@ class Row:
 
     `auc`, `success` (overlap above 0.5), `precision` (20 pixels) and `normalised_precision` are those of `scores.py`,
     from 0 to 1. `lost` is the share of the runs that have lost the object in the end. `f_score` and its two components
-    are None if the object is never absent. The spreads are standard deviations over the runs. `flips` is None unless
-    the runs have different first boxes; it is true if their smallest and largest success differ by more than 0.25: then
-    chance decides.
+    are None if the object is never absent. `noticed` of the `absent` frames without the object, and `false` of the
+    `present` ones with it, have no reported box: these are counts over all runs. The spreads are standard deviations
+    over the runs. `flips` is None unless the runs have different first boxes; it is true if their smallest and largest
+    success differ by more than 0.25: then chance decides.
     """
 
     name: str
@@ -58,6 +66,10 @@ class Row:
     long_term_recall: float | None
     flips: bool | None
     fps: float
+    absent: int
+    noticed: int
+    present: int
+    false: int
 
 
 def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
@@ -69,18 +81,22 @@ def rows_of(runs: Iterable[EvaluationRun]) -> list[Row]:
 
 
 def mean_of(rows: Iterable[Row]) -> dict[str, dict[str, float | None]]:
-    """Return the mean of each measure over the sequences, by tracker; that of the F-score over those that have one."""
+    """Return the mean of each measure over the sequences, and the sum of each count, by tracker.
+
+    The mean of the F-score is over the sequences that have one.
+    """
     groups: dict[str, list[Row]] = {}
     for row in rows:
         groups.setdefault(row.tracker, []).append(row)
     return {
         tracker: {measure: _mean(getattr(row, measure) for row in group) for measure in MEASURES}
+        | {count: sum(getattr(row, count) for row in group) for count in COUNTS}
         for tracker, group in groups.items()
     }
 
 
 def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
-    """Return the measures of a row or a mean as text, in the order of `MEASURES`; with the spread of several runs."""
+    """Return the measures of a row or a mean as text, in the order of `HEADINGS`; with the spread of several runs."""
     values = dataclasses.asdict(measured) if isinstance(measured, Row) else measured
 
     def text(measure: str) -> str:
@@ -89,7 +105,14 @@ def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
             return "-"
         return f"{value:.3f}" if spread is None or values.get("runs") == 1 else f"{value:.3f} ±{spread:.3f}"
 
-    return [text(measure) if measure != "fps" else f"{values['fps']:.0f}" for measure in MEASURES]
+    def share(part: float | None, whole: float | None) -> str:
+        if part is None or not whole:
+            return "-"
+        return f"{part}/{whole} {part / whole:.{0 if part / whole > 0.1 else 1}%}"
+
+    measures = [text(measure) for measure in MEASURES if measure != "fps"]
+    shares = share(values["noticed"], values["absent"]), share(values["false"], values["present"])
+    return [*measures, *shares, f"{values['fps']:.0f}"]
 
 
 def by_attribute(
@@ -142,6 +165,7 @@ def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
     scores = [run.score() for run in runs]
     success = [score.success for score in scores]
     long = [score.long_term for score in scores if score.long_term is not None]
+    counts = {count: sum(getattr(score.absence, count) for score in scores) for count in COUNTS}
     return Row(
         name=name,
         tracker=tracker,
@@ -159,6 +183,7 @@ def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
         long_term_recall=_mean(part.recall for part in long),
         flips=max(success) - min(success) > FLIP if any(run.start.variation.name for run in runs) else None,
         fps=fmean(run.fps for run in runs),
+        **counts,
     )
 
 
@@ -168,18 +193,25 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def write_report(
-    path: Path, runs: list[EvaluationRun], settings: Settings, attributes: Mapping[str, Sequence[str]]
+    path: Path,
+    runs: list[EvaluationRun],
+    settings: Settings,
+    attributes: Mapping[str, Sequence[str]],
+    errors: Sequence[CatstreamError] = (),
 ) -> Path:
     """Write the report of an evaluation as one self-contained HTML file.
 
     attributes : names of the sequences that have each attribute
+    errors : those of runs that are not included
     """
     rows = rows_of(runs)
     sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
     body = [
         "<h1>Accuracy</h1>",
         f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
-        "the object count only for F. ± is the standard deviation over the runs of a sequence.</p>",
+        "the object count only for F and noticed. Noticed and false are the frames without and with the object that "
+        "have no reported box. ± is the standard deviation over the runs of a sequence.</p>",
+        *(f'<p class="about">Not included: {escape(str(error))}</p>' for error in errors),
         *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
         _plots(runs),
         "<h2>Sequences</h2>",
@@ -224,7 +256,7 @@ def _table(rows: list[Row]) -> str:
     lines = [[escape(row.name), row.tracker, row.frames, *_shaded(cells(row))] for row in rows]
     means = mean_of(rows)
     lines += [["mean", tracker, "", *_shaded(cells(mean))] for tracker, mean in means.items()]
-    return table(("sequence", "tracker", "frames", *MEASURES.values()), lines, texts=2, means=len(means))
+    return table(("sequence", "tracker", "frames", *HEADINGS), lines, texts=2, means=len(means))
 
 
 def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
@@ -233,12 +265,13 @@ def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -
         for attribute, means in by_attribute(rows, attributes).items()
         for tracker, mean in means.items()
     ]
-    return table(("attribute", "tracker", "sequences", *MEASURES.values()), lines, texts=2, means=0)
+    return table(("attribute", "tracker", "sequences", *HEADINGS), lines, texts=2, means=0)
 
 
 def _shaded(texts: list[str]) -> list[str]:
-    """Give the measures from 0 to 1 a background that is darker for a higher value."""
-    shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:-1]]
+    """Give the means of the measures from 0 to 1 a background that is darker for a higher value."""
+    shaded = len(MEASURES) - 1  # all but frames/s
+    shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:shaded]]
     style = "background: rgb(47 158 68 / {:.0f}%); padding: .1rem .3rem"
     shown = [f'<span style="{style.format(each)}">{text}</span>' for each, text in zip(shades, texts, strict=False)]
-    return [*shown, texts[-1]]
+    return [*shown, *(f'<span style="white-space: nowrap">{text}</span>' for text in texts[shaded:])]

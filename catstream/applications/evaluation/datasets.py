@@ -3,15 +3,16 @@
 A sequence is a folder with frames, in any form that `catstream.video.source`
 opens, and one of these files:
 
-    groundtruth_rect.txt   OTB: x,y,w,h (comma, blank or tab); two objects, groundtruth_rect.1.txt and .2.txt, are
-                           two sequences
+    groundtruth_rect.txt   OTB: x,y,w,h (comma, semicolon, blank or tab); two objects, groundtruth_rect.1.txt and
+                           .2.txt, are two sequences
     gt.txt                 TLD: x1,y1,x2,y2
     groundtruth.txt        VOT: polygons x1,y1,x2,y2 ... (their bounding box is taken), or x,y,w,h
     FOLDER.txt             Princeton: x,y,w,h,occluded, and the frames in rgb/
 
 Each file has one line for each frame; NaN, or a box without area, means that
-the object is absent. Boxes are used as published; OTB's pixel coordinates,
-which start at 1, are not shifted.
+the object is absent. Numbers may have a decimal comma, if commas do not also
+separate them. Boxes are used as published; OTB's pixel coordinates, which start
+at 1, are not shifted.
 
 A run starts from one of these:
 
@@ -24,10 +25,11 @@ A run starts from one of these:
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -36,7 +38,8 @@ from catstream.box import Box
 from catstream.errors import BoxError, SettingsError, VideoError
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64, UInt8
-from catstream.video.source import natural_order, open_source
+from catstream.video.images import natural_order
+from catstream.video.source import open_source
 
 #: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
 #: boxes.
@@ -83,22 +86,64 @@ class Sequence:
         return width, height
 
 
-def find_sequences(path: str | Path) -> list[Sequence]:
-    """Return the sequence in a folder, or the sequences in its subfolders, in natural order."""
+def find_sequences(path: str | Path, failed: Callable[[VideoError], None] | None = None) -> list[Sequence]:
+    """Return the sequence in a folder, or the sequences in its subfolders, in natural order.
+
+    failed : function that is called with the error of each sequence whose ground truth is malformed, while the others
+        are read; if None, the error is raised
+    """
     path = Path(path)
-    sequences = _sequences(path)
-    if not sequences and path.is_dir():
-        for folder in sorted((inner for inner in path.iterdir() if inner.is_dir()), key=natural_order):
-            sequences += _sequences(folder)
-    if not sequences:
+    folders = [path]
+    if not _truths(path) and path.is_dir():
+        folders = sorted((inner for inner in path.iterdir() if inner.is_dir()), key=natural_order)
+    truths = [truth for folder in folders for truth in _truths(folder)]
+    if not truths:
         raise VideoError(
             f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with groundtruth_rect.txt "
             "(x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT) or FOLDER.txt (Princeton), or a folder of such folders"
         )
+    sequences = []
+    for truth in truths:
+        try:
+            sequences.append(_sequence(*truth))
+        except VideoError as error:
+            if failed is None:
+                raise
+            failed(error)
     return sequences
 
 
-def _sequences(folder: Path) -> list[Sequence]:
+class _Layout(NamedTuple):
+    """The layout of a ground truth: a line in words, the possible numbers of columns, and the way to boxes."""
+
+    line: str
+    columns: Collection[int]
+    boxes: Callable[[Float64], Float64]
+
+
+def _rectangles(table: Float64) -> Float64:
+    return table[:, :4].copy()
+
+
+def _corners(table: Float64) -> Float64:
+    return np.hstack([table[:, :2], table[:, 2:] - table[:, :2]])
+
+
+def _polygons(table: Float64) -> Float64:
+    if table.shape[1] == 4:
+        return _rectangles(table)
+    low, high = (np.stack([pick(table[:, axis::2], axis=1) for axis in (0, 1)], axis=1) for pick in (np.min, np.max))
+    return np.hstack([low, high - low])
+
+
+_OTB = _Layout("x,y,w,h", (4,), _rectangles)
+_TLD = _Layout("x1,y1,x2,y2", (4,), _corners)
+_VOT = _Layout("x,y,w,h or the corners of a polygon, x1,y1,x2,y2 ...", range(4, 1000, 2), _polygons)
+_PRINCETON = _Layout("x,y,w,h or x,y,w,h,occluded", (4, 5), _rectangles)
+
+
+def _truths(folder: Path) -> list[tuple[str, Path, Path, _Layout]]:
+    """Return the name, the folder, the ground truth and its layout of each sequence in a folder."""
     target = folder.resolve()
     name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
     rects = [file for file in sorted(folder.glob("*.txt"), key=natural_order) if _RECT.fullmatch(file.stem)]
@@ -106,27 +151,26 @@ def _sequences(folder: Path) -> list[Sequence]:
     rects = [file for file in rects if not file.exists() or file.stat().st_size] or rects
     if rects:
         ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
-        return [_sequence(name + end, folder, file, _rectangles) for file, end in zip(rects, ends, strict=True)]
-    for file, reader in (
-        (folder / "gt.txt", _corners),
-        (folder / "groundtruth.txt", _polygons),
-        (folder / f"{target.name}.txt", _rectangles),
-    ):
-        if file.is_file():
-            return [_sequence(name, folder, file, reader)]
-    return []
+        return [(name + end, folder, file, _OTB) for file, end in zip(rects, ends, strict=True)]
+    others = {"gt.txt": _TLD, "groundtruth.txt": _VOT, f"{target.name}.txt": _PRINCETON}
+    found = [(name, folder, folder / file, layout) for file, layout in others.items() if (folder / file).is_file()]
+    return found[:1]
 
 
-def _sequence(name: str, folder: Path, file: Path, reader: Callable[[Float64], Float64]) -> Sequence:
-    boxes = reader(_numbers(file))
+def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
+    boxes = layout.boxes(_numbers(file, layout))
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
-    if np.isnan(boxes).all():
-        raise VideoError(f"{str(file)!r} has no box: the object must be present in at least one frame")
+    present = np.isfinite(boxes).all(axis=1).sum()
+    if present < 2:  # a run starts with the first box
+        raise VideoError(
+            f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
+            "frame, and the object in at least two frames"
+        )
     return Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
 
 
-def _numbers(file: Path) -> Float64:
-    """Read the table in a text file, float64 (lines, columns), with at least four columns."""
+def _numbers(file: Path, layout: _Layout) -> Float64:
+    """Read the table in a text file, float64 (lines, columns)."""
     rows: list[list[float]] = []
     try:
         lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
@@ -135,37 +179,38 @@ def _numbers(file: Path) -> Float64:
             f"{str(file)!r} cannot be read ({error}): expected a text file with one line for each frame"
         ) from None
     for number, line in enumerate(lines, start=1):
-        fields = line.replace(",", " ").replace(";", " ").split()
-        if not fields:  # skipping the line would shift all later boxes by one frame
+        if not line.strip():  # skipping the line would shift all later boxes by one frame
             raise VideoError(f"{str(file)!r}, line {number} is blank: if the object is absent, write nan,nan,nan,nan")
-        try:
-            row = [float(field) for field in fields]
-        except ValueError:
-            row = []
-        if len(row) < 4 or (rows and len(row) != len(rows[0])):
+        columns = [len(rows[0])] if rows else layout.columns
+        readings = [row for row in _readings(line) if len(row) in columns]
+        if len(readings) != 1:
+            expected = f"{len(rows[0])} numbers as in line 1" if rows else layout.line
             raise VideoError(
-                f"{str(file)!r}, line {number}: expected {len(rows[0]) if rows else 'four or more'} numbers, "
-                f"got {line.strip()[:60]!r}"
+                f"{str(file)!r}, line {number}: expected {expected}, with decimal points, got {line.strip()[:60]!r}"
             )
-        rows.append(row)
+        rows += readings
     if not rows:
         raise VideoError(f"{str(file)!r} is empty: expected one line for each frame")
     return np.array(rows)
 
 
-def _rectangles(table: Float64) -> Float64:
-    return table[:, :4].copy()
+def _readings(line: str) -> list[list[float]]:
+    """Return the numbers of a line, with its commas as separators, and as decimal commas if there are other separators.
 
-
-def _corners(table: Float64) -> Float64:
-    return np.hstack([table[:, :2], table[:, 2:4] - table[:, :2]])
-
-
-def _polygons(table: Float64) -> Float64:
-    if table.shape[1] < 6:
-        return _rectangles(table)
-    low, high = (np.stack([pick(table[:, axis::2], axis=1) for axis in (0, 1)], axis=1) for pick in (np.min, np.max))
-    return np.hstack([low, high - low])
+    >>> _readings("215,90 61,18 50,02 50")
+    [[215.9, 61.18, 50.02, 50.0]]
+    >>> _readings("215,90 61,18 50,20 50,30")
+    [[215.0, 90.0, 61.0, 18.0, 50.0, 20.0, 50.0, 30.0], [215.9, 61.18, 50.2, 50.3]]
+    """
+    readings: list[list[float]] = []
+    line = line.strip(" \t,;")
+    separated, words = re.split(r"\s*[,;]\s*|\s+", line), re.split(r",?[;\s]+", line)
+    if not any(re.match(r"[-+]?0\d", field) for field in separated):  # 02 has been the decimals of a number
+        with suppress(ValueError):
+            readings.append([float(field) for field in separated])
+    if "," in "".join(words) and all(re.fullmatch(r"[-+]?\d+(,\d+)?|nan", word, re.IGNORECASE) for word in words):
+        readings.append([float(word.replace(",", ".")) for word in words])
+    return readings
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,9 +338,10 @@ def _present(sequence: Sequence) -> list[int]:
 def _valid(sequence: Sequence) -> list[int]:
     """Return the frames with a box that `Box.validated` accepts; all with the object if none has one, or none is read.
 
-    The run then raises the error.
+    The run then raises the error. The last frame with the object is left out: nothing but the given box would be
+    measured.
     """
-    present = _present(sequence)
+    present = _present(sequence)[:-1]
     try:
         size = sequence.size(present[0])
     except VideoError:

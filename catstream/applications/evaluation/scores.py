@@ -10,9 +10,9 @@ frame, NaN if there is no box:
     lost          whether fewer than half of the frames in the last quarter have an overlap above 0.5
 
 Frames without the object do not count; frames in which the tracker reports no
-box count as missed. The values agree with the got10k toolkit. If the object is
-absent in some frames, the measures of VOT's long-term challenge show whether the
-tracker reports its absence: see `long_term`.
+box count as missed. The values agree with the got10k toolkit. Whether the tracker
+reports absence when the object is absent, and only then, is counted in `Absence`;
+the measures of VOT's long-term challenge judge the boxes as well: see `long_term`.
 """
 
 from __future__ import annotations
@@ -40,14 +40,25 @@ class LongTerm:
 
 
 @dataclass(frozen=True, slots=True)
+class Absence:
+    """Numbers of frames: without the object, of these without a reported box; with the object, of these without one."""
+
+    absent: int
+    noticed: int
+    present: int
+    false: int
+
+
+@dataclass(frozen=True, slots=True)
 class Score:
-    """The measures of one run, from 0 to 1; `long_term` is None if the object is never absent."""
+    """The measures of one run, from 0 to 1, and its counts; `long_term` is None if the object is never absent."""
 
     auc: float
     success: float
     precision: float
     normalised_precision: float
     lost: bool  # see `is_lost`
+    absence: Absence
     long_term: LongTerm | None
 
 
@@ -88,6 +99,13 @@ def is_lost(boxes: Float64, truth: Float64) -> bool:
     last = slice(-math.ceil(len(truth) / 4), None)
     followed = overlaps(boxes[last], truth[last])[_present(truth[last])] > 0.5
     return bool(len(followed)) and bool(followed.mean() < 0.5)
+
+
+def count_absence(boxes: Float64, truth: Float64) -> Absence:
+    """Count the frames without and with the object, and those of each without a reported box."""
+    present, reported = _present(truth), _present(boxes)
+    counts = (~present, ~present & ~reported, present, present & ~reported)
+    return Absence(*(int(frames.sum()) for frames in counts))
 
 
 def precision_plot(boxes: Float64, truth: Float64) -> Float64:
@@ -136,6 +154,7 @@ def score(boxes: Float64, truth: Float64, confidence: Float64 | None = None) -> 
         precision=float(precision_plot(boxes, truth)[20]),
         normalised_precision=float((off[:, None] <= _SHARES).mean()),
         lost=is_lost(boxes, truth),
+        absence=count_absence(boxes, truth),
         long_term=None
         if present.all()
         else long_term(boxes, truth, np.ones(len(boxes)) if confidence is None else confidence),

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import math
 import os
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -29,11 +29,13 @@ from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
 from catstream.messages.kinds import Model
+from catstream.messages.names import counted
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import RunSettings, Settings
 from catstream.video.frames import Frame, read_ahead
-from catstream.video.source import IMAGES, VIDEOS, image_files, is_live, natural_order, open_source, read_image
+from catstream.video.images import IMAGES, ImageReader, first_pages, image_files, natural_order, pages_of
+from catstream.video.source import VIDEOS, is_live, open_source
 
 _One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
 #: A frame that is searched, and the name of its file in a folder of images.
@@ -56,6 +58,7 @@ _MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for 
 _WIDEST = 1.25  # of a window, as a multiple of the frame: its object fills the frame
 _SMALLEST = 24  # side of a window in pixels: a smaller one shows too little of its object
 _MOST_MAXIMA = 8  # windows of one size that are examined, and sightings of one object in a frame
+_TIME_STEP = 0.001  # of most containers, in seconds: time stamps are rounded to it
 _FITTED = 0.7  # share of the threshold from which a window is fitted: its score rises by less
 
 _log = logging.getLogger(__name__)
@@ -115,28 +118,34 @@ class File:
         return image_files(self.path) if self.kind == "images" else [self.path]
 
     def frames(self, every: float, settings: RunSettings, opened: Opened, damaged: Damaged) -> Generator[_Searched]:
-        """Yield the frames to search: all images; of a video one in `every` seconds, the first and the last.
+        """Yield the frames to search: all images; of a video the first one in each `every` seconds, and the last one.
 
         A video that is damaged raises VideoError after the frames before the damage.
         """
         if self.kind == "video":
-            with open_source(self.path, settings=settings) as source:
+            # Not in equal numbers of frames: the rate of a file may be nominal, and its frames need not be regular.
+            with open_source(self.path, settings=settings, resize=True) as source:
                 opened(source.frames)
-                interval, last = max(1, round(every * source.rate)), None
+                before, last = -1.0, None
                 with closing(read_ahead(source)) as frames:
                     for frame in frames:
-                        last = frame if frame.number % interval else None
+                        interval = (frame.time + _TIME_STEP) // every if every else frame.number
+                        last = frame if interval == before else None
                         if last is None:
                             yield frame, ""
+                        before = interval
                 if last is not None:
                     yield last, ""
+                if scaled := source.counters.get("scaled"):
+                    _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
                 if skipped := source.counters.get("damaged"):
                     damaged(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
             return
-        images = self.paths()
-        opened(len(images))
-        for number, path in enumerate(images):
-            image = read_image(path)
+        pages = first_pages(self.paths()) if self.kind == "images" else pages_of(self.path)
+        opened(len(pages))
+        read_image = ImageReader(pages)
+        for number, (path, _) in enumerate(pages):
+            image = read_image(number)
             if image is None:
                 damaged(f"cannot read the image {str(path)!r}: it is left out")
             else:
@@ -160,29 +169,41 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
 
 def _files(path: Path) -> list[File]:
     if path.is_file():
-        return [File(path, "image" if path.suffix.lower() in IMAGES else "video")]
+        return [File(path, "image" if pages_of(path) else "video")]
     if not path.is_dir():
         raise VideoError(f"there is no file or folder {str(path)!r}: give videos, images, or folders of them")
-    found = list(_files_below(path))
+    others: Counter[str] = Counter()
+    found = list(_files_below(path, set(), others))
+    left_out = ", ".join(f"{number} {suffix}" for suffix, number in others.most_common())
     if not found:
         raise VideoError(
-            f"the folder {str(path)!r} and its subfolders hold neither images nor videos: give another folder"
+            f"the folder {str(path)!r} and its subfolders hold neither images nor videos"
+            f"{left_out and f' ({left_out})'}: give another folder, or name the files"
         )
+    if left_out:
+        _log.warning("left out of %s: %s; a file that is named is searched", path, left_out)
     return found
 
 
-def _files_below(folder: Path) -> Iterator[File]:
+def _files_below(folder: Path, searched: set[Path], others: Counter[str]) -> Iterator[File]:
+    """Yield the files in a folder and its subfolders, also in linked ones; count the suffixes of all others."""
+    if folder.resolve() in searched:  # a link leads back to it
+        return
+    searched.add(folder.resolve())
     entries = sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_order)
     if any(entry.suffix.lower() in IMAGES and entry.is_file() for entry in entries):
         yield File(folder, "images")
     for entry in entries:
-        if entry.is_dir() and not entry.is_symlink():
+        suffix = entry.suffix.lower()
+        if entry.is_dir():
             try:
-                yield from _files_below(entry)
+                yield from _files_below(entry, searched, others)
             except PermissionError as error:
                 _log.warning("%s is left out (%s)", error.filename, error.strerror)
-        elif entry.suffix.lower() in VIDEOS and entry.is_file():
+        elif suffix in VIDEOS and entry.is_file():
             yield File(entry, "video")
+        elif suffix not in IMAGES:
+            others[suffix or "without a suffix"] += 1
 
 
 @dataclass(frozen=True, slots=True)

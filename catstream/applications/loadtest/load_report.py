@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from catstream.applications.evaluation.runs import provenance
-from catstream.applications.loadtest.latency import Measures, percentiles, summary
-from catstream.applications.loadtest.load_test import LoadTest, Result, violations
+from catstream.applications.loadtest.latency import PERCENTILES, Measures, percentiles, summary
+from catstream.applications.loadtest.load_test import KINDS, LoadTest, Result, violations
 from catstream.applications.page import Axis, plot, table, write_page
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64
@@ -124,7 +124,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
             {
                 "rate": step.plan.rate,
                 "followed": step.followed,
-                "track": percentiles(step.track),
+                "track": {name: KINDS[name].measure(step) for name in PERCENTILES},
                 "violations": violations(load_test.limits, step),
             }
             for step in load_test.results
@@ -207,11 +207,11 @@ def _steps(load_test: LoadTest) -> Table:
             "due": f"{step.plan.rate:g} frames/s",
             "limits": "; ".join(violations(load_test.limits, step)) or "met",
             "tracked": f"{step.followed:.1f}",
-            **{f"{name} ms": milliseconds(seconds) for name, seconds in percentiles(step.track).items()},
+            **{f"{name} ms": milliseconds(KINDS[name].measure(step)) for name in PERCENTILES},
         }
         for step in load_test.results
     ]
-    return Table(title, rows, "The runs, in this order.")
+    return Table(title, rows, "The runs, in this order, with the figures of the worst stream.")
 
 
 def _plots(result: Result) -> Iterator[str]:

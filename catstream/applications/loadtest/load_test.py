@@ -101,11 +101,18 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """A quantity that can have a limit: its description, its value in a result, and whether the limit is a minimum."""
+    """A quantity that can have a limit: its description, its value in a result, and whether the limit is a minimum.
+
+    Limits of a time are given in seconds; people read milliseconds, as in the tables.
+    """
 
     about: str
     measure: Callable[[Result], float]
     minimum: bool = False
+    is_time: bool = False
+
+    def in_words(self, value: float) -> str:
+        return f"{1000 * value:.4g} ms" if self.is_time else f"{value:.4g}"
 
 
 def _worst(name: str, kind: str) -> Callable[[Result], float]:
@@ -114,9 +121,9 @@ def _worst(name: str, kind: str) -> Callable[[Result], float]:
 
 #: All quantities that can have a limit, by name. If there are several streams, the worst one counts.
 KINDS: dict[str, _Quantity] = {
-    **{name: _Quantity("seconds from a frame to its track", _worst(name, "track")) for name in PERCENTILES},
+    **{name: _Quantity("from a frame to its track", _worst(name, "track"), is_time=True) for name in PERCENTILES},
     **{
-        f"model-{name}": _Quantity("seconds from a frame to the model trained on it", _worst(name, "model"))
+        f"model-{name}": _Quantity("from a frame to the model trained on it", _worst(name, "model"), is_time=True)
         for name in PERCENTILES
     },
     "skipped": _Quantity(
@@ -168,7 +175,8 @@ class Limit:
         """Describe the limit and the measured value."""
         kind = KINDS[self.name]
         sense = "least" if kind.minimum else "most"
-        return f"{self.name} is {kind.measure(result):.4g}, limit at {sense} {self.value:g} ({kind.about})"
+        value, limit = kind.in_words(kind.measure(result)), kind.in_words(self.value)
+        return f"{self.name} is {value}, limit at {sense} {limit} ({kind.about})"
 
 
 def violations(limits: list[Limit], result: Result) -> list[str]:

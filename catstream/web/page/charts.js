@@ -47,12 +47,12 @@ export class Charts {
   plot({ drawing, right, column, least, show, unit, title }, all) {
     const points = all.filter((point) => point[column] !== null);
     const values = points.map((point) => point[column]);
-    right.textContent = values.length ? `${show(values.at(-1))}${unit && ` ${unit}`}` : "–";
+    const now = this.rows.at(-1)?.[0];
+    right.textContent = points.at(-1)?.[0] === now && now !== undefined ? `${show(values.at(-1))}${unit && ` ${unit}`}` : "–";
     drawing.replaceChildren();
     drawing.setAttribute("aria-label", values.length ? `${title}: ${right.textContent}, from ${show(Math.min(...values))} to `
       + `${show(Math.max(...values))} in the last two minutes; shaded: the object was absent` : `${title}: nothing yet`);
     if (!all.length) return;
-    const now = this.rows.at(-1)[0];
     const [wide, tall] = [drawing.clientWidth, drawing.clientHeight];
     const seconds = Math.min(SECONDS, Math.max(FEWEST, now - all[0][0]));
     const low = Math.min(0, ...values);

@@ -2,10 +2,10 @@
 
 import { $, add, duration, Items, write } from "./dom.js";
 
-const STATES = ["trouble", "failed", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
+const STATES = ["trouble", "failed", "lost", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
-  stopping: "bootstrapping", failed: "absent", alive: "present", dead: "absent" };
-const WORDS = { waiting: "waiting for a box" };
+  stopping: "bootstrapping", failed: "absent", lost: "absent", alive: "present", dead: "absent" };
+const WORDS = { waiting: "waiting for a box", lost: "source lost" };
 const byNumber = new Intl.Collator("en", { numeric: true }).compare; // cam-9 before cam-10
 const round = (value) => String(Number(value.toFixed(2)));
 

@@ -63,11 +63,11 @@ export class Objects {
 function fill({ element, choose, state, model, score, share }, one) {
   choose.setAttribute("aria-pressed", String(one.chosen));
   element.style.setProperty("--colour", one.colour);
-  element.dataset.state = one.state;
-  share.style.width = `${100 * Math.max(0, Math.min(1, one.score))}%`;
-  write(state, one.state);
+  element.dataset.state = one.state ?? "";
+  share.style.width = `${100 * Math.max(0, Math.min(1, one.score ?? 0))}%`;
+  write(state, one.state ?? "–"); // unknown while no frames are tracked
   write(model, `, model ${one.version}`);
-  write(score, one.score.toFixed(2));
+  write(score, one.score?.toFixed(2) ?? "–");
 }
 
 /** Asks what a drawn box is: a new object with a name, the chosen one, or another one in its place. */

@@ -6,6 +6,8 @@ import { BoxForm, Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { Trees } from "./trees.js";
 
+const PAUSE = { seconds: 30, renewed: 10_000 }; // of the pipeline while a box is drawn; milliseconds until it is renewed
+const TONES = { lost: "silent", starting: "waiting" };
 const MESSAGE = { delay: 8000, duration: 1000 }; // milliseconds that a message is shown, and fades
 
 export class StreamPage {
@@ -13,7 +15,7 @@ export class StreamPage {
   constructor(server) {
     this.server = server;
     this.name = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // empty if there is one stream
-    this.status = { phase: "waiting", paused: false };
+    this.status = { phase: "waiting", state: "none", paused: false };
     this.frame = null; // number and time of the newest frame
     this.charts = new Charts($(".charts"));
     this.trees = new Trees($(".trees"), $("#tree-summary"));
@@ -33,7 +35,7 @@ export class StreamPage {
     $("#pause").onclick = () => this.send(this.status.paused ? "resume" : "pause");
     $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
       "Stop it", "Continue", () => this.send("stop"));
-    addEventListener("pagehide", () => this.stage.cancel()); // nobody else would resume
+    addEventListener("pagehide", () => this.stage.cancel()); // else the pipeline resumes only once its pause is over
     const trees = $("#trees details");
     trees.open = matchMedia("(min-width: 40rem)").matches; // on a phone, they are much longer than the rest
     const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
@@ -66,8 +68,14 @@ export class StreamPage {
   }
 
   /** Send a command; returns the answer, or null if it was rejected, after showing the reason. */
-  async send(verb, more = {}) {
-    let answer;
+  async send(verb, more) {
+    const answer = await this.command(verb, more);
+    this.showMessage(answer.reason, !answer.done);
+    return answer.done ? answer : null;
+  }
+
+  /** Send a command; returns the answer, or why there is none. */
+  async command(verb, more = {}) {
     try {
       const response = await fetch("control", {
         method: "POST",
@@ -76,27 +84,38 @@ export class StreamPage {
         body: JSON.stringify({ verb, ...more }),
       });
       const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
-      answer = json ? await response.json() : { done: false, reason: (await response.text()).trim() };
+      return json ? await response.json() : { done: false, reason: (await response.text()).trim() };
     } catch {
-      answer = { done: false, reason: "the server of this page does not answer" };
+      return { done: false, reason: "the server of this page does not answer" };
     }
-    this.showMessage(answer.reason, !answer.done);
-    if (!answer.done) return null;
-    if (verb === "pause" || verb === "resume") this.status.paused = verb === "pause";
-    this.showState();
-    return answer;
   }
 
-  /** Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. */
+  /**
+   * Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. The pause ends
+   * by itself if this page does not renew it. Another pause, which the user or another program has begun, stays.
+   */
   async pause() {
     await this.left; // the pause of a box that was cancelled just now
-    if (this.isWaiting) return { frame: Infinity, leave: null };
-    const before = this.status.paused;
-    const answer = await this.send("pause");
+    if (this.status.state === "waiting") return { frame: Infinity, leave: null };
+    const answer = await this.send("pause", { seconds: PAUSE.seconds });
     if (!answer) return null;
     this.showMessage("Paused for your box.", false, false);
+    this.renewing = setInterval(() => this.renew(answer.frame), PAUSE.renewed);
+    const leave = () => {
+      clearInterval(this.renewing);
+      return (this.left = this.send("pause", { seconds: 0 }));
+    };
     // A paused pipeline holds the frame after the last tracked one; the box applies to that frame.
-    return { frame: answer.frame + 1, leave: () => (this.left = before ? this.showMessage("") : this.send("resume")) };
+    return { frame: answer.frame + 1, leave };
+  }
+
+  /** Renew the pause, unless the pipeline has continued after this frame: the picture is another one by then. */
+  async renew(frame) {
+    const answer = await this.command("pause", { seconds: PAUSE.seconds });
+    if (!answer.done || answer.frame === frame || !this.stage.drawing || this.stage.asking) return;
+    this.stage.cancel();
+    await this.left;
+    this.showMessage("The pipeline has continued meanwhile: draw the box again.", true);
   }
 
   /** Send the box, as that of a new object or of the chosen one. */
@@ -138,6 +157,7 @@ export class StreamPage {
   }
 
   showDrawing(drawing, box) {
+    if (!drawing) clearInterval(this.renewing);
     if (drawing && $("#drawing").hidden) this.form.begin();
     $("#watching").hidden = drawing;
     $("#drawing").hidden = !drawing;
@@ -176,8 +196,8 @@ export class StreamPage {
     $("#state").dataset.state = state;
     write($("#state b"), words);
     this.showSource();
-    write($("#overlay"), this.overlay(running));
-    $("#stage").classList.toggle("over", status.phase === "ended" && stage.hasPicture);
+    write($("#overlay"), this.overlay());
+    $("#stage").classList.toggle("over", (status.phase === "ended" || status.state === "lost") && stage.hasPicture);
     $("#draw").classList.toggle("main", state === "waiting" || state === "absent"); // else there is no need of one
     write($("#pause"), status.paused ? "Resume" : "Pause");
     $("#pause").setAttribute("aria-pressed", String(status.paused));
@@ -189,16 +209,10 @@ export class StreamPage {
     const { status, server, objects: { list } } = this;
     if (server.silent !== null && status.phase !== "ended") return ["silent", "page stopped"];
     if (!running) return [status.phase, status.phase === "silent" ? "pipeline silent" : status.phase];
-    if (status.lost_seconds > 0) return ["silent", `source lost for ${Math.round(status.lost_seconds)} s`];
-    if (this.isWaiting) return ["waiting", "waiting for a box"];
+    if (status.state !== "running") return [TONES[status.state] ?? status.state, status.words];
     const state = ["present", "bootstrapping", "absent"].find((each) => list.some((one) => one.state === each)) ?? "waiting";
     const words = list.length > 1 ? `${list.filter((one) => one.state !== "absent").length} of ${list.length} present` : state;
-    return [state, status.paused ? `paused, ${words}` : words];
-  }
-
-  /** Whether there is no object. The status is one of each second, so after the first box the tracks are newer. */
-  get isWaiting() {
-    return this.status.waiting && !this.objects.list.length;
+    return [state, words];
   }
 
   /** The name of the source; its whole address and the endpoint of the pipeline as the tooltip. */
@@ -212,7 +226,7 @@ export class StreamPage {
   }
 
   /** Text over the picture: the reason why it does not change. */
-  overlay(running) {
+  overlay() {
     const { status, stage, server: { closed, silent } } = this;
     if (status.phase === "ended") {
       const page = closed ? "The server of this page has ended too" : silent !== null ? "The server of this page does not answer" : "";
@@ -221,7 +235,8 @@ export class StreamPage {
     if (closed) return "The server of this page was stopped: this is the last picture. The pipeline may still run.";
     if (silent !== null) return "The server of this page does not answer. This page tries again.";
     if (status.phase === "waiting") return status.reason || "Waiting for a pipeline";
-    if (status.phase === "silent") return "The pipeline does not send messages. This page waits for it.";
-    return running && !stage.hasPicture ? "Waiting for a picture" : "";
+    if (status.phase === "silent") return `The pipeline does not send messages. This page waits for it. The reason: ${status.reason}`;
+    if (!stage.hasPicture) return "Waiting for a picture";
+    return status.state === "lost" ? `${status.words[0].toUpperCase()}${status.words.slice(1)}: this is the last picture.` : "";
   }
 }

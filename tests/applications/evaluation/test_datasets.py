@@ -97,14 +97,36 @@ def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
 
 
 def test_a_rotated_polygon_is_read_as_its_bounding_box(tmp_path):
-    place = folder(tmp_path / "walk", "groundtruth.txt", ".", "10,5,15,10,10,15,5,10\n", frames=1)
-    np.testing.assert_allclose(find_sequences(place)[0].boxes, [[5, 5, 10, 10]])
+    place = folder(tmp_path / "walk", "groundtruth.txt", ".", 2 * "10,5,15,10,10,15,5,10\n", frames=1)
+    np.testing.assert_allclose(find_sequences(place)[0].boxes, 2 * [[5, 5, 10, 10]])
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "box"),
+    [
+        ("groundtruth_rect.txt", "215,90 61,18 50,02 50", (215.9, 61.18, 50.02, 50)),
+        ("groundtruth_rect.txt", "215,9\t61,1\t50,2\t50,3", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "215,9;61,1;50,2;50,3", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "215,9, 61,1, 50,2, 50,3", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "215.9;61.1;50.2;50.3;", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "10, 20,30 ,40", (10, 20, 30, 40)),
+        ("groundtruth_rect.txt", "10,20 30,40", (10, 20, 30, 40)),
+        ("gt.txt", "10,5 20,5 30,5 40,5", (10.5, 20.5, 20, 20)),
+        ("groundtruth.txt", "215,90 61,18 50,02 50,03", (215.9, 61.18, 50.02, 50.03)),  # no polygon: 02
+        ("groundtruth.txt", "10,5 15,10 10,15", (10, 5, 5, 10)),  # a triangle
+        ("groundtruth.txt", "10.0,5 15,10 10,15 5,10", (5, 5, 10, 10)),
+        ("walk.txt", "10,5 20,5 30,5 40,5 0", (10.5, 20.5, 30.5, 40.5)),
+    ],
+)
+def test_decimal_commas_are_read_where_a_comma_can_be_nothing_else(tmp_path, name, line, box):
+    place = folder(tmp_path / "walk", name, "img", f"{line}\n{line}\n")
+    np.testing.assert_allclose(find_sequences(place)[0].boxes, [box, box])
 
 
 @pytest.mark.parametrize("row", ["0,0,0,0", "10,10,0,5", "NaN,NaN,NaN,NaN", "10,10,nan,5", "10,10,-3,5"])
 def test_a_box_without_area_is_an_absent_object(tmp_path, row):
-    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", f"1,2,3,4\n{row}\n", frames=2)
-    assert np.isnan(find_sequences(place)[0].boxes).all(axis=1).tolist() == [False, True]
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", f"1,2,3,4\n{row}\n1,2,3,4\n")
+    assert np.isnan(find_sequences(place)[0].boxes).all(axis=1).tolist() == [False, True, False]
 
 
 def test_a_folder_of_sequences_in_natural_order(tmp_path):
@@ -125,18 +147,29 @@ def test_folders_of_one_name_are_told_apart_by_the_names_of_their_links(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("name", "text", "message"),
     [
-        ("", "is empty"),
-        ("1,2,3\n", "line 1: expected four or more numbers"),
-        ("1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers"),
-        ("1,2,3,4\na,b,c,d\n", "line 2"),
-        ("nan,nan,nan,nan\n", "has no box"),
-        ("1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
+        ("groundtruth_rect.txt", "", "is empty"),
+        ("groundtruth_rect.txt", "1,2,3\n", "line 1: expected x,y,w,h, with decimal points, got '1,2,3'"),
+        ("groundtruth_rect.txt", "1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers as in line 1"),
+        ("groundtruth_rect.txt", "1,2,3,4\na,b,c,d\n", "line 2"),
+        ("groundtruth_rect.txt", "1,,2,3,4\n", "line 1"),
+        ("groundtruth_rect.txt", "x,y,w,h\n1,2,3,4\n", "line 1: expected x,y,w,h"),
+        ("groundtruth_rect.txt", "1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
+        ("groundtruth_rect.txt", "215,90,61,18,50,02,50,03\n", "line 1: expected x,y,w,h"),
+        ("groundtruth_rect.txt", "1,2,3,4,5,6,7,8\n", "line 1: expected x,y,w,h"),
+        ("groundtruth_rect.txt", "nan,nan,nan,nan\n", "has no box: expected a line with x,y,w,h for each frame"),
+        ("groundtruth_rect.txt", "1,2,3,4\n", "has one box: .* the object in at least two"),
+        ("groundtruth_rect.txt", "1,2,3,4\nnan nan nan nan\n", "has one box"),
+        ("gt.txt", "1,2,3,4,5\n", "line 1: expected x1,y1,x2,y2"),
+        ("groundtruth.txt", "215,90 61,18 50,20 50,30\n", "line 1: expected x,y,w,h or .* a polygon"),  # either
+        ("groundtruth.txt", "215,90,61,18,50,02,50,03\n", "line 1: expected x,y,w,h or .* a polygon"),
+        ("groundtruth.txt", "1,2,3,4,5,6,7\n", "line 1: expected x,y,w,h or .* a polygon"),
+        ("walk.txt", "1,0.5,0.5,0.1,0.1,7\n", "line 1: expected x,y,w,h or x,y,w,h,occluded"),
     ],
 )
-def test_a_malformed_ground_truth_is_an_error_with_the_line(tmp_path, text, message):
-    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", text)
+def test_a_malformed_ground_truth_is_an_error_with_the_line(tmp_path, name, text, message):
+    place = folder(tmp_path / "walk", name, "img", text)
     with pytest.raises(VideoError, match=message):
         find_sequences(place)
 
@@ -180,6 +213,7 @@ def test_start_frames_are_evenly_spaced_over_the_frames_with_the_object(sequence
     assert frames(1) == [0]
     assert frames(2) == [0, 8]  # the object is absent in 5, 6 and 7
     assert frames(4) == [0, 3, 8, 9]
+    assert frames(12) == [0, 1, 2, 3, 4, 8, 9, 10]  # after the last one with the object, there is nothing to measure
 
 
 @pytest.mark.parametrize("box", [(-40, 50, 60, 30), (140, 50, 60, 30), (60, 50, 30, 1), (-99, 0, 330, 90)])

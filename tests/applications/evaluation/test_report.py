@@ -1,5 +1,6 @@
 """The report and the command: one file with all in it, what made it, and a table."""
 
+import dataclasses
 import json
 import platform
 import re
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from catstream.applications.evaluation import runs as module
-from catstream.applications.evaluation.accuracy import MEASURES, write_report
+from catstream.applications.evaluation.accuracy import COUNTS, MEASURES, mean_of, rows_of, write_report
 from catstream.applications.evaluation.datasets import FIRST
 from catstream.applications.evaluation.runs import EvaluationRun, machine, provenance
 from catstream.settings import Settings
@@ -30,16 +31,29 @@ def test_the_report_is_self_contained(tmp_path, sequence, found):
     assert page.count("<tr") == 1 + 2 + 2 + 1 + 2 * 2  # the sequences with the means, and the attributes
 
 
+def test_the_frames_without_a_reported_box_are_added_up_over_runs_and_sequences(tmp_path, sequence, found):
+    boxes, other = found.copy(), dataclasses.replace(sequence, name="other")
+    absent = np.flatnonzero(np.isnan(sequence.boxes[:, 0]))
+    boxes[[0, *absent[:2]]] = np.nan
+    runs = [run_of(sequence, found), run_of(sequence, boxes), run_of(other, boxes)]
+    mean = mean_of(rows_of(runs))["catstream"]
+    count = len(absent)
+    assert [mean[each] for each in COUNTS] == [3 * count, 4, 3 * (12 - count), 2]
+    page = write_report(tmp_path / "report.html", runs, Settings(), {}).read_text()
+    assert f"2/{2 * count} {1 / count:.0%}" in page
+    assert f"2/{3 * (12 - count)} " in page
+
+
 def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
     out, file = tmp_path / "out", tmp_path / "numbers.json"
     attributes = tmp_path / "attributes.json"
     attributes.write_text('{"walk": ["blur"]}')
     files = ["--output", out, "--json", file, "--attributes", attributes]
     output, errors = succeed("evaluate", walk, *files, "--set", "coreset.size=32")
-    assert re.search(r"walk +catstream +12 +0\.\d{3}", output)
+    assert re.search(r"walk +catstream +12 +0\.\d{3} .* \d/3 \d+(\.0)?%  0/9 0\.0%", output)
     assert "report.html" in output + errors
     figures = json.loads(file.read_text())
-    assert figures["mean"]["catstream"].keys() == set(MEASURES)
+    assert figures["mean"]["catstream"].keys() == {*MEASURES, *COUNTS}
     assert figures["mean"]["catstream"]["success"] > 0.7
     assert figures["attributes"]["blur"] == {"sequences": ["walk"], "mean": figures["mean"]}
     assert (out / "report.html").exists()
@@ -65,14 +79,20 @@ def test_options_that_contradict_one_another_are_an_error(walk, fail, options, m
 
 
 def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk, said):
-    torn = tmp_path / "torn"
-    shutil.copytree(walk, torn)
-    (torn / "img" / "0012.png").unlink()
+    for name in ("torn", "malformed"):
+        shutil.copytree(walk, tmp_path / "all" / name)
+    shutil.copytree(walk, tmp_path / "all" / "walk")
+    (tmp_path / "all" / "torn" / "img" / "0012.png").unlink()
+    (tmp_path / "all" / "malformed" / "groundtruth_rect.txt").write_text("1,2,3,4\n")
     file = tmp_path / "out.json"
-    code, output, errors = said("evaluate", walk, torn, "--tracker", "mil", "--json", file)
+    options = "--tracker", "mil", "--json", file, "--output", tmp_path / "out"
+    code, output, errors = said("evaluate", tmp_path / "all", *options)
     assert re.search(r"walk +mil +12 +0\.\d{3}", output)
-    assert re.search(r"mil on torn: .* 1 frame too few", errors)
-    assert (code, "1 of 2 runs" in errors.splitlines()[-1]) == (1, True)
+    page = (tmp_path / "out" / "report.html").read_text()
+    for message in (r"mil on torn: .* 1 frame too few", r"malformed/groundtruth_rect.txt\S* has one box"):
+        assert re.search(message, errors)
+        assert re.search(message, page)
+    assert (code, "2 of 3 runs" in errors.splitlines()[-1]) == (1, True)
     assert [row["name"] for row in json.loads(file.read_text())["sequences"]] == ["walk"]
 
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from catstream.applications.evaluation.scores import (
+    Absence,
     distances,
     is_lost,
     long_term,
@@ -104,6 +105,12 @@ def test_frames_without_a_reported_box_count_as_missed():
     assert overlaps(half, truth)[::2].max() == 0
     assert np.isinf(distances(half, truth)[::2]).all()
     assert score(half, truth).success <= score(found, truth).success
+
+
+def test_frames_without_a_reported_box_are_noticed_or_false_absence():
+    found, truth = boxes()
+    truth[10:18], found[15:25] = np.nan, np.nan
+    assert score(found, truth).absence == Absence(absent=8, noticed=3, present=32, false=7)
 
 
 def test_boxes_in_frames_without_the_object_reduce_precision_unless_their_confidence_is_low():

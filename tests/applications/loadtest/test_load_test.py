@@ -76,7 +76,7 @@ def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not
 
 def test_a_limit_applies_to_the_worst_stream(result):
     run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
-    assert violations([Limit("p99", 0.1)], run) == ["p99 is 0.2, limit at most 0.1 (seconds from a frame to its track)"]
+    assert violations([Limit("p99", 0.1)], run) == ["p99 is 200 ms, limit at most 100 ms (from a frame to its track)"]
     assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
 
 

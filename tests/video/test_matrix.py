@@ -1,0 +1,168 @@
+"""Containers, codecs, frame rates, sound and joins: all frames and their times, as Debian's FFmpeg says."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from catstream.video.source import open_source
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no ffmpeg to compare with: apt-get install ffmpeg"),
+]
+
+FRAMES, RATE, SIZE = 24, 25, (160, 120)
+_B_FRAMES = "-bf 2 -g 8"
+#: Options of the encoder of each codec.
+CODECS = {
+    "H.264": f"-c:v libx264 -preset superfast -pix_fmt yuv420p {_B_FRAMES}",
+    "HEVC": "-c:v libx265 -preset superfast -x265-params log-level=error:keyint=8",
+    "AV1": "-c:v libaom-av1 -cpu-used 8 -g 8 -crf 40",
+    "VP8": "-c:v libvpx -deadline realtime -g 8 -crf 20 -b:v 1M",
+    "VP9": "-c:v libvpx-vp9 -deadline realtime -cpu-used 8 -lag-in-frames 16 -auto-alt-ref 1 -g 8",
+    "MPEG-4": f"-c:v mpeg4 -qscale:v 3 {_B_FRAMES}",
+    "MPEG-2": f"-c:v mpeg2video -qscale:v 3 {_B_FRAMES}",
+    "MPEG-1": f"-c:v mpeg1video -qscale:v 3 {_B_FRAMES}",
+    "MJPEG": "-c:v mjpeg -qscale:v 3 -pix_fmt yuvj420p",
+    "ProRes": "-c:v prores_ks",
+    "FFV1": "-c:v ffv1",
+    "Theora": "-c:v libtheora -qscale:v 9 -g 8",
+    "WMV": "-c:v wmv2 -qscale:v 3",
+    "Sorenson": "-c:v flv -qscale:v 3",
+    "GIF": "-c:v gif",
+    "raw": "-pix_fmt yuv420p",
+}
+#: Codecs of each container, and that of its sound.
+CONTAINERS = {
+    "mp4": ("H.264 HEVC AV1 VP9 MPEG-4", "aac"),
+    "mov": ("H.264 ProRes MJPEG", "pcm_s16le"),
+    "3gp": ("H.264", "aac"),
+    "mkv": ("H.264 VP9 FFV1 Theora", "aac"),
+    "webm": ("VP8 VP9 AV1", "libopus"),
+    "avi": ("H.264 MPEG-4 MJPEG FFV1", "pcm_s16le"),
+    "ts": ("H.264 HEVC MPEG-2", "aac"),
+    "m2ts": ("H.264", "ac3"),
+    "mpg": ("MPEG-1 MPEG-2", "mp2"),
+    "vob": ("MPEG-2", "ac3"),
+    "flv": ("H.264 Sorenson", "aac"),
+    "wmv": ("WMV", "wmav2"),
+    "ogv": ("Theora", "libvorbis"),
+    "mxf": ("MPEG-2", ""),
+    "nut": ("FFV1", "aac"),
+    "gif": ("GIF", ""),
+    "y4m": ("raw", ""),
+    "h264": ("H.264", ""),
+    "hevc": ("HEVC", ""),
+}
+#: Containers without time stamps: frames have equal distances.
+RAW = {"y4m", "h264", "hevc"}
+#: Those of which FFmpeg reads two files that were joined byte by byte.
+JOINABLE = {"mkv", "webm", "ts", "m2ts", "mpg", "vob", "h264", "hevc"}
+#: Codecs and containers that cannot state a frame rate of 1000, or of which it is not compared.
+REGULAR = {"MPEG-1", "MPEG-2", "Theora", "AV1", "mxf", "gif", "mov", "3gp", "avi"}
+FORMATS = [(container, codec) for container, (codecs, _) in CONTAINERS.items() for codec in codecs.split()]
+
+#: Frame n of an irregular video is shown at so many twenty-fifths of a second.
+IRREGULAR = "(N+floor(N/3)+2*floor(N/7))"
+
+
+@pytest.fixture(scope="session")
+def pictures(tmp_path_factory):
+    """Uncompressed frames that show their number as five black and white fields."""
+    path, rng = tmp_path_factory.mktemp("pictures") / "numbered.bgr", np.random.default_rng(0)
+    scene = rng.integers(60, 190, (SIZE[1] // 8, SIZE[0] // 8, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    images = np.repeat(scene[None], FRAMES, 0)
+    for number in range(FRAMES):
+        for bit in range(5):
+            images[number, 8:32, 32 * bit : 32 * bit + 32] = 255 * (number >> bit & 1)
+    path.write_bytes(images.tobytes())
+    return path
+
+
+def number_of(image: np.ndarray) -> int:
+    return sum((int(image[16:24, 32 * bit + 8 : 32 * bit + 24].mean() > 127) << bit) for bit in range(5))
+
+
+def ffmpeg(*words: object) -> None:
+    subprocess.run(["ffmpeg", "-nostdin", "-v", "error", "-y", *map(str, words)], check=True)
+
+
+def make(path: Path, pictures: Path, codec: str, *, rate: int, times: str, sound: str) -> Path:
+    """Write the pictures at these times, with a sound that begins before them, or outlasts them."""
+    container = path.suffix[1:]
+    offset = 0.4 if sound == "before" else 0.0
+    tone = ["-f", "lavfi", "-itsoffset", 0 if offset else 0.2, "-i", "sine=duration=2.5:sample_rate=48000"]
+    tone, coder = (
+        (tone, ["-ac", 2, "-c:a", CONTAINERS[container][1]]) if sound and CONTAINERS[container][1] else ([], [])
+    )
+    stamps = f"settb=1/1000,setpts=({times}/{RATE}+{offset})/TB" if container not in RAW else "null"
+    ffmpeg(
+        *("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", "160x120", "-framerate", rate, "-i", pictures, *tone),
+        *("-vf", stamps, "-fps_mode", "passthrough", *CODECS[codec].split(), *coder, path),
+    )  # fmt: skip
+    return path
+
+
+def said(path: Path) -> list[float | None]:
+    """The times of the frames that FFmpeg's own tool says; None where it says none."""
+    command = ["ffprobe", "-v", "quiet", "-select_streams", "V:0", "-show_entries", "frame=best_effort_timestamp_time"]
+    answer = json.loads(subprocess.run([*command, "-of", "json", path], check=True, capture_output=True).stdout)
+    times = [frame.get("best_effort_timestamp_time") for frame in answer["frames"]]
+    return [None if time is None or path.suffix[1:] in RAW else float(time) for time in times]
+
+
+def read(path: Path) -> tuple[list[int], list[float]]:
+    with open_source(path) as source:
+        frames = list(source)
+        # A cut may begin with frames that cannot be decoded, because they refer to some before it.
+        assert len(frames) <= (source.frames or 0) <= len(frames) + (3 if path.stem == "cut" else 0)
+    return [number_of(frame.image) for frame in frames], [frame.time for frame in frames]
+
+
+def compared(times: list[float], wanted: list[float | None]) -> None:
+    """Compare times from the first frame that has one on."""
+    assert len(times) == len(wanted)
+    known = [(time, other) for time, other in zip(times, wanted, strict=True) if other is not None]
+    assert [time - known[0][0] for time, _ in known] == pytest.approx([o - known[0][1] for _, o in known], abs=0.0015)
+
+
+@pytest.mark.parametrize(("container", "codec"), FORMATS, ids=str)
+def test_all_frames_and_their_times_are_those_that_ffmpeg_says(tmp_path, pictures, container, codec):
+    constant = make(tmp_path / f"constant.{container}", pictures, codec, rate=RATE, times="N", sound="")
+    variants = [(constant, range(FRAMES))]
+    if container not in RAW:
+        variable = tmp_path / f"variable.{container}"
+        variants.append((make(variable, pictures, codec, rate=RATE, times=IRREGULAR, sound="after"), range(FRAMES)))
+        cut = tmp_path / f"cut.{container}"
+        if (
+            container != "ogv" and codec != "AV1"
+        ):  # of which Debian's FFmpeg says wrong times, and frames before the cut
+            ffmpeg("-ss", 0.48, "-i", constant, "-c", "copy", cut)
+            variants.append((cut, None))
+        if not {container, codec} & REGULAR:
+            nominal = tmp_path / f"nominal.{container}"
+            variants.append((make(nominal, pictures, codec, rate=1000, times=IRREGULAR, sound="before"), range(FRAMES)))
+    for path, wanted in variants:
+        numbers, times = read(path)
+        compared(times, said(path) if container not in RAW else [number / RATE for number in range(FRAMES)])
+        assert numbers == list(wanted or range(numbers[0], numbers[0] + len(times))), path.name
+    if container in JOINABLE:
+        joined = tmp_path / f"joined.{container}"
+        joined.write_bytes(2 * constant.read_bytes())
+        numbers, times = read(joined)
+        assert len(said(joined)) == len(numbers)
+        assert numbers[-FRAMES:] == list(range(FRAMES))
+        assert times == pytest.approx([number / RATE for number in range(len(times))], abs=0.0015)
+
+
+def test_the_table_of_the_how_to_lists_what_is_compared():
+    page = Path(__file__).parents[2] / "docs" / "how-to" / "inputs.md"
+    rows = dict(re.findall(r"^\| \.(\w+) \| ([^|]+) \|", page.read_text(), re.MULTILINE))
+    assert rows == {container: codecs.replace(" ", ", ") for container, (codecs, _) in CONTAINERS.items()}
