@@ -55,7 +55,7 @@ IMPORTERS = {
     "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
-    "av": ["catstream/video", "catstream/applications/loadtest/camera.py"],
+    "av": ["catstream/video", "catstream/applications/loadtest/camera.py", "catstream/applications/loadtest/rtsp.py"],
     "zmq": [
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",

@@ -24,6 +24,7 @@ from catstream.cli.common import (
     write_json,
 )
 from catstream.errors import CatstreamError
+from catstream.messages.names import counted
 from catstream.messages.storage import writing
 from catstream.services.options import FOLDER, PATH, NumberRange, with_settings
 from catstream.settings import Settings
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
 
 _FAILED = 1  # exit code if a limit was not met or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
-_FIND = ("p99=0.1", "skipped=0.01")  # limits of a search if none are given
+#: Limits of a search if none are given.
+_FIND = {"rate": ("p99=0.1", "skipped=0.01"), "streams": ("p99=0.1", "skipped=0"), None: ()}
 
 
 @click.command()
@@ -184,7 +186,15 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
 )
+@click.option(
+    "--source",
+    type=click.Choice(["mjpeg", "h264"]),
+    default="mjpeg",
+    show_default=True,
+    help="MJPEG over HTTP, or H.264 over RTSP.",
+)
 @click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
+@click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets them.")
 @click.option(
     "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
 )
@@ -192,13 +202,18 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option("--output", type=FOLDER, help="Folder for report.html.")
 @with_settings
 def loadtest(
-    find_limit: bool, limits: tuple[str, ...], json_file: Path | None, output: Path | None, **plan: Any
+    find_limit: bool,
+    find_streams: bool,
+    limits: tuple[str, ...],
+    json_file: Path | None,
+    output: Path | None,
+    **plan: Any,
 ) -> None:
     """Run pipelines under load, and measure latency and losses.
 
-    The load test sends a rendered video with ground truth over HTTP on the
-    loopback interface; a pipeline of its own tracks each stream. The camera
-    does not wait: frame i is due at start + i / RATE, and latency counts from
+    The load test sends a rendered video with ground truth on the loopback
+    interface; a pipeline of its own tracks each stream. The camera does not
+    wait: frame i is due at start + i / RATE, and latency counts from
     then. The latency of a skipped frame ends with the track of a newer one.
     Slow subscribers read two tracks per second; half of them are frozen
     instead.
@@ -212,8 +227,10 @@ def loadtest(
       success                   share of frames with an overlap above 0.5, at least
 
     With --find-limit, the search begins with RATE, each rate runs for DURATION,
-    and the limits are p99=0.1 and skipped=0.01 if none are given. The exit code
-    is 1 if a limit was not met or a stream failed.
+    and the limits are p99=0.1 and skipped=0.01 if none are given. With
+    --find-streams, it begins with STREAMS, and the limits are p99=0.1 and
+    skipped=0: how many cameras can this machine serve? The exit code is 1 if a
+    limit was not met or a stream failed.
 
     \b
     EXAMPLES
@@ -221,12 +238,16 @@ def loadtest(
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
       catstream loadtest --find-limit --size 320x240
+      catstream loadtest --find-streams --rate 25 --size 1920x1080 --source h264
     """
     # Imported here so that --help and the other commands start faster.
-    from catstream.applications.loadtest.load_report import milliseconds, to_json, write_report
+    from catstream.applications.loadtest.load_report import answer, milliseconds, to_json, write_report
     from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
 
-    asked = [Limit.parse(text) for text in limits or (_FIND if find_limit else ())]
+    if find_limit and find_streams:
+        raise click.UsageError("--find-limit and --find-streams each search for one number: give one of them")
+    find = "rate" if find_limit else "streams" if find_streams else None
+    asked = [Limit.parse(text) for text in limits or _FIND[find]]
     parameters = Plan(**plan)
     if output is not None:
         with writing(output):
@@ -240,24 +261,29 @@ def loadtest(
             progress.update(task, description=activity, completed=share, figures=figures)
 
         def done(result: Result) -> None:
-            if find_limit:
-                verdict = "; ".join(violations(asked, result)) or "met"
+            if find is not None:
+                (cores, memory), verdict = result.cost, "; ".join(violations(asked, result)) or "met"
                 click.echo(
-                    f"{result.plan.rate:g} frames/s due; in the worst stream {result.followed:.1f} tracked, "
-                    f"p99 {milliseconds(KINDS['p99'].measure(result))} ms: {verdict}"
+                    f"{counted(result.plan.streams, 'stream')}, {result.plan.rate:g} frames/s due; in the worst stream "
+                    f"{result.followed:.1f} tracked, p99 {milliseconds(KINDS['p99'].measure(result))} ms; each takes "
+                    f"{cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
                 )
 
-        load_test = run_load_test(parameters, asked, find=find_limit, report=report, done=done)
+        load_test = run_load_test(parameters, asked, find=find, report=report, done=done)
+    for value, reason in load_test.refused.items():
+        click.echo(f"{value:g} streams did not start: {reason}")
     if load_test.results:
+        if find == "streams":
+            click.echo(f"{answer(load_test)}.")
         _print_run(load_test.result, asked)
         write_json(json_file, to_json(load_test))
         if output is not None:
             click.echo(f"report: {write_report(output / 'report.html', load_test)}")
     if load_test.interrupted:
         stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
-    if load_test.highest_rate:
+    if find == "rate" and load_test.highest:
         click.echo(
-            f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest_rate:g} frames/s a stream"
+            f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest:g} frames/s a stream"
         )
     for line in load_test.violations:
         complain(f"broken: {line}")

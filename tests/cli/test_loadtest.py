@@ -3,7 +3,10 @@
 import json
 import re
 
+import psutil
 import pytest
+
+from catstream.applications.loadtest import load_test
 
 
 def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
@@ -34,6 +37,26 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
 
 
+@pytest.mark.system
+def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(said, tmp_path, monkeypatch):
+    monkeypatch.setattr(load_test, "MOST_STREAMS", 2)
+    arguments = ["--find-streams", "--rate", 20, "--duration", 1, "--size", "320x240", "--limit", "p99=60"]
+    code, output, _ = said("loadtest", *arguments, "--output", "load", "--json", "x.json", cwd=tmp_path)
+    assert code == 0
+    steps, _, rest = output.partition("This machine serves 2 streams of 320x240 pixels, 20 frames/s due in each; ")
+    assert re.findall(r"^(\d) streams?, .* cores, .* MB: met$", steps, re.MULTILINE) == ["1", "2"]
+    assert re.match(r"a stream takes \d\.\d\d cores and \d+ MB\.\n", rest)
+
+    figures = json.loads((tmp_path / "x.json").read_text())
+    assert figures["highest_streams"] == 2
+    for stream in figures["streams"]:
+        assert 0 < stream["cores"] < psutil.cpu_count()
+        assert 10e6 < stream["memory"] < 2e9
+    page = (tmp_path / "load" / "report.html").read_text()
+    places = [page.index(part) for part in ("This machine serves", "p99 of the worst stream", "<h2>Streams</h2>")]
+    assert places == sorted(places)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -41,6 +64,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
         (["--size", "20x20"], "for example 640x480"),
         (["--subscribers", 1, "--slow-subscribers", 2], "2 of 1 subscribers cannot be slow"),
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
+        (["--find-limit", "--find-streams"], "give one of them"),
         (["--rate", 0], "0.5<=x<=1000"),
         (["--json", "missing/x.json"], "give a file in a folder that exists"),
         (["--output", "/dev/null/load"], "give another place"),

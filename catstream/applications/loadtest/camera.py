@@ -1,9 +1,9 @@
-"""The camera of a load test: a process that sends known images over HTTP at the times of a schedule.
+"""The camera of a load test: a process that sends known images over HTTP or RTSP at the times of a schedule.
 
 Each frame is sent when it is due, even if the receiver has not read the frames before it; a slow receiver gets frames
 late, but none is left out. The time stamp of a frame in the stream is its due time by `time.monotonic`, so the receiver
-can compute its number and its age. The container is NUT, because FFmpeg returns its frames without delay; for other
-containers it buffers one frame.
+can compute its number and its age. Over HTTP, the container is NUT, because FFmpeg returns its frames without delay;
+for other containers, and for H.264 over RTSP, it buffers one frame.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from multiprocessing.connection import Connection
 from time import monotonic
 from typing import Any, Self, cast
 
+from catstream.applications.loadtest.rtsp import RtspConnection
 from catstream.applications.workers import SPAWN, sigint_blocked
 from catstream.errors import ServiceError
 from catstream.services.process import die_with
@@ -73,9 +74,9 @@ class Camera:
     urls : URL of each stream
     """
 
-    def __init__(self, pictures: Sequence[bytes], size: tuple[int, int], streams: int) -> None:
+    def __init__(self, files: Sequence[bytes], size: tuple[int, int], streams: int, source: str = "mjpeg") -> None:
         self._pipe, self._other = SPAWN.Pipe()
-        arguments = self._other, pictures, size, streams, os.getpid()
+        arguments = self._other, files, size, streams, source, os.getpid()
         self._process = SPAWN.Process(target=_broadcast, args=arguments, daemon=True)
 
     @property
@@ -120,9 +121,11 @@ class Camera:
             raise ServiceError("the camera of the load test has exited: its error is printed above") from None
 
 
-def _broadcast(pipe: Connection, pictures: Sequence[bytes], size: tuple[int, int], streams: int, parent: int) -> None:
+def _broadcast(
+    pipe: Connection, files: Sequence[bytes], size: tuple[int, int], streams: int, source: str, parent: int
+) -> None:
     die_with(parent)
-    with Broadcast(pictures, size, streams) as broadcast:
+    with Broadcast(files, size, streams, source) as broadcast:
         pipe.send(broadcast.urls)
         while True:
             asked = pipe.recv()
@@ -130,7 +133,9 @@ def _broadcast(pipe: Connection, pictures: Sequence[bytes], size: tuple[int, int
 
 
 class Broadcast(ThreadingHTTPServer):
-    """Serves streams of the same images, JPEG files, on the loopback interface; a context manager.
+    """Serves streams of the same images on the loopback interface; a context manager.
+
+    `files` are JPEG files for the source mjpeg, and access units of `rtsp.encode` for h264.
 
     The schedules of n streams are shifted by 1/n of a frame each, so that frames are not due at the same time.
 
@@ -140,12 +145,16 @@ class Broadcast(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, pictures: Sequence[bytes], size: tuple[int, int], streams: int = 1) -> None:
-        super().__init__(("127.0.0.1", 0), _Connection)
-        self._pictures, self._size, self._closed = pictures, size, threading.Event()
+    def __init__(
+        self, files: Sequence[bytes], size: tuple[int, int], streams: int = 1, source: str = "mjpeg"
+    ) -> None:
+        self._is_h264 = source == "h264"
+        super().__init__(("127.0.0.1", 0), RtspConnection if self._is_h264 else _Connection)
+        self._files, self._size, self._closed = files, size, threading.Event()
         self._schedules = [Schedule(monotonic(), _STILL_RATE, frames=1)] * streams
         self.late = 0.0
-        self.urls = [f"http://127.0.0.1:{self.server_port}/{number}" for number in range(streams)]
+        protocol = "rtsp" if self._is_h264 else "http"
+        self.urls = [f"{protocol}://127.0.0.1:{self.server_port}/{number}" for number in range(streams)]
 
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Start to send the images by a schedule; return the schedule of each stream."""
@@ -171,16 +180,16 @@ class Broadcast(ThreadingHTTPServer):
         with av.open(pipe, "w", format="nut", options={"flush_packets": "1"}) as container:
             track: Any = container.add_stream("mjpeg", rate=Fraction(_STILL_RATE))
             track.width, track.height, track.pix_fmt, track.time_base = *self._size, "yuvj420p", clock
-            for moment, picture in self._frames(stream):
-                packet = av.Packet(self._pictures[picture])
+            for moment, picture in self.frames(stream):
+                packet = av.Packet(picture)
                 packet.stream, packet.time_base, packet.is_keyframe = track, clock, True
                 packet.pts = packet.dts = round(moment * _TICKS_PER_SECOND)
                 container.mux(packet)
                 if pipe.broken:
                     break
 
-    def _frames(self, stream: int) -> Iterator[tuple[float, int]]:
-        """Yield due time and image of each frame when it is due; switch to a new schedule as soon as it is set."""
+    def frames(self, stream: int) -> Iterator[tuple[float, bytes]]:
+        """Yield due time and file of each frame when it is due; switch to a new schedule as soon as it is set."""
         while not self._closed.is_set():
             schedule = self._schedules[stream]
             number = schedule.following(monotonic())
@@ -192,8 +201,15 @@ class Broadcast(ThreadingHTTPServer):
                     if left > 1 / _STILL_RATE:
                         continue
                     self.late = max(self.late, monotonic() - due)
-                yield due, schedule.picture(number, len(self._pictures))
+                yield due, self._file(schedule, number)
                 number += 1
+
+
+    def _file(self, schedule: Schedule, number: int) -> bytes:
+        if not self._is_h264:
+            return self._files[schedule.picture(number, len(self._files))]
+        # All but key frames refer to the one before. So the still is a key frame, and the video goes on after its end.
+        return self._files[number % len(self._files) if number > 0 and schedule.frames > 1 else 0]
 
 
 class _Connection(BaseHTTPRequestHandler):

@@ -8,7 +8,7 @@ pipeline does not get better figures by skipping frames while it is slow (no coo
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from statistics import fmean
 from threading import Event, Thread
@@ -291,6 +291,20 @@ class Usage:
             return process.cpu_percent() / 100, process.memory_info().rss
         except psutil.Error:
             return 0.0, 0
+
+
+def proportional_memory(pids: Iterable[int]) -> int:
+    """Return the bytes of these processes (PSS): a page that n processes share counts as 1/n of a page in each."""
+    total = 0
+    for pid in pids:
+        with suppress(psutil.Error):  # it has just ended
+            total += psutil.Process(pid).memory_full_info().pss
+    return total
+
+
+def available_memory() -> int:
+    """Return the bytes that processes can still use on this machine."""
+    return int(psutil.virtual_memory().available)
 
 
 def summary(readings: Sequence[tuple[float, int]]) -> dict[str, float]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from catstream.applications.evaluation.runs import provenance
 from catstream.applications.loadtest.latency import PERCENTILES, Measures, percentiles, summary
-from catstream.applications.loadtest.load_test import KINDS, LoadTest, Result, violations
+from catstream.applications.loadtest.load_test import KINDS, MOST_STREAMS, LoadTest, Result, violations
 from catstream.applications.page import Axis, plot, table, write_page
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64
@@ -39,6 +39,8 @@ def tables(result: Result) -> Iterator[Table]:
             "stream": str(number),
             "frames/s": f"{each.rate(result.plan.rate):.1f}",
             "skipped": f"{100 * each.skipped_share:.1f} %",
+            "cores": f"{result.cores(number):.2f}",
+            "MB": _shown(result.memory[number] / 1e6 if result.memory else None, ".0f"),
             **_latencies(each.track, each.model),
             "lag": str(each.max_lag),
             "not stored": _shown(each.not_stored, "d"),
@@ -50,7 +52,8 @@ def tables(result: Result) -> Iterator[Table]:
     yield Table(
         "Streams",
         streams + together,
-        "Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet received. Not "
+        "Cores: processor seconds per second of all processes of the stream; MB: their memory, in which a page that n "
+        "processes share counts as 1/n of a page (PSS). Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet received. Not "
         "stored: features messages that were not in the coreset trees at the end. Success: share of frames with an "
         "overlap with the ground truth above 0.5; a skipped frame has the last known box. Of tracked: the same over "
         "the frames that were not skipped.",
@@ -108,7 +111,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
         "seconds": result.seconds,
         "interrupted": load_test.interrupted,
         "latency": {"track": percentiles(result.track), "model": percentiles(result.model)},
-        "streams": [_stream(measures, result.plan.rate) for measures in result.streams],
+        "streams": [_stream(result, number) for number in range(len(result.streams))],
         "processes": {name: summary(readings) for name, readings in result.usage.items()},
         "subscribers": {
             "quick": len(result.received),
@@ -119,23 +122,31 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
         "camera_late": round(result.camera_late, 6),
         "limits": {limit.name: {"value": limit.value, "met": limit.is_met(result)} for limit in load_test.limits},
         "violations": load_test.violations,
-        "highest_rate": load_test.highest_rate,
+        "highest_rate": load_test.highest if load_test.find == "rate" else None,
+        "highest_streams": result.plan.streams if load_test.find == "streams" and load_test.highest else None,
         "steps": [
             {
                 "rate": step.plan.rate,
+                "streams": step.plan.streams,
+                "skipped": KINDS["skipped"].measure(step),
+                **dict(zip(("cores", "memory"), step.cost, strict=True)),
                 "followed": step.followed,
                 "track": {name: KINDS[name].measure(step) for name in PERCENTILES},
                 "violations": violations(load_test.limits, step),
             }
             for step in load_test.results
         ],
+        "refused": {f"{value:g}": reason for value, reason in load_test.refused.items()},
     }
 
 
-def _stream(measures: Measures, rate: float) -> dict[str, object]:
+def _stream(result: Result, number: int) -> dict[str, object]:
+    measures = result.streams[number]
     return {
+        "cores": result.cores(number),
+        "memory": result.memory[number] if result.memory else None,
         "frames": measures.frames,
-        "frames_per_second": measures.rate(rate),
+        "frames_per_second": measures.rate(result.plan.rate),
         "skipped": measures.skipped,
         "without_track": measures.without_track,
         "track": percentiles(measures.track),
@@ -151,12 +162,13 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
     """Write the report of the decisive run, and of the search steps."""
     result = load_test.result
     streams, *others = tables(result)
+    kind = "good" if load_test.highest else "bad"
     return write_page(
         path,
         "load test",
         [
             "<h1>Load test</h1>",
-            _verdict(result),
+            _verdict(result) if load_test.find != "streams" else f'<p class="{kind}">{escape(answer(load_test))}.</p>',
             f'<p class="about">{result.plan}, {result.seconds:.1f} s{", interrupted" * load_test.interrupted}. Latency '
             "counts from the due time of a frame; that of a skipped frame ends with the track of a newer one. The "
             f"camera was at most {milliseconds(result.camera_late)} ms late, and other processes of this machine kept "
@@ -166,7 +178,8 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
                 f'<p class="{"good" if limit.is_met(result) else "bad"}">{escape(limit.describe(result))}</p>'
                 for limit in load_test.limits
             ),
-            _html(_steps(load_test)) if load_test.is_search else "",
+            _html(_steps(load_test)) if load_test.find else "",
+            f'<div class="plots">{"".join(_plots_of_steps(load_test))}</div>' if load_test.find else "",
             _html(streams),
             f'<div class="plots">{"".join(_plots(result))}</div>',
             *map(_html, others),
@@ -197,21 +210,44 @@ def _verdict(result: Result) -> str:
     )
 
 
+def answer(load_test: LoadTest) -> str:
+    """How many streams this machine serves, or the highest rate, and what a stream costs."""
+    if load_test.highest is None:
+        what = "number of streams" if load_test.find == "streams" else "rate"
+        return f"Interrupted before a {what} was found" if load_test.interrupted else f"No {what} meets the limits"
+    if load_test.find == "rate":
+        return f"The highest rate that meets the limits: {load_test.highest:g} frames/s"
+    (cores, memory), most = load_test.result.cost, "at least " * (load_test.highest == MOST_STREAMS)
+    return f"This machine serves {most}{load_test.result.plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB"
+
+
 def _steps(load_test: LoadTest) -> Table:
-    if load_test.highest_rate:
-        title = f"The highest rate that meets the limits: {load_test.highest_rate:g} frames/s"
-    else:
-        title = "Interrupted before a rate was found" if load_test.interrupted else "No rate meets the limits"
     rows = [
         {
+            "streams": f"{step.plan.streams}",
             "due": f"{step.plan.rate:g} frames/s",
             "limits": "; ".join(violations(load_test.limits, step)) or "met",
             "tracked": f"{step.followed:.1f}",
+            "skipped": f"{100 * KINDS['skipped'].measure(step):.1f} %",
             **{f"{name} ms": milliseconds(KINDS[name].measure(step)) for name in PERCENTILES},
+            "cores a stream": f"{step.cost[0]:.2f}",
+            "MB a stream": f"{step.cost[1] / 1e6:.0f}",
         }
         for step in load_test.results
     ]
-    return Table(title, rows, "The runs, in this order, with the figures of the worst stream.")
+    refused = "".join(f" {value:g} streams did not start: {escape(why)}." for value, why in load_test.refused.items())
+    note = f"The runs, in this order, with the figures of the worst stream; cores and MB are means.{refused}"
+    return Table(answer(load_test), rows, note)
+
+
+def _plots_of_steps(load_test: LoadTest) -> Iterator[str]:
+    """Plot the worst p99 and share of skipped frames over the parameter that was searched for."""
+    steps = sorted(load_test.results, key=load_test.value)
+    values = np.array([load_test.value(step) for step in steps])
+    x = Axis.upto(float(values.max()), "streams" if load_test.find == "streams" else "frames/s")
+    for name, factor, unit in (("p99", 1000, "ms"), ("skipped", 100, "%")):
+        ys = factor * np.array([KINDS[name].measure(step) for step in steps])
+        yield plot(f"{name} of the worst stream", x, Axis.upto(float(ys.max()), unit), {name: (values, ys)})
 
 
 def _plots(result: Result) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""A load test: its plan, its limits, a single run, and the search for the highest rate at which the limits are met."""
+"""A load test: its plan, its limits, a single run, and the search for the highest rate or number of streams."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from os import getpid
 from time import monotonic
+from typing import Literal
 
 import numpy as np
 
@@ -19,18 +20,25 @@ from catstream.applications.loadtest.latency import (
     Measures,
     Observations,
     Usage,
+    available_memory,
     measure,
     observed,
     percentiles,
+    proportional_memory,
     summary,
 )
 from catstream.applications.loadtest.load import Stream, Subscribers, Video, render
+from catstream.applications.loadtest.rtsp import encode
 from catstream.errors import ServiceError, SettingsError
 from catstream.messages.names import check_count, counted
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings
 from catstream.video import rendered
 
+#: Parameters that a search may find, by their names in `Plan`.
+Parameter = Literal["rate", "streams"]
+
+MOST_STREAMS = 64  # of a load test
 _LEAST, _MOST = 0.5, 1000.0  # frames per second
 _PRECISION = 0.05  # maximum relative error of the highest rate
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
@@ -51,6 +59,7 @@ class Plan:
     rate              frames per second of each stream, whether or not the pipeline keeps up
     duration          seconds
     size              (width, height) of a frame in pixels
+    source            what the camera sends: mjpeg, over HTTP, or h264, over RTSP
     settings          settings of all pipelines
     """
 
@@ -61,6 +70,7 @@ class Plan:
     rate: float = 25.0
     duration: float = 10.0
     size: tuple[int, int] = rendered.SIZE
+    source: str = "mjpeg"
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
@@ -77,6 +87,8 @@ class Plan:
             raise SettingsError(
                 f"the video of a load test shows at most {most} objects, not {self.objects}: give fewer"
             )
+        if self.source == "h264" and any(side % 2 for side in self.size):
+            raise SettingsError("a frame of H.264 has an even width and an even height: give another size")
         check_count(self.objects, self.settings.run.objects_most)
         if self.settings.run.lockstep:
             raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
@@ -85,7 +97,7 @@ class Plan:
 
     def __str__(self) -> str:
         objects = f", {self.objects} objects" if self.objects > 1 else ""
-        size = f"{self.size[0]}x{self.size[1]} pixels"
+        size = f"{self.size[0]}x{self.size[1]} pixels{', H.264' * (self.source == 'h264')}"
         return f"{counted(self.streams, 'stream')} of {size}{objects}, {self.rate:g} frames/s due in each"
 
     @property
@@ -199,6 +211,7 @@ class Result:
     received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
     frozen       seconds for which the frozen subscribers were stopped
     camera_late  largest delay in seconds of a frame that the camera itself caused
+    memory       bytes of the processes of each stream, in which a shared page counts in proportion (PSS)
     errors       errors of failed streams
     interrupted  whether the run was interrupted
     """
@@ -211,6 +224,7 @@ class Result:
     missed: list[int]
     frozen: float
     camera_late: float
+    memory: list[int] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
     interrupted: bool = False
 
@@ -228,6 +242,16 @@ class Result:
     def model(self) -> Float64:
         """Model latencies of all streams."""
         return np.concatenate([stream.model for stream in self.streams])
+
+    def cores(self, number: int) -> float:
+        """Return the processor seconds per second of the processes of a stream."""
+        return sum(summary(each)["cores"] for name, each in self.usage.items() if name.endswith(f" {number}"))
+
+    @property
+    def cost(self) -> tuple[float, float]:
+        """Mean of the streams: processor seconds per second, and bytes of memory."""
+        count = len(self.streams)
+        return sum(map(self.cores, range(count))) / count, sum(self.memory) / count
 
     @property
     def other_load(self) -> float:
@@ -257,6 +281,7 @@ def run(plan: Plan, video: Video, camera: Camera, report: Report) -> Result:
         except KeyboardInterrupt:
             interrupted = True
         end, late = monotonic(), camera.late
+        memory = [proportional_memory(stream.pids.values()) for stream in streams]
         frozen = max((group.frozen_seconds for group in groups), default=0.0)
         report("ending", 1.0, "")
         _stop(streams)
@@ -277,6 +302,7 @@ def run(plan: Plan, video: Video, camera: Camera, report: Report) -> Result:
         missed=[count for group in groups for count in group.missed()],
         frozen=frozen,
         camera_late=late,
+        memory=memory,
         errors=[f"stream {number}: {stream.error}" for number, stream in enumerate(streams) if stream.error],
         interrupted=interrupted,
     )
@@ -364,33 +390,39 @@ def _pids(streams: list[Stream], groups: list[Subscribers]) -> dict[str, list[in
 class LoadTest:
     """The runs of a load test.
 
-    limits        the limits of each run
-    is_search     whether the highest rate is searched for
-    results       all runs, in order; empty if it was interrupted before the first measurement
-    highest_rate  the highest rate that meets the limits; None if there was no search, or no such rate
-    interrupted   whether it was interrupted
+    limits       the limits of each run
+    find         the parameter whose highest value is searched for; None if there is no search
+    results      all runs, in order; empty if it was interrupted before the first measurement
+    highest      the highest value that meets the limits; None if there was no search, or no such value
+    refused      reasons why so many streams did not start, by their number
+    interrupted  whether it was interrupted
     """
 
     limits: list[Limit]
-    is_search: bool
+    find: Parameter | None = None
     results: list[Result] = field(default_factory=list)
-    highest_rate: float | None = None
+    highest: float | None = None
+    refused: dict[float, str] = field(default_factory=dict)
     interrupted: bool = False
+
+    def value(self, result: Result) -> float:
+        """Return the searched parameter of a run."""
+        return float(getattr(result.plan, self.find or "rate"))
 
     @property
     def result(self) -> Result:
-        """The decisive run: the one with the highest rate that meets the limits, or the last one if none does."""
+        """The decisive run: the one with the highest value that meets the limits, or the last one if none does."""
         held = [result for result in self.results if not violations(self.limits, result)]
-        return max(held, key=lambda result: result.plan.rate, default=self.results[-1])
+        return max(held, key=self.value, default=self.results[-1])
 
     @property
     def violations(self) -> list[str]:
         """The reasons why the load test has failed, one line each."""
-        if not self.is_search:
+        if self.find is None:
             return [line for result in self.results for line in violations(self.limits, result)]
-        if self.highest_rate is None and not self.interrupted:
-            lowest = self.results[-1].plan.rate
-            return [f"no rate meets {', '.join(map(str, self.limits))}: the lowest tried was {lowest:g}"]
+        if self.highest is None and not self.interrupted:
+            what, limits = "rate" if self.find == "rate" else "number of streams", ", ".join(map(str, self.limits))
+            return [f"no {what} meets {limits}: the lowest tried was {self.value(self.results[-1]):g}"]
         return []
 
 
@@ -398,19 +430,32 @@ def run_load_test(
     plan: Plan,
     limits: list[Limit],
     *,
-    find: bool,
+    find: Parameter | None = None,
     report: Report = lambda *_: None,
     done: Callable[[Result], None] = lambda _: None,
 ) -> LoadTest:
     """Run a load test. After Ctrl-C, the measurements so far are returned.
 
-    find : search for the highest rate that meets the limits, beginning with that of the plan
+    find : search for the highest value of this parameter that meets the limits, beginning with that of the plan
     report, done : functions that are called with the progress, and after each run
     """
-    load_test, images = LoadTest(limits, find), rendered.FRAMES if find else min(plan.frames, rendered.FRAMES)
+    load_test = LoadTest(limits, find)
+    images = rendered.FRAMES if find == "rate" else min(plan.frames, rendered.FRAMES)
 
-    def holds(rate: float) -> bool:
-        result = run(replace(plan, rate=rate), video, camera, report)
+    def told(activity: str, count: int, total: int) -> None:
+        report(activity, count / total, f"{count} of {total} frames")
+
+    def holds(value: float) -> bool:
+        tried = plan if find is None else replace(plan, **{find: int(value) if find == "streams" else value})
+        try:
+            _check_memory(load_test, tried)
+            with Camera(files, plan.size, tried.streams, plan.source) as camera:
+                result = run(tried, video, camera, report)
+        except ServiceError as error:
+            if find != "streams" or not load_test.results:
+                raise
+            load_test.refused[value] = str(error)
+            return False
         load_test.results.append(result)
         done(result)
         if result.interrupted:
@@ -418,40 +463,64 @@ def run_load_test(
         return not violations(limits, result)
 
     try:
-
-        def rendered_so_far(count: int) -> None:
-            report("rendering", count / images, f"{count} of {images} frames")
-
-        video = render(plan.objects, images, plan.size, rendered_so_far)
-        with Camera(video.files, plan.size, plan.streams) as camera:
-            if find:
-                load_test.highest_rate = find_highest_rate(plan.rate, holds)
-            else:
-                holds(plan.rate)
+        video = render(plan.objects, images, plan.size, lambda count: told("rendering", count, images))
+        files = video.files
+        if plan.source == "h264":
+            shown = Schedule(0.0, plan.rate, 2 * rendered.FRAMES if find == "rate" else plan.frames)
+            order = [shown.picture(number, images) for number in range(min(shown.frames, max(2 * images - 2, 1)))]
+            files = encode(video.files, order, plan.size, lambda count: told("encoding", count, len(order)))
+        if find == "rate":
+            load_test.highest = find_highest(plan.rate, holds)
+        elif find == "streams":
+            load_test.highest = find_highest(plan.streams, holds, least=1, most=MOST_STREAMS, digits=0, precision=0)
+        else:
+            holds(plan.rate)
     except KeyboardInterrupt:
         load_test.interrupted = True
     return load_test
 
 
-def find_highest_rate(start: float, holds: Callable[[float], bool]) -> float | None:
-    """Return the highest rate for which `holds` is true, to within 5 %; None if it is false even for the lowest rate.
+def _check_memory(load_test: LoadTest, plan: Plan) -> None:
+    """ServiceError if the streams would need more memory than there is, so that the system would end processes."""
+    if load_test.results:
+        needed, available = plan.streams * load_test.results[-1].cost[1], available_memory()
+        if needed > available:
+            raise ServiceError(f"they need {needed / 1e6:.0f} MB of memory, and {available / 1e6:.0f} MB are available")
 
-    The rate is doubled or halved from `start` until the limit is between two rates, and then bisected. `holds` is
-    called once for each rate, so random variation of its result affects the answer.
 
-    >>> find_highest_rate(25.0, lambda rate: rate <= 42)
+def find_highest(
+    start: float,
+    holds: Callable[[float], bool],
+    *,
+    least: float = _LEAST,
+    most: float = _MOST,
+    digits: int = 1,
+    precision: float = _PRECISION,
+) -> float | None:
+    """Return the highest value for which `holds` is true, to within 5 %; None if it is false even for the lowest one.
+
+    The value is doubled or halved from `start` until the limit is between two values, and then bisected. `holds` is
+    called once for each value, so random variation of its result affects the answer.
+
+    least, most : range of values
+    digits : number of decimals of a value
+    precision : maximum relative error; it is not less than the last decimal
+
+    >>> find_highest(25.0, lambda rate: rate <= 42)
     40.6
+    >>> find_highest(1, lambda streams: streams <= 42, least=1, most=64, digits=0, precision=0)
+    42.0
     """
-    low, high, rate = 0.0, float("inf"), min(max(start, _LEAST), _MOST)
-    while rate not in (low, high) and high - low > _PRECISION * low:
-        if holds(rate):
-            low = rate
+    low, high, value = 0.0, float("inf"), min(max(start, least), most)
+    while value not in (low, high) and high - low > precision * low:
+        if holds(value):
+            low = value
         else:
-            high = rate
+            high = value
         if low == 0.0:
-            rate = max(round(high / 2, 1), _LEAST)
+            value = max(round(high / 2, digits), least)
         elif high == float("inf"):
-            rate = min(round(2 * low, 1), _MOST)
+            value = min(round(2 * low, digits), most)
         else:
-            rate = round((low + high) / 2, 1)
+            value = round((low + high) / 2, digits)
     return low or None

@@ -2,15 +2,20 @@
 
 import subprocess
 import time
+from contextlib import nullcontext
 
+import numpy as np
 import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from catstream.applications.loadtest import load_test as module
 from catstream.applications.loadtest.latency import REST, Usage
-from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, find_highest_rate, run_load_test, violations
-from catstream.errors import ObjectError, SettingsError
+from catstream.applications.loadtest.load import Video
+from catstream.applications.loadtest.load_report import to_json
+from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, find_highest, run_load_test, violations
+from catstream.errors import ObjectError, ServiceError, SettingsError
 from catstream.settings import Settings
 
 
@@ -47,7 +52,7 @@ def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
             raise KeyboardInterrupt
 
     plan = Plan(rate=20.0, duration=20.0, size=(320, 240))
-    load_test = run_load_test(plan, [Limit("p99", 60.0)], find=False, report=tell)
+    load_test = run_load_test(plan, [Limit("p99", 60.0)], report=tell)
     assert load_test.interrupted
     assert load_test.violations == []
     (stream,) = load_test.result.streams
@@ -59,7 +64,7 @@ def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
 
 
 def test_a_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
-    load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64)), [], find=False)
+    load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64)), [])
     (stream,) = load_test.result.streams
     assert stream.track[0] > 0
 
@@ -67,11 +72,64 @@ def test_a_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
 @pytest.mark.slow
 def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not():
     plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
-    load_test = run_load_test(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find=True)
+    load_test = run_load_test(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find="rate")
     held = {step.plan.rate for step in load_test.results if not violations(load_test.limits, step)}
-    assert load_test.highest_rate in held
+    assert load_test.highest in held
     assert load_test.result.plan.rate == max(held)
-    assert any(violations(load_test.limits, step) for step in load_test.results) or load_test.highest_rate == 1000.0
+    assert any(violations(load_test.limits, step) for step in load_test.results) or load_test.highest == 1000.0
+
+
+@pytest.fixture
+def machine(monkeypatch, result):
+    """Makes a machine that serves so many streams, and starts at most `most`; returns the numbers that were tried."""
+
+    def made(capacity, most=64, memory=0):
+        tried = []
+
+        def run(plan, *_):
+            tried.append(plan.streams)
+            if plan.streams > most:
+                raise ServiceError("it took too long")
+            followed = 1.0 if plan.streams <= capacity else 0.9
+            run = result(*[[0.01] * 50] * plan.streams, followed=followed, memory=[memory] * plan.streams)
+            run.plan = plan
+            return run
+
+        monkeypatch.setattr(module, "run", run)
+        monkeypatch.setattr(module, "Camera", lambda *_: nullcontext())
+        monkeypatch.setattr(module, "render", lambda *_: Video([], {}, np.empty((0, 4))))
+        monkeypatch.setattr(module, "available_memory", lambda: 1000)
+        return tried
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("facts", "start", "steps", "highest"),
+    [
+        ({"capacity": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
+        ({"capacity": 6, "most": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
+        ({"capacity": 3}, 8, [8, 4, 2, 3], 3),
+        ({"capacity": 99}, 40, [40, 64], 64),
+        ({"capacity": 99, "memory": 200}, 1, [1, 2, 4, 5], 5),  # 6 would not fit
+        ({"capacity": 0}, 2, [2, 1], None),
+    ],
+)
+def test_the_number_of_streams_is_doubled_or_halved_and_bisected(machine, facts, start, steps, highest):
+    tried = machine(**facts)
+    load_test = run_load_test(Plan(streams=start), [Limit("skipped", 0.0)], find="streams")
+    assert (tried, load_test.highest) == (steps, highest)
+    assert load_test.result.plan.streams == (highest or 1)
+    assert load_test.violations == ([] if highest else ["no number of streams meets skipped=0: the lowest tried was 1"])
+    assert to_json(load_test)["highest_streams"] == highest
+
+
+def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(machine):
+    machine(capacity=6, most=4)
+    assert run_load_test(Plan(), [], find="streams").refused == dict.fromkeys((8.0, 6.0, 5.0), "it took too long")
+    machine(capacity=6, most=0)
+    with pytest.raises(ServiceError, match="it took too long"):
+        run_load_test(Plan(), [], find="streams")
 
 
 def test_a_limit_applies_to_the_worst_stream(result):
@@ -110,6 +168,7 @@ def test_a_malformed_limit_is_an_error(text):
     [
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
         ({"objects": 99}, "shows at most 16 objects, not 99"),
+        ({"size": (321, 240), "source": "h264"}, "an even width"),
         ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],
 )
@@ -132,7 +191,7 @@ def test_the_search_is_within_5_percent_of_the_highest_rate_and_tries_each_rate_
         step_done.append(rate)
         return rate <= capacity
 
-    found = find_highest_rate(start, holds)
+    found = find_highest(start, holds)
     assert found <= capacity <= max(found * 1.05 + 0.1, 1000 * (found == 1000))
     assert len(step_done) == len(set(step_done)) <= 18
-    assert find_highest_rate(start, lambda _: False) is None
+    assert find_highest(start, lambda _: False) is None
