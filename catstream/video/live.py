@@ -165,8 +165,8 @@ class LiveSource(Source):
                 if monotonic() - max(opened, self._last_frame_time) >= self._settings.silent_seconds:
                     is_invalid, problem = False, _SILENT  # FFmpeg's messages for a time-out are unclear
                 is_other, is_known = is_invalid or (problem == _SILENT and not is_known), is_known and not is_invalid
-            except TimeoutError:
-                problem, is_other = _NO_FRAME, not is_known
+            except TimeoutError as error:
+                problem, is_other = str(error), not is_known
             except Exception as error:  # an unexpected error must not end the thread silently
                 problem = str(error).replace(self._text, self._address)
             if is_other and self._format is None and _is_http(self._text):
@@ -187,8 +187,8 @@ class LiveSource(Source):
     def _decoded(self, opened: float, is_known: bool) -> Iterator[VideoFrame]:
         """Yield the undamaged frames of one connection, until it ends.
 
-        If no frame came before, a part of the time is left for the other way of reading MJPEG. TimeoutError if data
-        arrives without frames.
+        If no frame came before, a part of the time is left for the other way of reading MJPEG. TimeoutError, with the
+        reason, if data arrives without frames, or a packet was cut off because nothing arrives.
         """
         import av
 
@@ -200,11 +200,13 @@ class LiveSource(Source):
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
+            now = monotonic()
             for packet in container.demux():
+                before, now = now, monotonic()
                 if self._closed:
                     return
-                if monotonic() > due:  # a packet that was cut off by a time-out is incomplete
-                    raise TimeoutError
+                if now > due:
+                    raise TimeoutError(_SILENT if now - before > settings.silent_seconds / 2 else _NO_FRAME)
                 if packet.stream_index != stream.index:  # sound may go on while the picture does not
                     continue
                 decoded: list[VideoFrame] = []
