@@ -282,9 +282,7 @@ def loadtest(
     if load_test.interrupted:
         stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
     if find == "rate" and load_test.highest:
-        click.echo(
-            f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest:g} frames/s a stream"
-        )
+        click.echo(f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest:g} frames/s a stream")
     for line in load_test.violations:
         complain(f"broken: {line}")
     if load_test.violations:

@@ -145,9 +145,7 @@ class Broadcast(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(
-        self, files: Sequence[bytes], size: tuple[int, int], streams: int = 1, source: str = "mjpeg"
-    ) -> None:
+    def __init__(self, files: Sequence[bytes], size: tuple[int, int], streams: int = 1, source: str = "mjpeg") -> None:
         self._is_h264 = source == "h264"
         super().__init__(("127.0.0.1", 0), RtspConnection if self._is_h264 else _Connection)
         self._files, self._size, self._closed = files, size, threading.Event()
@@ -203,7 +201,6 @@ class Broadcast(ThreadingHTTPServer):
                     self.late = max(self.late, monotonic() - due)
                 yield due, self._file(schedule, number)
                 number += 1
-
 
     def _file(self, schedule: Schedule, number: int) -> bytes:
         if not self._is_h264:

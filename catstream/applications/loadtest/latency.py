@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from threading import Event, Thread
 from time import monotonic
@@ -19,6 +19,7 @@ import psutil
 
 from catstream.applications.evaluation.scores import overlaps
 from catstream.applications.loadtest.camera import Schedule
+from catstream.applications.loadtest.rtsp import due_time
 from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Health, Model, Track
@@ -61,6 +62,8 @@ class Observations:
     def add(self, moment: float, message: Track | Model | Health) -> None:
         """Add a message that arrived at a moment."""
         if isinstance(message, Track):
+            if message.pts is not None:
+                message = replace(message, pts=due_time(message.pts, moment))
             self.tracks.append((moment, message))
         elif isinstance(message, Model):
             self.models.append((moment, message.frame))

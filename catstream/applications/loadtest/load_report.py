@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from catstream.applications.evaluation.runs import provenance
-from catstream.applications.loadtest.latency import PERCENTILES, Measures, percentiles, summary
+from catstream.applications.loadtest.latency import PERCENTILES, percentiles, summary
 from catstream.applications.loadtest.load_test import KINDS, MOST_STREAMS, LoadTest, Result, violations
 from catstream.applications.page import Axis, plot, table, write_page
 from catstream.messages.names import counted
@@ -53,10 +53,10 @@ def tables(result: Result) -> Iterator[Table]:
         "Streams",
         streams + together,
         "Cores: processor seconds per second of all processes of the stream; MB: their memory, in which a page that n "
-        "processes share counts as 1/n of a page (PSS). Latencies in milliseconds. Lag: maximum number of messages that the compressor had not yet received. Not "
-        "stored: features messages that were not in the coreset trees at the end. Success: share of frames with an "
-        "overlap with the ground truth above 0.5; a skipped frame has the last known box. Of tracked: the same over "
-        "the frames that were not skipped.",
+        "processes share counts as 1/n of a page (PSS). Latencies in milliseconds. Lag: maximum number of messages "
+        "that the compressor had not yet received. Not stored: features messages that were not in the coreset trees at "
+        "the end. Success: share of frames with an overlap with the ground truth above 0.5; a skipped frame has the "
+        "last known box. Of tracked: the same over the frames that were not skipped.",
     )
     processes = [{"process": name, **_use(summary(readings))} for name, readings in result.usage.items()]
     if processes:
@@ -218,7 +218,9 @@ def answer(load_test: LoadTest) -> str:
     if load_test.find == "rate":
         return f"The highest rate that meets the limits: {load_test.highest:g} frames/s"
     (cores, memory), most = load_test.result.cost, "at least " * (load_test.highest == MOST_STREAMS)
-    return f"This machine serves {most}{load_test.result.plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB"
+    return (
+        f"This machine serves {most}{load_test.result.plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB"
+    )
 
 
 def _steps(load_test: LoadTest) -> Table:

@@ -2,8 +2,8 @@
 
 The video is encoded before the load test, so that a stream takes little processor time from the pipelines. RTP is sent
 in the connection of RTSP (RFC 2326, section 10.12), in packets of RFC 6184. The answer to PLAY states the due time of
-the first frame as its position. FFmpeg counts from there, so the time stamp of each frame is its due time; other servers
-of live streams state no position, and the age of a frame would not be known.
+the first frame as its position. FFmpeg counts from there, so the time stamp of each frame is its due time, up to the
+period of the 32 bits of RTP. Other servers of live streams state no position, so the age of a frame would not be known.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 from catstream.errors import ServiceError
 
 _CLOCK = 90_000  # ticks per second of RTP time stamps of video
+_PERIOD = 2**32 / _CLOCK  # seconds
 _PAYLOAD = 1400  # bytes, so that a packet fits into one of Ethernet, as cameras send it
 _FRAGMENT = 28  # type of a packet with a part of a NAL unit (FU-A)
 _DESCRIPTION = (
@@ -56,6 +57,15 @@ def encode(
         packets += encoder.encode(frame)
         done(number + 1)
     return [bytes(packet) for packet in [*packets, *encoder.encode(None)]]
+
+
+def due_time(pts: float, arrival: float) -> float:
+    """Return the due time of a frame from its time stamp and the arrival of its track: FFmpeg may shift it by periods.
+
+    >>> due_time(pts=1000.0, arrival=1000.1), round(due_time(pts=-1.0, arrival=47721.0), 3)
+    (1000.0, 47720.859)
+    """
+    return pts + _PERIOD * round((arrival - pts) / _PERIOD)
 
 
 def payloads(unit: bytes) -> Iterator[bytes]:
