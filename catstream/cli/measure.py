@@ -31,12 +31,16 @@ from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.applications.evaluation.accuracy import Row
-    from catstream.applications.loadtest.load_test import Limit, Result
+    from catstream.applications.loadtest.load_test import Limit, Parameter, Result
 
 _FAILED = 1  # exit code if a limit was not met or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 #: Limits of a search if none are given.
-_FIND = {"rate": ("p99=0.1", "skipped=0.01"), "streams": ("p99=0.1", "skipped=0"), None: ()}
+_FIND: dict[str | None, tuple[str, ...]] = {
+    "rate": ("p99=0.1", "skipped=0.01"),
+    "streams": ("p99=0.1", "skipped=0"),
+    None: (),
+}
 
 
 @click.command()
@@ -246,7 +250,7 @@ def loadtest(
 
     if find_limit and find_streams:
         raise click.UsageError("--find-limit and --find-streams each search for one number: give one of them")
-    find = "rate" if find_limit else "streams" if find_streams else None
+    find: Parameter | None = "rate" if find_limit else "streams" if find_streams else None
     asked = [Limit.parse(text) for text in limits or _FIND[find]]
     parameters = Plan(**plan)
     if output is not None:

@@ -305,11 +305,6 @@ def proportional_memory(pids: Iterable[int]) -> int:
     return total
 
 
-def available_memory() -> int:
-    """Return the bytes that processes can still use on this machine."""
-    return int(psutil.virtual_memory().available)
-
-
 def summary(readings: Sequence[tuple[float, int]]) -> dict[str, float]:
     """Return mean and maximum of busy cores and of memory in bytes."""
     cores, memory = zip(*readings, strict=True)

@@ -239,7 +239,8 @@ def _steps(load_test: LoadTest) -> Table:
     ]
     refused = "".join(f" {value:g} streams did not start: {escape(why)}." for value, why in load_test.refused.items())
     note = f"The runs, in this order, with the figures of the worst stream; cores and MB are means.{refused}"
-    return Table(answer(load_test), rows, note)
+    title = answer(load_test) if load_test.find == "rate" else "The number of streams"
+    return Table(title, rows, note)
 
 
 def _plots_of_steps(load_test: LoadTest) -> Iterator[str]:

@@ -9,7 +9,7 @@ period of the 32 bits of RTP. Other servers of live streams state no position, s
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from http.client import parse_headers
@@ -36,10 +36,8 @@ _ENCODER = {
 }
 
 
-def encode(
-    pictures: Sequence[bytes], order: Iterable[int], size: tuple[int, int], done: Callable[[int], None]
-) -> list[bytes]:
-    """Encode JPEG files in an order; return one access unit for each, with start codes. The first is a key frame.
+def encode(pictures: Sequence[bytes], size: tuple[int, int], done: Callable[[int], None]) -> list[bytes]:
+    """Encode JPEG files, forwards, then backwards; return one access unit for each frame, the first is a key frame.
 
     done : is called with the number of frames so far
     """
@@ -50,8 +48,8 @@ def encode(
     decoder, encoder = av.CodecContext.create("mjpeg", "r"), av.CodecContext.create("libx264", "w")
     encoder.width, encoder.height, encoder.pix_fmt, encoder.options = *size, "yuv420p", _ENCODER
     encoder.time_base, packets = Fraction(1, 25), []
-    for number, picture in enumerate(order):
-        (decoded,) = decoder.decode(av.Packet(pictures[picture]))
+    for number, picture in enumerate([*pictures, *pictures[-2:0:-1]]):
+        (decoded,) = decoder.decode(av.Packet(picture))
         frame = decoded.reformat(format="yuv420p")
         frame.pts, frame.pict_type = number, 0  # the encoder chooses: each JPEG file is a key frame
         packets += encoder.encode(frame)

@@ -46,7 +46,7 @@ def test_the_time_stamp_of_a_frame_is_its_due_time_and_its_image_the_scheduled_o
 def test_the_same_is_true_of_h264_over_rtsp(monkeypatch, ahead):
     begin = time.monotonic() - ahead
     monkeypatch.setattr(camera, "monotonic", lambda: time.monotonic() - begin)
-    files, numbers = encode(GREYS, [0, 1, 2, 3, 2, 1], SIZE, lambda _: None), []
+    files, numbers = encode(GREYS, SIZE, lambda _: None), []
     with Broadcast(files, SIZE, source="h264") as broadcast:
         (schedule,) = broadcast.play(Schedule(camera.monotonic() + 1.3, 20.0, frames=30))
         with open_source(*broadcast.urls) as source:

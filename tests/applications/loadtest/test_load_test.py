@@ -83,7 +83,7 @@ def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not
 def machine(monkeypatch, result):
     """Makes a machine that serves so many streams, and starts at most `most`; returns the numbers that were tried."""
 
-    def made(capacity, most=64, memory=0):
+    def made(capacity, most=64):
         tried = []
 
         def run(plan, *_):
@@ -91,14 +91,13 @@ def machine(monkeypatch, result):
             if plan.streams > most:
                 raise ServiceError("it took too long")
             followed = 1.0 if plan.streams <= capacity else 0.9
-            run = result(*[[0.01] * 50] * plan.streams, followed=followed, memory=[memory] * plan.streams)
+            run = result(*[[0.01] * 50] * plan.streams, followed=followed)
             run.plan = plan
             return run
 
         monkeypatch.setattr(module, "run", run)
         monkeypatch.setattr(module, "Camera", lambda *_: nullcontext())
         monkeypatch.setattr(module, "render", lambda *_: Video([], {}, np.empty((0, 4))))
-        monkeypatch.setattr(module, "available_memory", lambda: 1000)
         return tried
 
     return made
@@ -111,7 +110,6 @@ def machine(monkeypatch, result):
         ({"capacity": 6, "most": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
         ({"capacity": 3}, 8, [8, 4, 2, 3], 3),
         ({"capacity": 99}, 40, [40, 64], 64),
-        ({"capacity": 99, "memory": 200}, 1, [1, 2, 4, 5], 5),  # 6 would not fit
         ({"capacity": 0}, 2, [2, 1], None),
     ],
 )
