@@ -6,7 +6,7 @@ import re
 import psutil
 import pytest
 
-from catstream.applications.loadtest import load_test
+from catstream.applications.loadtest import load_report, load_test
 
 
 def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
@@ -39,7 +39,8 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
 
 @pytest.mark.system
 def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(said, tmp_path, monkeypatch):
-    monkeypatch.setattr(load_test, "MOST_STREAMS", 2)
+    for module in (load_test, load_report):
+        monkeypatch.setattr(module, "MOST_STREAMS", 2)
     arguments = ["--find-streams", "--rate", 20, "--duration", 1, "--size", "320x240", "--limit", "p99=60"]
     code, output, _ = said("loadtest", *arguments, "--output", "load", "--json", "x.json", cwd=tmp_path)
     assert code == 0

@@ -12,6 +12,7 @@ import pytest
 from catstream.applications.loadtest import camera, crowd
 from catstream.applications.loadtest.camera import Broadcast, Schedule
 from catstream.applications.loadtest.rtsp import due_time, encode
+from catstream.errors import ServiceError
 from catstream.video.frames import jpeg
 from catstream.video.source import open_source
 
@@ -59,6 +60,12 @@ def test_the_same_is_true_of_h264_over_rtsp(monkeypatch, ahead):
                     if numbers[-1] >= 15:
                         break
     assert numbers[0] < 0, "it begins with the still"
+
+
+def test_h264_without_an_encoder_is_an_error(monkeypatch):
+    monkeypatch.setattr("av.codecs_available", set())
+    with pytest.raises(ServiceError, match="--source mjpeg"):
+        encode(GREYS, SIZE, lambda _: None)
 
 
 def test_the_streams_are_shifted_by_a_part_of_a_frame(broadcast):
