@@ -22,7 +22,7 @@ from catstream.box import Box
 from catstream.cli.common import check_file, complain, screen, table
 from catstream.client.control import Control, control
 from catstream.client.registry import address_of, locate
-from catstream.client.subscription import Subscription, subscribe, wait_until_running
+from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Health, run_state
 from catstream.messages.names import UNNAMED, check_name, counted, split_name
@@ -232,7 +232,8 @@ def status(endpoint: str, keys: str, source: str, as_json: bool, wait: float) ->
     if silent := [name for name in _PROCESSES if name not in reports]:
         if not reports:
             locate(pipeline, keys)  # its error says why a stream of a fleet does not run
-        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}")
+        removed = f": {REMOVED}" if Endpoint.parse(place).lacks_sockets() else ""
+        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}{removed}")
         sys.exit(1)
 
 

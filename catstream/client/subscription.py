@@ -37,6 +37,8 @@ REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a runn
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
 REASON_SECONDS = 2.0  #: before the end of a time-out, in which a health report says why nothing arrives
 DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
+#: Why nothing arrives from a folder without sockets.
+REMOVED = "no sockets are there: no pipeline runs there, or its folder was removed; end that one, and start it again"
 
 Message = TypeVar("Message")
 
@@ -264,7 +266,10 @@ class Subscription(Generic[Message]):
         reports = self._reports.receive_all() if self._reports is not None else []
         states = [run_state(report.counters)[1] for report in reports if report.process == "detector"]
         self._close_reports()  # the next ones would wait behind these
-        return f"the state of the pipeline is: {states[-1]}" if states else "is a pipeline running there?"
+        if states:
+            return f"the state of the pipeline is: {states[-1]}"
+        removed = self.place is not None and self.place.lacks_sockets()
+        return REMOVED if removed else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
         """End after so many seconds; a stream of a fleet may continue with another pipeline."""
