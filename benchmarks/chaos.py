@@ -47,7 +47,7 @@ from catstream.services.supervisor import Child
 from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.channels import MODELS
-from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 from catstream.wire.results import ResultsReceiver
 
@@ -116,7 +116,7 @@ class Arena:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            endpoint = Endpoint.parse(str(stack.enter_context(private_folder())))
+            endpoint = Endpoint.parse(stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-")))
             job = Job(self._source, self._boxes, settings=self._settings, owned=True, resume=True)
             file = replace(job, state=self.state, endpoint=str(endpoint)).save(self._folder)
             (self._folder / "sitecustomize.py").write_text(_MODULE)

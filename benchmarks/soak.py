@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 from typing import NamedTuple
 
@@ -33,7 +34,7 @@ from catstream.messages.names import UNNAMED
 from catstream.settings import Settings
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
-from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.endpoint import Endpoint
 
 BLOCKS = 200  # number of measurements
 GAIN = 0.02  # standard deviation of a drawn row's brightness
@@ -144,12 +145,12 @@ def law(tree: CoresetTree) -> float:
 def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int, float, float, int, float]]:
     """Measure the compressor process: a row for each fifth of the messages."""
     rows = []
-    with private_folder() as folder:
+    with TemporaryDirectory(prefix="catstream-") as folder:
         command = [sys.executable, "-m", "catstream.services", "compressor"]
-        options = ["--set", f"run.endpoint={folder}", "--state", folder / "state"]
+        options = ["--set", f"run.endpoint={folder}", "--state", f"{folder}/state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,
-            Sender(FEATURES, Endpoint.parse(str(folder)), settings.run.unstored_frames) as sender,
+            Sender(FEATURES, Endpoint.parse(folder), settings.run.unstored_frames) as sender,
         ):
             seen, part, begin = psutil.Process(process.pid), messages // 5, 0.0
             for seq in range(1, messages + 1):
@@ -166,7 +167,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
                 if seq % part == 0:
                     wait(sender, seq)
                     micros = (perf_counter() - begin) / part * 1e6
-                    disk = sum(file.stat().st_size for file in (folder / "state").iterdir()) / 1e6
+                    disk = sum(file.stat().st_size for file in Path(folder, "state").iterdir()) / 1e6
                     rows.append((seq, micros, seen.memory_info().rss / 1e6, seen.num_fds(), disk))
                     begin = perf_counter()
             sender.send(End(messages + 1, "that was all"))

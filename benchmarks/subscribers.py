@@ -10,6 +10,7 @@ import argparse
 import threading
 from collections.abc import Iterator, Mapping
 from statistics import median
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import NamedTuple
 
@@ -22,7 +23,6 @@ from catstream.applications.loadtest.load import Subscribers
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.settings import Settings
-from catstream.wire.endpoint import private_folder
 
 SIZE = (320, 240)
 PAUSE_SECONDS = 2.0  # between two late joiners
@@ -84,15 +84,15 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 def run_with(frames: int, readers: int, frozen: int) -> Run:
     """Run a pipeline over the whole video, with subscribers that connect at its start."""
     sequence, joined, ended = rendered(frames, SIZE), list[float](), threading.Event()
-    with private_folder() as folder, Subscribers(str(folder), readers, frozen=frozen) as group:
-        late = threading.Thread(target=join, args=(str(folder), ended, joined))
+    with TemporaryDirectory(prefix="catstream-") as folder, Subscribers(folder, readers, frozen=frozen) as group:
+        late = threading.Thread(target=join, args=(folder, ended, joined))
 
         def turn(tracks: Mapping[str, Track]) -> None:
             group.freeze()
             if readers and late.ident is None and any(track.model_version for track in tracks.values()):
                 late.start()
 
-        settings = Settings(run={"endpoint": str(folder)})
+        settings = Settings(run={"endpoint": folder})
         try:
             journey = travel(str(sequence.path), sequence.boxes[0], settings, frames // 50 + 1, turn=turn)
         finally:

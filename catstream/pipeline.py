@@ -20,18 +20,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from catstream.errors import ProtocolError, ServiceError, SettingsError
+from catstream.errors import ProtocolError, ServiceError, SettingsError, without_password
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
-from catstream.run.state import begun, last_seq, saved
+from catstream.run.state import begun, last_seq, last_time, saved
 from catstream.services.decisions import DESIRED, DesiredState
 from catstream.services.start_server import start_server
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
-from catstream.video.frames import without_password
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.socket import check_owner
@@ -236,14 +235,20 @@ class Pipeline:
         return self
 
     def _started(self, endpoint: str) -> Job:
-        """The job for the processes that are started now."""
+        """The job for the processes that are started now.
+
+        The times of a live run go on after those before, also if the clock of the machine was set back since.
+        """
+        passed = max(0.0, time.time() - self._job.started)
+        if self.live and self._resumed_job is not None and self._state is not None:
+            passed = max(passed, last_time(self._state) + self.settings.run.checkpoint_seconds)
         return replace(
             self._job,
             endpoint=endpoint,
             owned=True,
             state=self._state,
             resume=self._resumed_job is not None,
-            since=time.monotonic() - max(0.0, time.time() - self._job.started),
+            since=time.monotonic() - passed,
         )
 
     def __exit__(

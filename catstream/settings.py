@@ -76,6 +76,15 @@ class RunSettings(_Group):
     image_rate: Annotated[
         float, _about("Frames per second of a folder or a pattern of images, and of a live demo.", ge=1e-9, le=1000)
     ] = 25.0
+    open_seconds: Annotated[
+        float, _about("Time-out for opening a camera or a stream, with its first frame.", ge=0.1, le=3600)
+    ] = 10.0
+    silent_seconds: Annotated[
+        float, _about("Time without a frame after which a camera or a stream is opened again.", ge=0.1, le=3600)
+    ] = 5.0
+    poll_seconds: Annotated[
+        float, _about("Time from one picture to the next at the http:// address of a still picture.", ge=0.01, le=3600)
+    ] = 1.0
     skip_damaged: Annotated[
         bool, _about("Continue after a damaged place in a video file. Without it, the run ends there.")
     ] = False

@@ -17,7 +17,7 @@ import cv2
 
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
-from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
+from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError, without_password
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state
 from catstream.run.learned import Learned
@@ -35,7 +35,7 @@ from catstream.services.decisions import (
 from catstream.services.outputs import ModelFiles, Outputs
 from catstream.services.process import LONG_SECONDS, TURN_SECONDS, Process
 from catstream.video import source as video_source
-from catstream.video.frames import Frame, Source, read_ahead, without_password
+from catstream.video.frames import Frame, Source, read_ahead
 from catstream.video.source import is_live, open_source
 from catstream.wire.channels import CONTROL, MODELS
 from catstream.wire.commands import Responder
@@ -84,7 +84,8 @@ class DetectorLoop:
     def __init__(self, process: Process, stack: ExitStack) -> None:
         cv2.setNumThreads(1)
         stack.callback(process.watchdog.allow)
-        process.source = _shown(process.job.source)
+        # The name of a file need not be UTF-8.
+        process.source = without_password(process.job.source).encode(errors="replace").decode()[:_LONGEST_SOURCE]
         job, endpoint = process.job, process.endpoint
         self._process = process
         self._model_files = ModelFiles(job.state / SEARCHED if job.state is not None else None)
@@ -470,15 +471,3 @@ def _desired(process: Process, models: ModelFiles) -> DesiredState:
     boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
     saved = {name: models.add(Learned.load(file)) for name, file in job.models.items()}
     return DesiredState(boxes | saved, paused=job.paused)
-
-
-def _shown(source: str) -> str:
-    """A source without secrets: an address without user, password and query, which may contain them too.
-
-    >>> _shown("http://me:secret@10.0.0.7/video.mjpg?pwd=secret")
-    'http://10.0.0.7/video.mjpg'
-    """
-    text = without_password(source)
-    if "://" in text:
-        text = text.partition("?")[0]
-    return text.encode(errors="replace").decode()[:_LONGEST_SOURCE]  # the name of a file need not be UTF-8

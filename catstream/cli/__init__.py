@@ -10,7 +10,7 @@ from importlib import import_module
 import click
 
 from catstream.cli.common import INTERRUPTS, complain, stopped
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, without_passwords
 
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
 COMMANDS = {
@@ -66,6 +66,8 @@ class _Commands(click.Group):
             return super().invoke(context)
         except (KeyboardInterrupt, click.Abort):  # click would report it as an error
             stopped()
+        except click.UsageError as error:
+            raise click.UsageError(without_passwords(error.format_message()), error.ctx) from None
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

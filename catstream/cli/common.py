@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column, Table
 
-from catstream.errors import ServiceError
+from catstream.errors import ServiceError, without_passwords
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDTH = 140  # columns of a table that is not printed to a terminal
@@ -36,8 +36,8 @@ def messages() -> Console:
 
 
 def complain(problem: object) -> None:
-    """Print a problem in one line that begins with the name of the program."""
-    click.echo(f"catstream: {problem}", err=True)
+    """Print a problem in one line that begins with the name of the program, without passwords of addresses in it."""
+    click.echo(f"catstream: {without_passwords(str(problem))}", err=True)
 
 
 def table(*heads: str, right: Collection[str] = ()) -> Table:

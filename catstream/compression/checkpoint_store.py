@@ -50,12 +50,12 @@ class CheckpointStore:
             _log.warning("%s", self._found_damaged)
         return forest or Forest(settings)
 
-    def seq(self) -> int:
-        """Number of the newest message in the newest undamaged checkpoint, read without its trees; 0 if there is none.
+    def position(self) -> tuple[int, float]:
+        """Number of the newest message in the newest undamaged checkpoint, and time of its frame; 0 if there is none.
 
         ServiceError as of `load`.
         """
-        return self._newest(Forest.seq_in) or 0
+        return self._newest(Forest.position_in) or (0, 0.0)
 
     def _newest(self, read: Callable[[Path], Read]) -> Read | None:
         """The newest checkpoint that is not damaged, as `read` returns it; None if there is none."""

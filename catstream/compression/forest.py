@@ -30,6 +30,7 @@ class Forest:
     `load`.
 
     seq, frame   number of the newest message, and of its frame
+    time         of that frame, in seconds
     version      of the newest sample. All objects share one count, so that no version is ever used twice
     compressors  the compressor of each object, by name
     """
@@ -37,7 +38,7 @@ class Forest:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.seq = self.version = 0
-        self.frame = -1
+        self.frame, self.time = -1, 0.0
         self.compressors: dict[str, Compressor] = {}
         self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MOST_STATES)  # of the last messages
 
@@ -82,7 +83,7 @@ class Forest:
                 self._add(compressor.begin(features.frame, self.version + 1), samples)
             self._add(compressor.take(features.frame, part, self.version + 1), samples)
             after_each()
-        self.seq, self.frame = features.seq, features.frame
+        self.seq, self.frame, self.time = features.seq, features.frame, float(features.time)
         states = {name: part.detector for name, part in features.objects.items() if part.detector is not None}
         self._states.append((self.seq, states))
         return samples
@@ -127,12 +128,12 @@ class Forest:
         storage.write(path, arrays, metadata | {"kind": _KIND})
 
     @staticmethod
-    def seq_in(path: str | os.PathLike[str]) -> int:
-        """Number of the newest message in a file that `save` wrote; errors as from `load`."""
+    def position_in(path: str | os.PathLike[str]) -> tuple[int, float]:
+        """Number of the newest message in a file that `save` wrote, and time of its frame; errors as from `load`."""
         metadata = storage.read_metadata(path)
         _check_kind(path, metadata)
         try:
-            return int(metadata["seq"])
+            return int(metadata["seq"]), float(metadata.get("time", 0.0))
         except (KeyError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
 
@@ -171,13 +172,15 @@ class Forest:
             arrays |= {f"{i}.{key}": array for key, array in own.items()}
             objects.append(metadata | {"name": name})
         arrays["states"] = np.frombuffer(_ENCODER.encode(list(self._states)), np.uint8)
-        return arrays, {"seq": self.seq, "frame": self.frame, "version": self.version, "objects": objects}
+        whole = {"seq": self.seq, "frame": self.frame, "time": self.time, "version": self.version}
+        return arrays, whole | {"objects": objects}
 
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings) -> Forest:
         """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings)
         self.seq, self.frame, self.version = (int(metadata[name]) for name in ("seq", "frame", "version"))
+        self.time = float(metadata.get("time", 0.0))  # which an older checkpoint lacks
         for i, own in enumerate(metadata["objects"]):
             name = str(own["name"])
             self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)

@@ -17,6 +17,7 @@ from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
+from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 #: The track and the features of an object in one frame.
 Result = tuple[Track, ObjectFeatures]
+
+_STILL_INTERVAL = 7  # frames from one taught frame of a still scene to the next; not even, as other intervals are
 
 
 class Detector:
@@ -47,6 +50,7 @@ class Detector:
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self.newest_version = 0
         self._scm: SparseCollaborativeModel | None = None
+        self._taught: tuple[int, Cells] | None = None  # number of the last frame that was taught, and the cells around
         self.likeness: Likeness | None = None
 
     @property
@@ -105,7 +109,13 @@ class Detector:
         else:  # never absent: the first leaf is of the first n frames, whatever the score of this tracker is
             state = replace(state, level="confident", window=found.window)
         self.state = state
-        return self._result(seq, time, found.score, taught(state, found, frame, seq, model, self.likeness, settings))
+        if found.around is not None and model.version and self._taught is not None:
+            number, cells = self._taught
+            if seq - number < _STILL_INTERVAL and found.around.cells.differs_by_noise(cells):
+                return self._result(seq, time, found.score, {})
+        training = taught(state, found, frame, seq, model, self.likeness, settings)
+        self._taught = (seq, found.around.cells) if training and found.around is not None else None
+        return self._result(seq, time, found.score, training)
 
     def correct(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
         """Continue with the same object at another box, whatever a search would have found.

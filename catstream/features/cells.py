@@ -22,6 +22,10 @@ from catstream.features.pyramid import planes_of
 from catstream.numerics.arrays import writable
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
+_MEAN_COLOUR = slice(CHANNELS - 3, CHANNELS)
+#: The most that differs by the noise of a camera: of a mean colour (9 levels of lightness, 3 of a and b) in all cells
+#: but one of a hundred, and of the squares of all features. Noise of 2 levels in each pixel changes 6 levels and 0.08.
+_NOISE_OF_COLOUR, _CHANGED, _NOISE = 9 * 1.5 / 255, 0.01, 0.1
 _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
 
 
@@ -53,6 +57,18 @@ class Cells:
         """Rows and columns."""
         rows, columns = self.grid.shape[:2]
         return rows, columns
+
+    def differs_by_noise(self, other: Cells) -> bool:
+        """Whether this shows what another image of the same size showed, but for the noise of a camera.
+
+        That changes gradients everywhere, and hardly the mean colour of a cell; what moves changes the colours.
+        """
+        if self.shape != other.shape:
+            return False
+        change, energy = (self.grid - other.grid).reshape(-1, CHANNELS), other.grid.ravel()
+        changed = np.abs(change[:, _MEAN_COLOUR]).max(axis=1) > _NOISE_OF_COLOUR
+        away = change.ravel()
+        return bool(changed.mean() <= _CHANGED and away @ away < _NOISE * (energy @ energy))
 
     def row(self, row: int, column: int) -> np.ndarray:
         """Feature row of the window whose first cell is (row, column), float32 (d,)."""

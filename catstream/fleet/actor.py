@@ -20,7 +20,15 @@ from dataclasses import replace
 from hashlib import sha256
 
 from catstream.client.control import control
-from catstream.errors import CatstreamError, CommandRejectedError, FencedError, FleetError, ServiceError, StoreError
+from catstream.errors import (
+    CatstreamError,
+    CommandRejectedError,
+    FencedError,
+    FleetError,
+    ServiceError,
+    StoreError,
+    without_password,
+)
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Generation, Store
 from catstream.messages.kinds import StreamState, StreamStatus, Track
@@ -28,7 +36,6 @@ from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
 from catstream.run.state import files, restore
-from catstream.video.frames import without_password
 from catstream.video.source import is_live
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder

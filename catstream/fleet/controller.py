@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Literal
 
 from catstream.client.registry import RegistryServer
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, without_password
 from catstream.fleet import life
 from catstream.fleet.actor import Stream, given_model
 from catstream.fleet.life import Actor, Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
-from catstream.video.frames import without_password
 from catstream.video.source import is_live
 from catstream.wire.keys import Client, allowed, ensure
 

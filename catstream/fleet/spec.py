@@ -108,7 +108,8 @@ class StreamSpec:
         check_fleet_name(name, "stream")
         with _errors_in(f"the stream {name}"):
             if not isinstance(table, Mapping):
-                raise FleetError(f"expected a table with a source, got {reprlib.repr(table)}: write [streams.{name}]")
+                got = table if isinstance(table, int) else type(table).__name__  # a text may contain a password
+                raise FleetError(f"expected a table with a source, got {got}: write [streams.{name}]")
             values: dict[str, Any] = {"source": ""} | _checked(table, _STREAM)
             for one, several in (("box", "boxes"), ("model", "models")):
                 if one in values and several in values:
@@ -254,7 +255,9 @@ def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]])
         try:
             checked[key] = msgspec.convert(value, kind)
         except msgspec.ValidationError:
-            raise FleetError(f"{key} must be {meaning}, got {reprlib.repr(value)}") from None
+            # A list of sources may contain a password.
+            shown = "a list" if key == "source" and isinstance(value, list) else reprlib.repr(value)
+            raise FleetError(f"{key} must be {meaning}, got {shown}") from None
     return checked
 
 

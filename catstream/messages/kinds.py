@@ -276,8 +276,8 @@ class Track:
     box            box of the object, in pixels of the frame; None while absent
     score          confidence: about 0 on background, about 1 on the object
     model_version  version of the model that scored it, 0 before the first
-    pts            time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file, a
-                   demo and a frame without one, which the first frame of a stream often is
+    pts            time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file, and
+                   if the stream states none, as mostly for its first frame
     object         name of the object; "" if it has none
     began          number of the object's first frame. If it differs from that of the track before, another object was
                    given this name, by a box or a saved model

@@ -27,7 +27,10 @@ Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 _NAME = "job.safetensors"
 
 #: Settings that do not affect the training: a run can be resumed with other values.
-_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"}
+_FREE = {
+    *("run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"),
+    *("run.open_seconds", "run.silent_seconds", "run.poll_seconds"),
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,12 @@ _log = logging.getLogger(__name__)
 
 def last_seq(folder: Path) -> int:
     """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
-    return CheckpointStore(folder / TREES).seq()
+    return CheckpointStore(folder / TREES).position()[0]
+
+
+def last_time(folder: Path) -> float:
+    """Time of the frame of that message, in seconds."""
+    return CheckpointStore(folder / TREES).position()[1]
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:

@@ -20,13 +20,12 @@ from pathlib import Path
 from typing import IO, get_args
 
 from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.errors import VideoError, without_password
 from catstream.messages.kinds import State, Track
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing
 from catstream.run.job import Results
 from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
-from catstream.video.frames import without_password
 from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}

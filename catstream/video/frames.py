@@ -6,7 +6,6 @@ libraries.
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -39,7 +38,8 @@ class Frame:
     number  0, 1, 2 ... over the frames that the source returns; skipped frames have no number
     time    seconds since the start of the video; for a live source, the arrival time
     image   uint8 (h, w, 3), blue green red; a grey image is expanded
-    pts     presentation time stamp in a live stream, in seconds of the stream's own clock; None for a file
+    pts     presentation time stamp in a live stream, in seconds of the stream's own clock; None for a file, or if the
+            stream states none
     """
 
     number: int
@@ -146,18 +146,6 @@ def video_stream(container: InputContainer) -> Any:
 def ffmpeg_reason(error: FFmpegError) -> str:
     """Return FFmpeg's own description of an error."""
     return (error.strerror or str(error)).lower()
-
-
-def without_password(source: str) -> str:
-    """Return the address of a stream without user and password, and any other source unchanged.
-
-    >>> without_password("rtsp://me:secret@10.0.0.7/stream1")
-    'rtsp://10.0.0.7/stream1'
-    >>> without_password("rtsp://me:sec/ret@10.0.0.7/stream1")  # no address: the slash is not escaped
-    'rtsp://10.0.0.7/stream1'
-    """
-    no_port = r"[^/@:\[]*:(?!\d*(/|$))"
-    return re.sub(rf"(?<=://)([^/]*|{no_port}.*)@", "", source)
 
 
 def as_bgr(image: object) -> np.ndarray:

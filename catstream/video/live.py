@@ -2,13 +2,20 @@
 
 A thread reads and decodes continuously and keeps only the newest frame. A slow consumer therefore gets fewer frames,
 never old ones; the skipped frames are counted. If no frame arrives within a time-out, or the stream ends or fails, the
-source is closed and reopened with exponential backoff until it is back or the consumer closes it.
+source is closed and reopened with exponential backoff until it is back or the consumer closes it. The time-outs count
+frames: a camera whose sound goes on without its picture is lost, too.
+
+HTTP has three special cases. The address of a still picture is fetched again and again. MJPEG that FFmpeg's demuxer for
+it rejects, because a part has another type or none, is read by the one that looks for JPEGs only. HLS sends segments of
+some seconds at once; their frames are returned at the pace of their time stamps.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
+import math
 import random
 import re
 import threading
@@ -18,31 +25,25 @@ from typing import TYPE_CHECKING
 
 import cv2
 
-from catstream.errors import VideoError
-from catstream.video.frames import (
-    RATE,
-    Frame,
-    Source,
-    UprightConverter,
-    ffmpeg_reason,
-    video_stream,
-    without_password,
-)
+from catstream.errors import VideoError, without_password
+from catstream.settings import RunSettings
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, video_stream
 
 if TYPE_CHECKING:
     from av import VideoFrame
     from av.container import InputContainer
 
-#: Time-outs for opening a source and its first frame, and between two frames.
-_OPEN_SECONDS, _SILENT_SECONDS = 10.0, 5.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 8.0
 _IDLE_SECONDS = 0.1
+_QUIET_SECONDS = 600.0  # the same reason of a loss is not logged again before
+_LONGEST_SEGMENT, _LONGEST_PLAYLIST = 20.0, 60.0  # seconds; of a segment, HLS recommends 6
+_SLOW = "check the camera; if it is slow, raise run.open_seconds or run.silent_seconds"
+_ENDED, _SILENT, _NO_FRAME = "it ended", f"nothing arrives: {_SLOW}", f"data arrives, but no picture: {_SLOW}"
 
-_OPTIONS = {
-    # TCP first, because over UDP a lost packet damages the picture; a camera without TCP is still received over UDP.
-    "rtsp": {"rtsp_flags": "prefer_tcp", "analyzeduration": "500000"},
-    "http": {"analyzeduration": "500000"},
-}
+# TCP first, because over UDP a lost packet damages the picture; a camera without TCP is still received over UDP.
+_OPTIONS = {"rtsp_flags": "prefer_tcp", "analyzeduration": "500000"}
+#: To look for JPEGs: FFmpeg would wait for several of them, and invent time stamps.
+_JPEG_OPTIONS = {"probesize": "32", "analyzeduration": "1", "fflags": "nofillin"}
 
 _log = logging.getLogger(__name__)
 
@@ -57,15 +58,23 @@ class LiveSource(Source):
 
     live = True
 
-    def __init__(self, text: str, start: int, *, since: float | None, idle: Callable[[], bool] | None) -> None:
+    def __init__(
+        self, text: str, start: int, settings: RunSettings, *, since: float | None, idle: Callable[[], bool] | None
+    ) -> None:
         super().__init__(_name(text), RATE, (0, 0))
         self.skipped = self.reopened = 0
-        self._text, self._address = text, without_password(text)
+        protocol, mark, place = text.partition("://")
+        self._text = protocol.lower() + mark + place  # FFmpeg knows its protocols in small letters
+        self._address, self._settings = without_password(text), settings
+        self._format: str | None = None  # for the next connection; None if FFmpeg finds it out
+        self._shown = (-math.inf, 0.0)  # time stamp of the last frame of a segment, and when it was returned
         self._number, self._zero, self._idle = start, since, idle
         self._upright = UprightConverter()
         self._condition = threading.Condition()  # guards the fields below
         self._newest: tuple[float, VideoFrame] | None = None
         self._problem = ""  # why the source is lost; empty while it is not
+        self._logged: dict[str, float] = {}  # when each reason of a loss was logged
+        self._is_logged = False  # whether a reason of this loss was
         self._last_frame_time = monotonic()
         self._closed = False
         self._was_open = idle is not None  # without `idle`, a source that was never open is an error and not a loss
@@ -81,7 +90,8 @@ class LiveSource(Source):
         that the source came back; `lost_seconds`: seconds since it was lost, 0 while it is not."""
         silent = monotonic() - self._last_frame_time
         # FFmpeg has no time-out for a device that hangs, so a long silence counts as a loss too.
-        lost = silent if self._problem or silent > _OPEN_SECONDS else 0.0
+        limits = self._settings.open_seconds, self._settings.silent_seconds, self._settings.poll_seconds
+        lost = silent if self._problem or silent > sum(limits) else 0.0
         return {"skipped": self.skipped, "reopened": self.reopened, "lost_seconds": lost}
 
     def __next__(self) -> Frame:
@@ -107,7 +117,10 @@ class LiveSource(Source):
                 self.close()
                 hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
                 problem, _, advice = self._problem.partition(": ")  # what to do about it, if that is known
-                advice = advice or f"check that it is running, and its address{hint}"
+                what = (
+                    "its user and password" if re.search("40[13]", problem) else "that it is running, and its address"
+                )
+                advice = advice or f"check {what}{hint}"
                 raise VideoError(f"cannot open {self._address!r} ({problem}): {advice}")
         return self._frame(*newest)
 
@@ -136,36 +149,64 @@ class LiveSource(Source):
         """Read frames and keep the newest; reconnect after each loss."""
         import av
 
-        pause = _FIRST_PAUSE
+        pause, opened = _FIRST_PAUSE, 0.0
+        is_known = False  # whether frames came by this way of reading
         while not self._closed:
-            opened, problem = monotonic(), "it ended"
+            opened, count, problem, is_other, is_invalid = opened or monotonic(), 0, _ENDED, False, False
             try:
-                for decoded in self._decoded():
+                for decoded in self._decoded(opened, is_known):
                     self._store_newest(monotonic(), decoded)
-                    pause = _FIRST_PAUSE
+                    pause, count, is_known = _FIRST_PAUSE, count + 1, True
             except av.FFmpegError as error:
-                problem = ffmpeg_reason(error)
+                is_invalid = isinstance(error, av.InvalidDataError)
+                # A connection that was closed is an error of input and output if no length was stated.
+                is_end = count and (isinstance(error, EOFError) or error.errno == errno.EIO)
+                problem = _ENDED if is_end else ffmpeg_reason(error)
+                if monotonic() - max(opened, self._last_frame_time) >= self._settings.silent_seconds:
+                    is_invalid, problem = False, _SILENT  # FFmpeg's messages for a time-out are unclear
+                is_other, is_known = is_invalid or (problem == _SILENT and not is_known), is_known and not is_invalid
+            except TimeoutError as error:
+                problem, is_other = str(error), not is_known
             except Exception as error:  # an unexpected error must not end the thread silently
-                problem = str(error)
-            if monotonic() - max(opened, self._last_frame_time) >= _SILENT_SECONDS:
-                problem = "no frame arrives"  # FFmpeg's messages for a time-out are unclear
+                problem = str(error).replace(self._text, self._address)
+            if is_other and self._format is None and _is_http(self._text):
+                self._format, opened = "mjpeg", 0.0 if count else opened
+                continue
+            if is_invalid or (self._format and not count and problem == _ENDED):  # a page, for example
+                problem = "it sends no video that can be read"
+            self._format = self._format if is_known else None
             with self._condition:
-                self._report_loss(problem)
-                self._condition.wait_for(lambda: self._closed, pause * random.uniform(0.5, 1))
-            pause = min(2 * pause, _LONGEST_PAUSE)
+                if problem == _ENDED and count == 1 and _is_http(self._text):  # a still picture
+                    wait = opened + self._settings.poll_seconds - monotonic()
+                else:
+                    self._report_loss(problem)
+                    wait, pause = pause * random.uniform(0.5, 1), min(2 * pause, _LONGEST_PAUSE)
+                self._condition.wait_for(lambda: self._closed, wait)
+            opened = 0.0
 
-    def _decoded(self) -> Iterator[VideoFrame]:
-        """Yield the undamaged frames of one connection, until it ends."""
+    def _decoded(self, opened: float, is_known: bool) -> Iterator[VideoFrame]:
+        """Yield the undamaged frames of one connection, until it ends.
+
+        If no frame came before, a part of the time is left for the other way of reading MJPEG. TimeoutError, with the
+        reason, if data arrives without frames, or a packet was cut off because nothing arrives.
+        """
         import av
 
-        with _open_container(self._text) as container:
-            stream = video_stream(container)
+        settings, due = self._settings, opened + self._settings.open_seconds
+        if _is_http(self._text) and self._format is None and not is_known:
+            due -= settings.open_seconds / 5
+        timeouts = max(1.0, due - monotonic()), settings.silent_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
+        with _open_container(self._text, self._format, timeouts) as container:
+            stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
-            due = monotonic() + _OPEN_SECONDS
+            now = monotonic()
             for packet in container.demux():
-                if self._closed or monotonic() > due:  # a packet that was cut off by a time-out is incomplete
+                before, now = now, monotonic()
+                if self._closed:
                     return
+                if now > due:
+                    raise TimeoutError(_SILENT if now - before > settings.silent_seconds / 2 else _NO_FRAME)
                 if packet.stream_index != stream.index:  # sound may go on while the picture does not
                     continue
                 decoded: list[VideoFrame] = []
@@ -173,8 +214,22 @@ class LiveSource(Source):
                     decoded = stream.codec_context.decode(packet)
                 for frame in decoded:
                     if not frame.is_corrupt:
-                        due = monotonic() + _SILENT_SECONDS
-                        yield frame
+                        if not is_segmented or self._is_next(frame):
+                            yield frame
+                        due = monotonic() + settings.silent_seconds + is_segmented * _LONGEST_SEGMENT
+
+    def _is_next(self, frame: VideoFrame) -> bool:
+        """Wait until a frame of a segment is due; returns False if a segment was fetched again, and it was shown."""
+        (time, moment), now = self._shown, monotonic()
+        ahead = (frame.time or 0.0) - time
+        if -_LONGEST_PLAYLIST < ahead <= 0:
+            return False
+        # The time stamps of the next segment may begin again.
+        moment = max(now, moment + ahead) if 0 < ahead < _LONGEST_SEGMENT else now
+        self._shown = frame.time or 0.0, moment
+        with self._condition:
+            self._condition.wait_for(lambda: self._closed, moment - now)
+        return True
 
     def _store_newest(self, moment: float, decoded: VideoFrame) -> None:
         with self._condition:
@@ -182,35 +237,44 @@ class LiveSource(Source):
                 return
             if self._problem:
                 self.reopened += 1
-                _log.warning("the source %s is back after %.1f s", self.name, moment - self._last_frame_time)
+                if self._is_logged:
+                    _log.warning("the source %s is back after %.1f s", self.name, moment - self._last_frame_time)
             self.skipped += self._newest is not None
             self._newest, self._last_frame_time, self._problem, self._was_open = (moment, decoded), moment, "", True
+            self._is_logged = False
             self._condition.notify()
 
     def _report_loss(self, problem: str) -> None:
-        """Log the reason of a loss, once for each reason: a source may be lost for days."""
-        if problem != self._problem and self._was_open and not self._closed:
+        """Log the reason of a loss, once for each reason: a source may be lost for days, or again and again."""
+        now = monotonic()
+        if self._was_open and not self._closed and now - self._logged.get(problem, -math.inf) > _QUIET_SECONDS:
             _log.warning("the source %s is lost (%s); it is reopened until it is back", self.name, problem)
+            self._logged[problem], self._is_logged = now, True
         self._problem = problem
 
 
-def _open_container(text: str) -> InputContainer:
+def _is_http(text: str) -> bool:
+    return text.startswith(("http:", "https:"))
+
+
+def _open_container(text: str, form: str | None, timeouts: tuple[float, float]) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     import av
 
-    kind = text.partition(":")[0].lower().rstrip("s") if "://" in text else ""
+    is_address = "://" in text
     container = av.open(
         f"/dev/video{text}" if text.isdigit() else text,
-        format=None if kind else "v4l2",
-        options=_OPTIONS.get(kind, {}),
-        timeout=(_OPEN_SECONDS, _SILENT_SECONDS),
+        format=form if is_address else "v4l2",
+        options=_JPEG_OPTIONS if form else _OPTIONS,
+        timeout=timeouts,
         metadata_errors="replace",
     )
-    problem = ""
+    problem, kind = "", container.format.name
+    has_end = container.duration if kind in ("hls", "dash") else (container.size or 0) > 0
     if video_stream(container) is None:
         problem = "it has no video"
-    elif kind == "http" and container.duration:
-        problem = f"it is a recording of {container.duration / 1e6:.0f} s: download it, and give the file"
+    elif _is_http(text) and has_end and not kind.endswith(("_pipe", "mjpeg", "mpjpeg")):
+        problem = "it is a recording: download it, and give the file"
     if problem:
         container.close()
         raise VideoError(problem)
@@ -228,5 +292,5 @@ def _name(text: str) -> str:
     # By hand: urlsplit raises ValueError for a bracket in a password.
     host, _, path = re.sub(r"^\w+://|[?#].*", "", without_password(text)).partition("/")
     word = path.rstrip("/").rpartition("/")[2].partition(".")[0]
-    word = word or re.sub(r":\d+$", "", host).strip("[]").lower() or "live"
+    word = word or re.sub(r":\d+$", "", host).strip("[].").lower() or "live"
     return re.sub(r"[^\w.-]", "_", word)

@@ -86,7 +86,8 @@ class LiveDemo(Source):
         self._zero = now if self._zero is None else self._zero
         self._last = max(self._last + 1, self._start + int((now - self._opened) * self.rate))
         self._number += 1
-        return Frame(self._number - 1, max(0.0, now - self._zero), self._image(self._last).copy())
+        image = self._image(self._last).copy()
+        return Frame(self._number - 1, max(0.0, now - self._zero), image, self._last / self.rate)
 
     def close(self) -> None:
         self._closed.set()

@@ -12,7 +12,7 @@ The text is one of these:
                         folder, or its only video; sequence folders of the public benchmarks open unchanged
     a pattern           images/%05d.png or images/*.png
     a camera            0 or /dev/video0
-    a stream            rtsp://HOST/PATH, or http://HOST/PATH for MJPEG
+    a stream            rtsp://HOST/PATH, http://HOST/PATH for MJPEG, or another address that FFmpeg opens
     a live demo         demo:1; it needs no camera, see `catstream.video.live_demo`
     a file:// address   file:///home/me/walk.mp4
 
@@ -39,7 +39,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from catstream.errors import VideoError
+from catstream.errors import VideoError, without_password
 from catstream.settings import RunSettings
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, video_stream
 from catstream.video.images import EXPECTED, IMAGES, ImageReader, first_pages, image_files, pages_of, visible
@@ -60,7 +60,7 @@ _VIDEOS = (
 )
 VIDEOS = {f".{suffix}" for suffix in _VIDEOS.split()}
 _FOLDERS = ("img", "imgs", "color", "rgb")
-_LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|(rtsps?|https?)://.+|demo:.*")
+_LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|demo:.*|(?!(?i:file):)[a-zA-Z][\w+.-]+://.+", re.DOTALL)
 
 #: After so many errors of the container without a packet between them, a file is treated as ended.
 _MAX_FAILURES = 3
@@ -159,7 +159,10 @@ def open_source(
 
         if str(text).startswith(PREFIX):
             return LiveDemo(str(text), start, settings.image_rate, since=since, idle=idle)
-        return LiveSource(str(text), start, since=since, idle=idle)
+        return LiveSource(str(text), start, settings, since=since, idle=idle)
+    shown = without_password(str(text))
+    if re.match(r"\w+:/[^/]", str(text)) and not Path(text).exists():
+        raise VideoError(f"the address of {shown!r} has one slash: write two of them after its protocol")
     if str(text) == "-":
         raise VideoError(
             "standard input is not a source, because a restarted process cannot read it again: "
@@ -168,7 +171,7 @@ def open_source(
     try:
         name, reader = _opened(Path(source_text(text)), settings)
     except OSError as error:
-        raise VideoError(f"cannot open {str(text)!r} ({error.strerror}): {EXPECTED}") from None
+        raise VideoError(f"cannot open {shown!r} ({error.strerror}): {EXPECTED}") from None
     return _FileSource(name, reader, part, start)
 
 
@@ -194,7 +197,7 @@ def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
             f"{str(path)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
             "write the video to a file, or serve it as a stream"
         )
-    raise VideoError(f"there is no video or folder {str(path)!r}: {EXPECTED}")
+    raise VideoError(f"there is no video or folder {without_password(str(path))!r}: {EXPECTED}")
 
 
 def _named(folder: Path) -> str:

@@ -26,7 +26,7 @@ _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline tracks, or why not
 
 _MIN_TOKEN_LENGTH = 16
-_LOOPBACK = ("127.0.0.1", "localhost")
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 SHUTDOWN_SECONDS = 2  #: limit for the responses to end when the server does
 KEEP_ALIVE_SECONDS = 5  #: after which a connection without a request is closed
@@ -122,7 +122,8 @@ class _Uvicorn(uvicorn.Server):
 
 def _listen(host: str, port: int) -> socket.socket:
     try:
-        if ":" in host:
+        families = {family for family, *_ in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
+        if socket.AF_INET not in families:
             return socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=True)
         return socket.create_server((host, port))
     except OSError as error:

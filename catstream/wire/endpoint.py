@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from catstream.errors import ServiceError
+from catstream.errors import ServiceError, without_password
 from catstream.messages.storage import descriptor, is_locked, lock, writing
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
@@ -110,12 +110,15 @@ class Endpoint:
         address = self.address(channel, sender)
         protocol, _, place = address.partition("://")
         host, _, port = place.rpartition(":")
-        if protocol == "ipc" or _address(host) is not None:
-            return address
-        try:
-            return f"tcp://{socket.gethostbyname(host)}:{port}"
-        except OSError:
+        if protocol == "ipc" or not (known := _resolved(host)):
             return address  # ZeroMQ reports what is wrong with it
+        number = known.get(socket.AF_INET) or f"[{known[socket.AF_INET6]}]"
+        return f"tcp://{number}:{port}"
+
+    @property
+    def is_ipv6(self) -> bool:
+        """Whether the host has addresses of IPv6 only; ZeroMQ would not look for them."""
+        return self.folder is None and [*_resolved(self.host)] == [socket.AF_INET6]
 
     def taken(self, channel: Channel[object], sender: str | None = None) -> bool:
         """Whether a process listens at a channel's Unix socket; ZeroMQ would replace it without an error."""
@@ -149,6 +152,15 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return ipaddress.ip_address(host.strip("[]"))
     except ValueError:
         return None
+
+
+def _resolved(host: str) -> dict[int, str]:
+    """An address of a host of each family that it has; empty if it is not known."""
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_STREAM)
+    except OSError:
+        return {}
+    return {int(family): str(place[0]) for family, _, _, _, place in reversed(found)}
 
 
 def _file(channel: Channel[object], sender: str) -> str:
@@ -282,6 +294,7 @@ def find(text: Place = "", keys: str = "", source: str = "") -> Endpoint:
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # one whose keys cannot be read is running: say so
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or give its --endpoint")
+    source = without_password(source)  # as it is in the note
     found = [endpoint for endpoint in endpoints if not source or _follows(endpoint, source)]
     if len(found) == 1:
         return found[0]

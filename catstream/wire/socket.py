@@ -284,7 +284,7 @@ class ChannelSocket(Generic[Message]):
         self._pid = os.getpid()
         for option, value in _OPTIONS.items():
             self._socket.set(option, value)
-        self._socket.set(zmq.IPV6, int("[" in str(endpoint)))
+        self._socket.set(zmq.IPV6, int(endpoint.is_ipv6))
         self._socket.set(zmq.SNDHWM, high_water_mark)
         self._socket.set(zmq.RCVHWM, high_water_mark)
         self._socket.set(zmq.MAXMSGSIZE, channel.limit)

@@ -53,12 +53,12 @@ def test_the_newest_two_checkpoints_are_kept_and_the_newest_is_used(kept):
 
 def test_a_folder_without_any_begins_anew(tmp_path):
     assert CheckpointStore(tmp_path).load(SETTINGS).seq == 0
-    assert CheckpointStore(tmp_path).seq() == 0
+    assert CheckpointStore(tmp_path).position() == (0, 0.0)
 
 
 def test_the_number_is_that_of_the_checkpoint_that_would_be_loaded(kept):
     for seq in (60, 50):
-        assert CheckpointStore(kept).seq() == CheckpointStore(kept).load(SETTINGS).seq == seq
+        assert CheckpointStore(kept).position()[0] == CheckpointStore(kept).load(SETTINGS).seq == seq
         data = bytearray(newest(kept).read_bytes())
         data[-1] ^= 1  # in an array, not in the header
         newest(kept).write_bytes(data)

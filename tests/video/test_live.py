@@ -6,13 +6,14 @@ import threading
 import time
 from contextlib import suppress
 from functools import partial
-from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import av
+import cv2
 import numpy as np
 import pytest
 
-from catstream.errors import VideoError
+from catstream.errors import VideoError, without_password
 from catstream.video import live
 from catstream.video.source import open_source
 
@@ -29,6 +30,33 @@ def number_of(image: np.ndarray) -> int:
     middle = image.shape[1] // 2
     low, high = (round(half.mean() / 4) for half in (image[:, : middle - 8], image[:, middle + 8 :]))
     return low + 64 * high
+
+
+@pytest.fixture
+def served():
+    """Serves a folder, or what a function sends for each request: the address of the server."""
+    servers: list[ThreadingHTTPServer] = []
+
+    def serve(content):
+        class Handler(SimpleHTTPRequestHandler):
+            def do_GET(self):
+                with suppress(OSError):
+                    content(self) if callable(content) else super().do_GET()
+
+            def log_message(self, *_):
+                pass
+
+        servers.append(
+            ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=None if callable(content) else content))
+        )
+        servers[-1].daemon_threads = True
+        threading.Thread(target=servers[-1].serve_forever, args=(0.02,), daemon=True).start()
+        return f"http://127.0.0.1:{servers[-1].server_port}"
+
+    yield serve
+    for server in servers:
+        server.shutdown()
+        server.server_close()
 
 
 def test_a_stream_has_a_name_and_a_size_also_if_its_password_contains_a_bracket(camera):
@@ -84,22 +112,20 @@ def test_a_camera_that_disconnects_is_reopened(camera, until):
     assert [frame.number for frame in frames] == [1, 2, 3]
 
 
-def test_a_camera_that_sends_no_frames_is_reopened(camera, monkeypatch, caplog, until):
-    monkeypatch.setattr(live, "_SILENT_SECONDS", 0.5)
+def test_a_camera_that_sends_no_frames_is_reopened(camera, caplog, until):
     cam = camera(numbered)
-    with open_source(cam.url) as source:
+    with open_source(cam.url, silent_seconds=0.5) as source:
         next(source)
         cam.sends.clear()
         until(lambda: source.counters["lost_seconds"] > 0.5)
         cam.sends.set()
         until(lambda: source.reopened == 1)
         next(source)
-    assert "one is lost (no frame arrives)" in caplog.text
+    assert "one is lost (nothing arrives: check the camera" in caplog.text
     assert "one is back after" in caplog.text
 
 
-def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_path, monkeypatch, caplog, until):
-    monkeypatch.setattr(live, "_SILENT_SECONDS", 0.5)
+def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_path, served, caplog, until):
     with av.open(str(tmp_path / "a.ts"), "w") as container:
         picture, tone = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=48000)
         picture.width, picture.height, picture.pix_fmt = 128, 96, "yuv420p"
@@ -113,35 +139,26 @@ def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_pa
         container.mux([*packets, *picture.encode(None), *tone.encode(samples), *tone.encode(None)])
     data = (tmp_path / "a.ts").read_bytes()
 
-    class Camera(BaseHTTPRequestHandler):
-        def do_GET(self):
-            self.send_response(200)
-            self.end_headers()
-            with suppress(OSError):
-                for start in range(0, len(data), len(data) // 200):
-                    self.wfile.write(data[start : start + len(data) // 200])
-                    time.sleep(0.3 if start > len(data) // 4 else 0)
+    def send(request):
+        request.send_response(200)
+        request.end_headers()
+        for start in range(0, len(data), len(data) // 200):
+            request.wfile.write(data[start : start + len(data) // 200])
+            time.sleep(0.3 if start > len(data) // 4 else 0)
 
-        def log_message(self, *_):
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Camera) as server:
-        server.daemon_threads = True
-        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        with open_source(f"http://127.0.0.1:{server.server_port}/a.ts") as source:
-            began = time.monotonic()
-            until(lambda: source.reopened)
-            assert time.monotonic() - began < 20, "the sound lasts longer"
-        server.shutdown()
-    assert "(no frame arrives)" in caplog.text
+    with open_source(f"{served(send)}/a.ts", silent_seconds=0.5) as source:
+        began = time.monotonic()
+        until(lambda: source.reopened)
+        assert time.monotonic() - began < 20, "the sound lasts longer"
+    assert "(data arrives, but no picture: check the camera" in caplog.text
 
 
 def test_the_reason_of_a_loss_is_logged_once(camera, monkeypatch, caplog, until):
     monkeypatch.setattr(live, "_LONGEST_PAUSE", 0.01)
     cam, tried = camera(numbered), []
 
-    def refuse(text):
-        tried.append(text)
+    def refuse(*arguments):
+        tried.append(arguments)
         raise OSError("it is unplugged")
 
     with open_source(cam.url) as source:
@@ -199,7 +216,7 @@ def test_a_closed_source_has_no_frames_and_leaves_no_thread(camera):
     assert not [thread for thread in threading.enumerate() if thread.name == "reader of one"]
 
 
-def test_a_url_of_a_video_file_is_an_error(tmp_path):
+def test_a_url_of_a_video_file_is_an_error(tmp_path, served):
     path = tmp_path / "walk.mp4"
     with av.open(str(path), "w", options={"movflags": "faststart"}) as container:
         stream = container.add_stream("mpeg4", rate=25)
@@ -207,9 +224,128 @@ def test_a_url_of_a_video_file_is_an_error(tmp_path):
         for number in range(50):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
         container.mux(stream.encode(None))
-    folder = partial(SimpleHTTPRequestHandler, directory=tmp_path)
-    with ThreadingHTTPServer(("127.0.0.1", 0), folder) as server:
-        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-        with pytest.raises(VideoError, match=r"it is a recording of 2 s\): download it, and give the file$"):
-            open_source(f"http://127.0.0.1:{server.server_port}/walk.mp4")
-        server.shutdown()
+    with pytest.raises(VideoError, match=r"\(it is a recording\): download it, and give the file$"):
+        open_source(f"{served(tmp_path)}/walk.mp4")
+
+
+def test_a_file_without_a_duration_is_a_recording_too(tmp_path, served):
+    with av.open(str(tmp_path / "walk.h264"), "w", format="h264") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height = 128, 96
+        for number in range(9):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+        container.mux(stream.encode(None))
+    with pytest.raises(VideoError, match="it is a recording"):
+        open_source(f"{served(tmp_path)}/walk.h264")
+
+
+def jpeg(number: int) -> bytes:
+    return cv2.imencode(".jpg", numbered(number))[1].tobytes()
+
+
+#: Parts of MJPEG, with {size} and {jpeg}, as cameras send them and browsers show them.
+PARTS = {
+    "standard": b"--b\r\nContent-Type: image/jpeg\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n",
+    "image/jpg": b"--b\r\nContent-Type: image/jpg\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n",
+    "a parameter": b"--b\r\nContent-Type: image/jpeg; size=1\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n",
+    "no type": b"--b\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n",
+    "no headers": b"--b\r\n\r\n%(jpeg)b\r\n",
+    "no first boundary": b"Content-Type: image/jpeg\r\nContent-Length: %(size)d\r\n\r\n%(jpeg)b\r\n--b\r\n",
+    "text parts": b"--b\r\nContent-Type: text/plain\r\n\r\nhi\r\n--b\r\nContent-Type: image/jpeg\r\n\r\n%(jpeg)b\r\n",
+    "LF, no length": b"--b\nContent-Type: image/jpeg\n\n%(jpeg)b\n",
+    "JPEGs alone": b"%(jpeg)b",
+}
+
+
+@pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
+def test_mjpeg_is_read_whatever_its_parts_say(served, caplog, part):
+    def send(request):
+        request.send_response(200)
+        request.send_header("Content-Type", 'multipart/x-mixed-replace; boundary="b"')
+        request.end_headers()
+        for number in range(4000):
+            request.wfile.write(part % {b"size": len(jpeg(number)), b"jpeg": jpeg(number)})
+            time.sleep(0.02)
+
+    with open_source(f"{served(send)}/video", open_seconds=4, silent_seconds=2) as source:
+        seen = [number_of(next(source).image) for _ in range(20)]
+    assert seen == sorted(set(seen))
+    assert not caplog.records
+
+
+def test_a_text_part_is_no_loss_also_long_after_the_beginning(served, caplog):
+    def send(request):
+        request.send_response(200)
+        request.end_headers()
+        for number in range(4000):
+            part = PARTS["text parts" if number % 80 == 79 else "standard"]
+            request.wfile.write(part % {b"size": len(jpeg(number)), b"jpeg": jpeg(number)})
+            time.sleep(0.02)
+
+    with open_source(f"{served(send)}/video", open_seconds=1) as source:
+        for _ in range(100):
+            next(source)
+        assert source.reopened == 0
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix):
+    fetched = []
+
+    def send(request):
+        fetched.append(1)
+        request.send_response(200)
+        request.end_headers()
+        request.wfile.write(cv2.imencode(suffix, numbered(len(fetched)))[1].tobytes())
+
+    with open_source(f"{served(send)}/now{suffix}", poll_seconds=0.05) as source:
+        seen = [number_of(next(source).image) for _ in range(5)]
+        assert (source.reopened, source.counters["lost_seconds"]) == (0, 0)
+    assert seen == sorted(set(seen))
+    assert not caplog.records
+
+
+def test_hls_is_returned_at_the_pace_of_its_pictures_and_none_twice(tmp_path, served, monkeypatch, caplog):
+    options = {"hls_time": "1", "hls_list_size": "0", "hls_flags": "omit_endlist"}
+    with av.open(str(tmp_path / "live.m3u8"), "w", format="hls", options=options) as container:
+        stream = container.add_stream("libx264", rate=25, options={"g": "25", "tune": "zerolatency"})
+        stream.width, stream.height = 128, 96
+        for number in range(75):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
+        container.mux(stream.encode(None))
+    monkeypatch.setattr(live, "_LONGEST_SEGMENT", 0.2)
+    url, is_over = f"{served(tmp_path)}/live.m3u8", lambda: source.counters["lost_seconds"] > 2
+    with open_source(url, idle=is_over, silent_seconds=0.3) as source:  # it is opened again after its last segment
+        times = [frame.pts for frame in source]
+    assert len(times) > 25, "a segment is not skipped"
+    assert times == sorted(set(times))
+    assert caplog.text.count("is lost") == 1
+
+
+ADDRESSES = [
+    "RTSP://admin:SeCrEt@127.0.0.1:1/x",
+    "rtmp://admin:SeCrEt@127.0.0.1:1/x",
+    "rtsp:/admin:SeCrEt@127.0.0.1:1/x",
+    "admin:SeCrEt@127.0.0.1:1/x",
+    "rtsp://admin:Se@Cr/SeCrEt@127.0.0.1:1/x",
+    "rtsp://admin:12/SeCrEt@127.0.0.1:1/x",
+    "rtsp://admin:Se#SeCrEt@127.0.0.1:1/x",
+    "rtsp://admin:Se?a=SeCrEt@127.0.0.1:1/x",
+    "rtsp://admin%3ASeCrEt%40127.0.0.1:1/x",
+    "rtsp://admin:SeCrEt",
+    "rtsp://127.0.0.1:1/user=admin_password=SeCrEt_channel=1.sdp",
+    "http://127.0.0.1:1/video.cgi?user=admin&pwd=SeCrEt",
+    "http://127.0.0.1:1/video.cgi?mail=a@b&pwd=SeCrEt",
+    "http://127.0.0.1:1/x;token=SeCrEt",
+    "http://127.0.0.1:1/token/SeCrEt/x",
+    "http://127.0.0.1:1/x#SeCrEt",
+]
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+def test_no_message_and_no_name_contains_a_password(address):
+    with pytest.raises(VideoError) as error:
+        open_source(address)
+    assert "SeCrEt" not in f"{error.value} {without_password(address)} {live._name(address)}"
+    assert without_password(without_password(address)) == without_password(address)

@@ -58,7 +58,7 @@ def test_it_runs_forwards_and_backwards_without_end(clock):
 def test_a_later_start_continues_with_the_image_of_that_number(clock):
     with open_source("demo:1") as whole, open_source("demo:1", start=3, since=90.0) as later:
         frame = next(later)
-        assert (frame.number, frame.time) == (3, 10.0)
+        assert (frame.number, frame.time, frame.pts) == (3, 10.0, 3 / 25)
         assert list(later._images) == [3], "the images before it are not rendered"
         next(whole)
         assert np.array_equal(frame.image, read(whole, clock, 0.121).image)

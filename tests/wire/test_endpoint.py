@@ -39,6 +39,21 @@ def test_without_keys_this_machine_is_accepted_and_a_host_that_others_can_reach_
         Endpoint.parse(f"tcp://{other}:5700")
 
 
+def test_a_name_that_has_addresses_of_one_family_only_is_listened_on_and_looked_up_there(folder, monkeypatch):
+    create(folder / "keys")
+    known = {"four": ["192.0.2.1"], "six": ["2001:db8::1"], "both": ["2001:db8::1", "192.0.2.1"]}
+
+    def found(host, *_, **__):
+        families = [socket.AF_INET6 if ":" in each else socket.AF_INET for each in known[host]]
+        return [(family, 0, 0, "", (each, 0)) for family, each in zip(families, known[host], strict=True)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", found)
+    places = {name: Endpoint.parse(f"tcp://{name}:5700", str(folder / "keys")) for name in known}
+    assert [places[name].is_ipv6 for name in ("four", "six", "both")] == [False, True, False]
+    addresses = [places[name].listening(CHANNELS["models"]) for name in ("four", "six", "both")]
+    assert addresses == ["tcp://192.0.2.1:5702", "tcp://[2001:db8::1]:5702", "tcp://192.0.2.1:5702"]
+
+
 def test_a_pipeline_with_keys_is_found_with_them(folder):
     create(folder / "keys")
     with private_folder() as note, meeting_place(str(folder / "run"), note, str(folder / "keys")) as place:

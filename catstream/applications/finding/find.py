@@ -23,7 +23,7 @@ import numpy as np
 from catstream.box import Box, Window
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
-from catstream.errors import SettingsError, VideoError
+from catstream.errors import SettingsError, VideoError, without_password
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
@@ -33,7 +33,7 @@ from catstream.messages.names import counted
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.settings import RunSettings, Settings
-from catstream.video.frames import Frame, read_ahead, without_password
+from catstream.video.frames import Frame, read_ahead
 from catstream.video.images import IMAGES, ImageReader, first_pages, image_files, natural_order, pages_of
 from catstream.video.source import VIDEOS, is_live, open_source
 
