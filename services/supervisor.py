@@ -319,8 +319,8 @@ class Supervisor:
         """Restart a process that died with an exit code, or schedule that."""
         if not self._folder.exists():  # with the file of its job, and the sockets
             raise ServiceError(
-                f"the {child.name} died {child.ending(code)}, and cannot be restarted, as the folder {self._folder} was "
-                "removed during the run: start again, with TMPDIR set to a folder that nothing cleans"
+                f"the {child.name} died {child.ending(code)}, and cannot be restarted, as the folder {self._folder} "
+                "was removed during the run: start again, with TMPDIR set to a folder that nothing cleans"
             )
         if code == PERMANENT_FAILURE:
             raise ServiceError(child.log.last_line())

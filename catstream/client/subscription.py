@@ -38,7 +38,7 @@ CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the
 REASON_SECONDS = 2.0  #: before the end of a time-out, in which a health report says why nothing arrives
 DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
 #: Why nothing arrives from a folder without sockets.
-REMOVED = "no sockets are there: no pipeline runs there, or its folder was removed; end that one, and start it again"
+REMOVED = "is a pipeline running there? It has no sockets: if it runs, they were removed; end it and start it again"
 
 Message = TypeVar("Message")
 

@@ -218,8 +218,7 @@ def test_a_run_whose_folder_was_removed_ends_with_that_reason(endless, folder):
         shutil.rmtree(folder)
         psutil.Process(supervisor.pids["trainer"]).kill()
         with pytest.raises(ServiceError, match=r"the trainer died with signal SIGKILL, and .* folder .* was removed"):
-            while supervisor.next_frame() is not None:
-                pass
+            list(iter(supervisor.next_frame, None))
     finally:
         supervisor.stop()
         folder.mkdir()  # the fixture removes it
