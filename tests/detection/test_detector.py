@@ -76,6 +76,22 @@ def test_a_moving_object_is_followed(scene, detection):
         assert track.box.overlap(Box(*at, 48, 40)) > 0.8
 
 
+@pytest.mark.parametrize("noise", [0, 1, 2])
+def test_of_a_still_scene_every_seventh_frame_teaches_and_of_a_moving_one_every_frame(scene, noise):
+    """Noise is the standard deviation of each pixel's level."""
+    detector, rng = started(scene), np.random.default_rng(0)
+    detector.adopt(dataclasses.replace(detector.model, version=1))
+
+    def teaches(place):
+        image = scene(place) + rng.normal(0, noise, (*scene(place).shape[:2], 3))
+        return bool(detector.step(image.round().clip(0, 255).astype(np.uint8))[1].training)
+
+    assert all(teaches((60 + 2 * step, 50)) for step in range(8))
+    standing = [teaches((74, 50)) for _ in range(38)]
+    assert sum(standing[10:]) == 4, "its window comes to rest in the first ten"
+    assert teaches((80, 50)), "it moves again"
+
+
 def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     detector = started(scene)
     for _ in range(3):

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from itertools import islice
 
@@ -19,6 +20,7 @@ from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.run.job import Job
 from catstream.run.state import TREES
+from catstream.services.process import RUNNING_SECONDS
 from catstream.services.start_server import NAMES
 from catstream.services.supervisor import Child, Supervisor
 from catstream.settings import Settings
@@ -200,8 +202,12 @@ def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_t
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16})) as pipeline:
         tracks = list(islice(pipeline, 5))
         stopped = pipeline.pids
-        for pid in stopped.values():
+        for name, pid in stopped.items():
             os.kill(pid, signal.SIGSTOP)
+            while pipeline._supervisor._children[name].watchdog.patience > RUNNING_SECONDS:  # a step that may take long
+                os.kill(pid, signal.SIGCONT)
+                time.sleep(0.01)
+                os.kill(pid, signal.SIGSTOP)
         until(lambda: pipeline.restarts == len(NAMES))
         tracks.extend(pipeline)
         assert len(stopped) == len(NAMES)
