@@ -434,6 +434,7 @@ class DetectorLoop:
             "stored": window.stored,
             "model_version": max((each.model_version for each in self._tracks.tracks.values()), default=0),
             "objects": len(self.desired.objects),
+            "time": max((each.time for each in self._tracks.tracks.values()), default=0.0),
             "paused": float(self._is_paused),
             "waiting": float(not self.desired.objects),
             "ended": float(self._process.has_ended),

@@ -168,7 +168,7 @@ class Supervisor:
     def __init__(self, job: Job, folder: Path, after: int = 0, *, live: bool = False) -> None:
         self.end: End | None = None
         self.health: dict[str, Health] = {}
-        self._live = live
+        self._live, self._folder = live, folder
         self._frames: deque[Tracks] = deque()  # that were received, and not returned yet
         self._changed = threading.Condition()
         self._over: bool = False  # whether no further frames are received
@@ -317,6 +317,11 @@ class Supervisor:
 
     def _restart(self, child: Child, code: int, now: float) -> None:
         """Restart a process that died with an exit code, or schedule that."""
+        if not self._folder.exists():  # with the file of its job, and the sockets
+            raise ServiceError(
+                f"the {child.name} died {child.ending(code)}, and cannot be restarted, as the folder {self._folder} "
+                "was removed during the run: start again, with TMPDIR set to a folder that nothing cleans"
+            )
         if code == PERMANENT_FAILURE:
             raise ServiceError(child.log.last_line())
         child.restarts.append(now)

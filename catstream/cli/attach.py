@@ -22,7 +22,7 @@ from catstream.box import Box
 from catstream.cli.common import check_file, complain, screen, table
 from catstream.client.control import Control, control
 from catstream.client.registry import address_of, locate
-from catstream.client.subscription import Subscription, subscribe, wait_until_running
+from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Health, run_state
 from catstream.messages.names import UNNAMED, check_name, counted, split_name
@@ -41,6 +41,7 @@ from catstream.wire.channels import CHANNELS, PUBLIC
 from catstream.wire.endpoint import Endpoint, Place, find
 
 _SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
+_OLD_SECONDS = 5.0  # age of what is read, from which they say that the reader is slow
 _PROCESSES = CHANNELS["health"].senders
 
 
@@ -153,12 +154,15 @@ def watch(
 
 
 def saying_why_silent(messages: Subscription[Any]) -> Iterator[Any]:
-    """Each message; the reason why none arrives is printed once, until there is another reason or a message."""
-    messages.timeout, said = _SILENT_SECONDS, ""
+    """Each message. It is printed once if they are old, and why none arrives, until there is another reason."""
+    messages.timeout, said, old = _SILENT_SECONDS, "", False
     while True:
         try:
             for message in messages:
                 said = ""
+                if not old and messages.behind >= _OLD_SECONDS:
+                    old = True
+                    click.echo(f"behind: what is read is {messages.behind:.0f} s old, as the reader is slow", err=True)
                 yield message
             return
         except SilenceError as error:
@@ -228,7 +232,8 @@ def status(endpoint: str, keys: str, source: str, as_json: bool, wait: float) ->
     if silent := [name for name in _PROCESSES if name not in reports]:
         if not reports:
             locate(pipeline, keys)  # its error says why a stream of a fleet does not run
-        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}")
+        removed = f": {REMOVED}" if Endpoint.parse(place).lacks_sockets() else ""
+        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}{removed}")
         sys.exit(1)
 
 

@@ -37,6 +37,8 @@ REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a runn
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
 REASON_SECONDS = 2.0  #: before the end of a time-out, in which a health report says why nothing arrives
 DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
+#: Why nothing arrives from a folder without sockets.
+REMOVED = "is a pipeline running there? It has no sockets: if it runs, they were removed; end it and start it again"
 
 Message = TypeVar("Message")
 
@@ -98,6 +100,8 @@ class Subscription(Generic[Message]):
         self._messages: Subscriber[Any] | None = None
         self._ends: Subscriber[Any] | None = None
         self._reports: Subscriber[Health] | None = None  # at the end of a silence
+        self._health: Subscriber[Health] | None = None  # once `behind` was asked for
+        self._read = self._newest = 0.0  # times of the frame that was read last, and of the newest one that is known
         self._has_run = False  # whether the pipeline was there before
         self._over = self._closed = False
         self._owner = os.getpid()
@@ -125,6 +129,20 @@ class Subscription(Generic[Message]):
         """Describe the missed messages in words."""
         before = f", {self._gaps.before} of them before this subscriber connected" if self._gaps.before else ""
         return f"{self.missed} missed{before}"
+
+    @property
+    def behind(self) -> float:
+        """Age of the track or features that were read last: seconds of the source from their frame to the newest one.
+
+        It is known from the health reports of the pipeline, one a second, which are received from the first call on; 0
+        before the first report, and on other channels.
+        """
+        with self._turn:
+            if self._health is None and self.place is not None and self._channel.keeps == "every":
+                self._health = Subscriber(HEALTH, self.place)
+            for report in self._health.receive_all() if self._health is not None else ():
+                self._newest = report.counters.get("time", self._newest)  # of the detector
+            return max(0.0, self._newest - self._read)
 
     @property
     def run(self) -> str:
@@ -212,6 +230,8 @@ class Subscription(Generic[Message]):
             return None
 
     def _receive(self) -> Message | None:
+        if self._ends is not None:
+            self._ends.pending()  # ZeroMQ subscribes again at a restarted pipeline only while the socket is looked at
         while self._messages is not None and (message := self._messages.receive(0)) is not None:
             if isinstance(message, End):
                 if self._channel.keeps == "every":  # the last message here
@@ -222,6 +242,7 @@ class Subscription(Generic[Message]):
             if isinstance(message, Track | Features):
                 began = message.began if self._about is not None and isinstance(message, Track) else None
                 self._gaps.take(message.seq, began)
+                self._read = message.time
             return cast(Message, message)
         if self._ends is not None and self.end is None and (end := self._ends.receive(0)) is not None:
             self._pipeline_ended(end, DRAIN_SECONDS)
@@ -245,7 +266,10 @@ class Subscription(Generic[Message]):
         reports = self._reports.receive_all() if self._reports is not None else []
         states = [run_state(report.counters)[1] for report in reports if report.process == "detector"]
         self._close_reports()  # the next ones would wait behind these
-        return f"the state of the pipeline is: {states[-1]}" if states else "is a pipeline running there?"
+        if states:
+            return f"the state of the pipeline is: {states[-1]}"
+        removed = self.place is not None and self.place.lacks_sockets()
+        return REMOVED if removed else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
         """End after so many seconds; a stream of a fleet may continue with another pipeline."""
@@ -257,7 +281,7 @@ class Subscription(Generic[Message]):
     def _look_for_pipeline(self) -> None:
         """Follow a stream of a fleet; end if the pipeline has removed its sockets from its folder, as it does at last.
 
-        ZeroMQ connects again only while the subscriber reads: the end is lost if it did not read since a restart.
+        A subscriber that did not read since a restart has no subscription there, and misses the end.
         """
         if self._stream is not None:
             self._follow(self._stream)
@@ -288,7 +312,9 @@ class Subscription(Generic[Message]):
             self._messages.close()
             self._ends.close()
             self._rejected += self._messages.rejected
-        self._messages = self._ends = None
+        if self._health is not None:
+            self._health.close()
+        self._messages = self._ends = self._health = None
         self._close_reports()
 
 

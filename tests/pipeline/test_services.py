@@ -1,6 +1,7 @@
 """The processes by themselves: started by hand, in any order, and ended in any way."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 
 from catstream.box import Box
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, ServiceError
 from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.run.job import Job
@@ -213,3 +214,17 @@ def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_t
         assert not any(map(psutil.pid_exists, stopped.values()))
         assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
     assert [track.frame for track in tracks] == list(range(len(boxes)))
+
+
+def test_a_run_whose_folder_was_removed_ends_with_that_reason(endless, folder):
+    """The folder is one that the system cleans, as the folder of a user at the logout."""
+    supervisor = Supervisor(Job(endless, {"": Box(150, 90, 50, 50)}, endpoint=str(folder), owned=True), folder)
+    try:
+        assert supervisor.next_frame()
+        shutil.rmtree(folder)
+        psutil.Process(supervisor.pids["trainer"]).kill()
+        with pytest.raises(ServiceError, match=r"the trainer died with signal SIGKILL, and .* folder .* was removed"):
+            list(iter(supervisor.next_frame, None))
+    finally:
+        supervisor.stop()
+        folder.mkdir()  # the fixture removes it

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -261,3 +262,37 @@ def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_fold
             assert next(subscription).seq == 1
         assert list(subscription) == []
         assert "did not receive its end" in subscription.end.reason
+
+
+def test_a_reader_that_is_slow_knows_how_old_its_tracks_are(endpoint, tracks, until):
+    with Publisher(HEALTH, endpoint, "detector") as health, attached(endpoint, tracks) as subscription:
+        assert subscription.behind == 0, "there was no report"
+        health.send(Health("detector", 1.0, {"time": 12.5}))
+        tracks.send(replace(track(2), time=0.4))
+        assert next(subscription).seq == 2
+        until(lambda: subscription.behind, health.serve_late_joiners)
+        assert subscription.behind == pytest.approx(12.1)
+        tracks.send(replace(track(3), time=12.5))
+        assert next(subscription).seq == 3
+        assert subscription.behind == 0
+
+
+def test_a_reader_that_always_finds_a_track_learns_the_end_of_a_pipeline_that_was_started_again(endpoint, until):
+    with Publisher(TRACKS, endpoint) as first:
+        subscription = attached(endpoint, first)
+        for seq in range(2, 900):
+            first.send(track(seq))
+    with subscription, Publisher(TRACKS, endpoint) as second:
+        heard = []
+
+        def read():
+            second.serve_late_joiners()
+            time.sleep(0.01)
+            heard.append(next(subscription).seq)
+
+        until(lambda: len(second._subscribed) == 2, read)
+        assert heard[-1] < 899, "a track was there at each look"
+        second.send(End(921, "the source has ended"))
+        heard += [message.seq for message in subscription]
+        assert heard == list(range(2, 900))
+        assert (subscription.end.reason, subscription.missed) == ("the source has ended", 21)
