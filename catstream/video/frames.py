@@ -111,13 +111,16 @@ class UprightConverter:
     """
 
     def __init__(self) -> None:
+        from av.sidedata.sidedata import SideDataContainer
         from av.video.reformatter import VideoReformatter
 
         self._reformatter = VideoReformatter()
+        self._side_data: Any = SideDataContainer
 
     def __call__(self, frame: VideoFrame) -> np.ndarray:
         image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
-        matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+        # With `frame.side_data`, the frame would refer to itself, and stay in memory until the next garbage collection.
+        matrix: Any = self._side_data(frame).get("DISPLAYMATRIX")
         if matrix is not None:
             image = _displayed(image, np.frombuffer(matrix, np.int32).reshape(3, 3)[:2, :2])
         return np.ascontiguousarray(image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import struct
 import tempfile
@@ -18,7 +19,7 @@ import pytest
 from av.stream import Disposition
 
 from catstream.errors import VideoError
-from catstream.video.frames import Source
+from catstream.video.frames import Source, UprightConverter
 from catstream.video.source import open_source
 
 H264 = dict.fromkeys((".mp4", ".mkv", ".ts", ".mov", ".h264", ".flv", ".MTS"), "libx264")
@@ -354,6 +355,16 @@ DISPLAYED: dict[str, tuple[tuple[int, ...], Callable[[np.ndarray], np.ndarray]]]
     "mirrored and turned": ((0, 1, 1, 0), lambda stored: stored.swapaxes(0, 1)),
     "without directions": ((0, 0, 0, 0), lambda stored: stored),
 }
+
+
+def test_a_frame_is_freed_without_a_garbage_collection(video):
+    with av.open(str(video("a.mp4", frames=1))) as container:
+        decoded = next(container.decode(video=0))
+    upright = UprightConverter()
+    gc.collect()
+    upright(decoded)
+    del decoded
+    assert gc.collect() == 0
 
 
 @pytest.mark.parametrize(("matrix", "seen"), DISPLAYED.values(), ids=DISPLAYED)
