@@ -206,7 +206,7 @@ class LiveSource(Source):
                 if self._closed:
                     return
                 if now > due:
-                    raise TimeoutError(_SILENT if now - before > settings.silent_seconds / 2 else _NO_FRAME)
+                    raise TimeoutError(_SILENT if now - before > 0.9 * settings.silent_seconds else _NO_FRAME)
                 if packet.stream_index != stream.index:  # sound may go on while the picture does not
                     continue
                 decoded: list[VideoFrame] = []

@@ -146,7 +146,7 @@ def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_pa
             request.wfile.write(data[start : start + len(data) // 200])
             time.sleep(0.3 if start > len(data) // 4 else 0)
 
-    with open_source(f"{served(send)}/a.ts", silent_seconds=0.5) as source:
+    with open_source(f"{served(send)}/a.ts", silent_seconds=1) as source:
         began = time.monotonic()
         until(lambda: source.reopened)
         assert time.monotonic() - began < 20, "the sound lasts longer"
