@@ -124,10 +124,10 @@ def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and
         with browser.stream("GET", f"{url}events") as events:
             lines = events.iter_lines()
             next(lines)
+            browser.post(f"{url}control", json={"verb": "pause"})  # before the box: the video is short
             command = {"verb": "set-box", "box": list(boxes[0])}
             answer = until(lambda: browser.post(f"{url}control", json=command))
             assert answer.json()["done"], answer.text
-            browser.post(f"{url}control", json={"verb": "pause"})
             asked = set(re.findall(r"(catstream_\w+){", BOARD.read_text())) - OTHERS
             until(lambda: asked <= set(re.findall(r"catstream_\w+", browser.get(f"{url}metrics").text)))
             browser.post(f"{url}control", json={"verb": "resume"})
