@@ -109,13 +109,18 @@ class Detector:
         else:  # never absent: the first leaf is of the first n frames, whatever the score of this tracker is
             state = replace(state, level="confident", window=found.window)
         self.state = state
-        if found.around is not None and model.version and self._taught is not None:
-            number, cells = self._taught
-            if seq - number < _STILL_INTERVAL and found.around.cells.differs_by_noise(cells):
-                return self._result(seq, time, found.score, {})
+        if self._shows_nothing_new(found, seq):
+            return self._result(seq, time, found.score, {})
         training = taught(state, found, frame, seq, model, self.likeness, settings)
         self._taught = (seq, found.around.cells) if training and found.around is not None else None
         return self._result(seq, time, found.score, training)
+
+    def _shows_nothing_new(self, found: Detection, seq: int) -> bool:
+        """Whether the surroundings of the object are still those of a recent frame that was taught (docs/paper.md)."""
+        if found.around is None or self._taught is None or not self.model.version:
+            return False
+        number, cells = self._taught
+        return seq - number < _STILL_INTERVAL and found.around.cells.differs_by_noise(cells)
 
     def correct(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
         """Continue with the same object at another box, whatever a search would have found.
