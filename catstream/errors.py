@@ -102,6 +102,7 @@ EXTRAS = {
     "loadtest": ("the load test", ("psutil",)),
     "mcap": ("an MCAP file", ("mcap",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
+    "network": ("a network", ("onnxruntime", "onnx")),
     "fleet": ("a fleet", ("ray", "obstore")),
     "s3": ("a store on S3", ("boto3",)),
 }

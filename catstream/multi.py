@@ -19,7 +19,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, FrameError, ObjectError
-from catstream.features.pyramid import Pyramid
+from catstream.features.descriptor import descriptor_of
 from catstream.messages.kinds import Features, Track, Tracks
 from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
 from catstream.numerics.threads import one_thread
@@ -56,6 +56,7 @@ class MultiTracker:
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
+        descriptor_of(self.settings)  # loads the network, if there is one: an error comes before the first frame
         self._tracks: dict[str, Track] | None = None
 
     def __repr__(self) -> str:
@@ -105,7 +106,7 @@ class MultiTracker:
         check_count(len(boxes), self.settings.run.objects_most)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
         with one_thread():
-            pyramid = Pyramid(image)
+            pyramid = detectors.pyramid(image)
             given = detectors.begin_all(boxes, pyramid, time)
             # If a box was refused, nothing has changed.
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
@@ -163,7 +164,7 @@ class MultiTracker:
             )
         self.detectors.seq = self.forest.seq  # a frame whose update was interrupted, as by Ctrl-C, counts as not seen
         with one_thread():
-            pyramid = Pyramid(image)
+            pyramid = self.detectors.pyramid(image)
             given = self.detectors.begin_all(boxes, pyramid, time)
             for name, learned in models.items():
                 self.detectors.seek(name, learned.model, learned.box, learned.likeness())
@@ -176,7 +177,8 @@ class MultiTracker:
             raise ObjectError(f"{listed(sorted(both))}: a box and a saved model for one object: give one of them")
         names = {check_name(name) for name in (*self.detectors.detectors, *boxes, *models)}
         check_count(len(names), self.settings.run.objects_most)
-        return {name: learned.compressor(self.settings, name) for name, learned in models.items()}
+        network = self.detectors.network
+        return {name: learned.compressor(self.settings, network, name) for name, learned in models.items()}
 
     def forget(self, name: str) -> None:
         """Stop tracking an object; everything learned of it is dropped with the next frame.

@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 from catstream.errors import ProtocolError, ServiceError, SettingsError, without_password
+from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import why_not_writable
@@ -168,8 +169,12 @@ class Pipeline:
             self.live = first.live
         check_boxes(job.boxes, *self.size)
         path = job.source if self.live else str(Path(job.source).absolute())
-        self._job = replace(job, source=path, size=self.size, settings=job.settings.for_length(self.frames))
-        check_files(job.models, self._job.settings)
+        settings = job.settings.for_length(self.frames)
+        if settings.features.network:
+            settings = settings.but({"features.network": str(Path(settings.features.network).absolute())})
+        network = digest_of(descriptor_of(settings, job.network))
+        self._job = replace(job, source=path, size=self.size, settings=settings, network=network)
+        check_files(job.models, settings, network)
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
         self._save_models = job.results.models if save_model is None else saved_models

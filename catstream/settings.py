@@ -177,6 +177,18 @@ class BeliefSettings(_Group):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FeatureSettings(_Group):
+    """What a feature row holds beside HOG and colours."""
+
+    group = "features"
+
+    network: Annotated[
+        str,
+        _about("ONNX file of a network whose features are used, too (empty: none): see `catstream network prepare`."),
+    ] = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TeachingSettings(_Group):
     """Which training rows are cut from a frame, and how a model is learned from them."""
 
@@ -237,7 +249,7 @@ class Settings:
 
     Parameters
     ----------
-    run, coreset, search, belief, teaching, extent : the group, or a mapping of its names to values
+    run, coreset, search, belief, features, teaching, extent : the group, or a mapping of its names to values
         What is left out has its default.
 
     Raises
@@ -255,6 +267,7 @@ class Settings:
     coreset: CoresetSettings = field(default_factory=CoresetSettings)
     search: SearchSettings = field(default_factory=SearchSettings)
     belief: BeliefSettings = field(default_factory=BeliefSettings)
+    features: FeatureSettings = field(default_factory=FeatureSettings)
     teaching: TeachingSettings = field(default_factory=TeachingSettings)
     extent: ExtentSettings = field(default_factory=ExtentSettings)
 
@@ -267,6 +280,7 @@ class Settings:
             coreset: CoresetSettings | Mapping[str, object] = ...,
             search: SearchSettings | Mapping[str, object] = ...,
             belief: BeliefSettings | Mapping[str, object] = ...,
+            features: FeatureSettings | Mapping[str, object] = ...,
             teaching: TeachingSettings | Mapping[str, object] = ...,
             extent: ExtentSettings | Mapping[str, object] = ...,
         ) -> None: ...
@@ -413,7 +427,7 @@ class Settings:
         return {name: text for name, text in self.texts().items() if name not in _LOCAL}
 
 
-_LOCAL = ("run.endpoint", "run.keys")
+_LOCAL = ("run.endpoint", "run.keys", "features.network")
 _SERVICE = re.compile(r"(^|[._])(service[._](host|port)|port(_[0-9]+_(tcp|udp).*)?$|port\.[0-9]+_(tcp|udp))")
 
 _PAPER: dict[str, Value] = {

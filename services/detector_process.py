@@ -18,7 +18,6 @@ import cv2
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError, without_password
-from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED
@@ -90,7 +89,7 @@ class DetectorLoop:
         self._process = process
         self._model_files = ModelFiles(job.state / SEARCHED if job.state is not None else None)
         self.desired = _desired(process, self._model_files)
-        self.detectors = Detectors(process.settings)
+        self.detectors = Detectors(process.settings, job.network)
         self._control: Responder[Command, Answer] = stack.enter_context(
             Responder(CONTROL, endpoint, longest=CONTROL.limit)
         )
@@ -231,7 +230,7 @@ class DetectorLoop:
 
     def track(self, frame: Frame, given: dict[str, Result]) -> tuple[Tracks, Features]:
         """Find all objects in a frame; those begin whose first frame it is."""
-        pyramid, seq = Pyramid(frame.image), self.detectors.seq + 1
+        pyramid, seq = self.detectors.pyramid(frame.image), self.detectors.seq + 1
         for name, each in [*self.desired.objects.items()]:  # in their order the samples are numbered
             if name in given or (name in self.detectors.detectors and each.begins != seq):
                 continue
@@ -333,7 +332,7 @@ class DetectorLoop:
             return None
         self._process.watchdog.allow()
         learned = Learned.from_bytes(command.model, "the file")
-        learned.check_fits(self._process.settings)
+        learned.check_fits(self._process.settings, self.detectors.network)
         return self._model_files.add(learned)
 
     def _begin_boxes(self, frame: Frame) -> dict[str, Result]:
@@ -359,10 +358,10 @@ class DetectorLoop:
         self._process.watchdog.allow()
         of_name = f" {name}" if name else ""
         if is_kept(command, name, self.desired, detectors):
-            given[name] = detectors.correct(name, Pyramid(frame.image), box, frame.time)
+            given[name] = detectors.correct(name, detectors.pyramid(frame.image), box, frame.time)
             effect = f"the same object{of_name} continues {at}"
         else:
-            given[name] = detectors.begin(name, Pyramid(frame.image), box, frame.time)
+            given[name] = detectors.begin(name, detectors.pyramid(frame.image), box, frame.time)
             effect = f"{'another' if name in self.desired.objects else 'the'} object{of_name} begins {at}"
             self.desired = self.desired.begun(name, DesiredObject(box, detectors.seq + 1))
         return answer(command, detectors, True, effect, name, detectors.seq)

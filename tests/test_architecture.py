@@ -81,10 +81,12 @@ IMPORTERS = {
     "uvicorn": ["catstream/web/server.py"],
     "prometheus_client": ["catstream/web/prometheus.py"],
     "rich": ["catstream/cli"],
+    "onnxruntime": ["catstream/features/network.py"],
+    "onnx": ["catstream/applications/backbone.py"],
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"mcap", "av", "pyarrow", "ray", "obstore"}
+SLOW = {"mcap", "av", "pyarrow", "ray", "obstore", "onnx", "onnxruntime"}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

@@ -33,6 +33,7 @@ COMMANDS = {
     "merge": "Merge saved models of one object.",
     "stop": "Stop a running pipeline as if its source had ended.",
     "fleet": "Run many streams on one machine or many.",
+    "network": "Use the features of a small network beside HOG and colours.",
     "keys": "Manage the keys of a pipeline and its clients.",
     "settings": "List all settings with their defaults and descriptions.",
 }
@@ -40,6 +41,7 @@ COMMANDS = {
 #: Module of the commands that share a module, or whose module has another name.
 _MODULES = {
     "fleet": "fleet_commands",
+    "network": "network_commands",
     **dict.fromkeys(("watch", "status", "set-box", "search", "forget", "pause", "resume", "save", "stop"), "attach"),
     **dict.fromkeys(("find", "merge"), "models"),
     **dict.fromkeys(("evaluate", "loadtest", "demo"), "measure"),

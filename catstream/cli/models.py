@@ -46,6 +46,9 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 @click.option(
     "--sizes", default="0.4,2.5", show_default=True, callback=_sizes, metavar="LOW,HIGH", help="Sizes to search."
 )
+@click.option(
+    "--network", type=PATH, metavar="FILE", help="The file features.network that the models were learned with."
+)
 @click.option("--fps", type=float, default=25.0, show_default=True, help="Images of a folder per second.")
 @with_skip_damaged
 def find(
@@ -56,6 +59,7 @@ def find(
     threshold: float,
     every: float,
     sizes: tuple[float, float],
+    network: Path | None,
     fps: float,
     skip_damaged: bool,
 ) -> None:
@@ -93,7 +97,7 @@ def find(
         from catstream.applications.finding.found import SearchLog, write_report, write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
-    search = Search(load_models(models), reading, threshold, every, sizes)
+    search = Search(load_models(models), reading, threshold, every, sizes, str(network or ""))
     files = find_files(paths)
     with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
         try:

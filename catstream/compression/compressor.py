@@ -35,15 +35,16 @@ class Compressor:
     box          box in which the object was last found
     detector     the detector state after the newest frame: a restarted detector continues from it
     last_sample  the newest sample, None before the first
+    network      digest of the network that computes a part of the rows, empty if there is none
     """
 
-    def __init__(self, settings: Settings, name: str = "") -> None:
+    def __init__(self, settings: Settings, name: str = "", network: str = "") -> None:
         if settings.coreset.share:
             raise SettingsError(
                 f"coreset.share={settings.coreset.share:g} is a share of a video's length: "
                 "call Settings.for_length first, or set coreset.size"
             )
-        self.settings, self.name = settings, name
+        self.settings, self.name, self.network = settings, name, network
         self.trees = {name: REDUCTIONS[settings.coreset.reduction](settings.coreset.size) for name in TREES}
         self.began, self.frame = 0, -1
         self.box: Box | None = None
@@ -64,11 +65,12 @@ class Compressor:
         origins: tuple[str, ...],
         settings: Settings,
         name: str = "",
+        network: str = "",
     ) -> Compressor:
         """A compressor that inserts another stream into copies of the trees of an earlier one; see `begin` too."""
-        self = cls(settings, name)
+        self = cls(settings, name, network)
         self.trees = {each: tree.copy() for each, tree in trees.items()}
-        self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name), centres
+        self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name, network=network), centres
         self._sampled_leaves, self._earlier = self.leaves, origins
         return self
 
@@ -102,7 +104,8 @@ class Compressor:
         if not self._due():
             return None
         self._sampled_leaves = self.leaves
-        self.last_sample = sample_of(self.trees, version, frame, self.centres, self.name, self.began)
+        about = self.name, self.began, self.network
+        self.last_sample = sample_of(self.trees, version, frame, self.centres, *about)
         return self.last_sample
 
     @property
@@ -144,6 +147,7 @@ class Compressor:
             "trees": trees,
             "origin": self._origin,
             "earlier": list(self._earlier),
+            "network": self.network,
         }
         # The trees grow after a sample was made. The sample is kept too, so that a restarted trainer trains the same
         # model again that the detector uses.
@@ -156,7 +160,7 @@ class Compressor:
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings, name: str = "") -> Compressor:
         """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
-        self = cls(settings, name)
+        self = cls(settings, name, str(metadata.get("network", "")))  # which an older checkpoint lacks
         self.began, self.frame = int(metadata["began"]), int(metadata["frame"])
         self.box = Box(*metadata["box"]) if metadata["box"] else None
         if "detector" in metadata:
@@ -190,11 +194,17 @@ class Compressor:
 
 
 def sample_of(
-    trees: Mapping[str, CoresetTree], version: int, frame: int, centres: np.ndarray, name: str, began: int = 0
+    trees: Mapping[str, CoresetTree],
+    version: int,
+    frame: int,
+    centres: np.ndarray,
+    name: str,
+    began: int = 0,
+    network: str = "",
 ) -> Sample:
     """The sample of all trees of an object that have a leaf."""
     summaries = {each: tree.sample() for each, tree in trees.items() if tree.nodes}
-    return Sample(version, frame, summaries, centres, name, began)
+    return Sample(version, frame, summaries, centres, name, began, network)
 
 
 def _rows_of(tree: Tree, training: TrainingRows) -> Float32:

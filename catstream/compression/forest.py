@@ -43,7 +43,13 @@ class Forest:
         self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MOST_STATES)  # of the last messages
 
     def check_features(self, features: Features) -> None:
-        """Raise ProtocolError if rows have another length than those before."""
+        """Raise ProtocolError if rows have another length than those before, or are of another network."""
+        if others := {compressor.network for compressor in self.compressors.values()} - {features.network}:
+            raise ProtocolError(
+                f"features are of the network {features.network or 'none'}, those before of {max(others) or 'none'}: "
+                "start all processes with the same catstream and the same settings",
+                "width",
+            )
         width = max((compressor.width for compressor in self.compressors.values()), default=0)
         for part in features.objects.values():
             for training in part.training.values():
@@ -75,7 +81,9 @@ class Forest:
             )
         self.check_features(features)  # before the first tree takes its rows, so that all trees hold the same frames
         before = self.compressors | {name: learned.get(name) for name, each in features.objects.items() if each.begins}
-        self.compressors = {name: before.get(name) or Compressor(self.settings, name) for name in features.objects}
+        self.compressors = {
+            name: before.get(name) or Compressor(self.settings, name, features.network) for name in features.objects
+        }
         samples: list[Sample] = []
         for name, part in features.objects.items():
             compressor = self.compressors[name]

@@ -18,6 +18,7 @@ from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import Cells
+from catstream.features.descriptor import Descriptor
 from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
@@ -44,8 +45,8 @@ class Detector:
     likeness        to the object of a saved model, used until that is found; None without a saved model
     """
 
-    def __init__(self, settings: Settings, name: str = "") -> None:
-        self.settings, self.name = settings, name
+    def __init__(self, settings: Settings, name: str = "", descriptor: Descriptor | None = None) -> None:
+        self.settings, self.name, self.descriptor = settings, name, descriptor
         self.state: DetectorState | None = None
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self.newest_version = 0
@@ -83,9 +84,9 @@ class Detector:
         higher than the rest of the frame, in several successive frames. Of two objects that look alike, neither is
         found. ProtocolError if the model is of other features.
         """
-        if len(model.weights) != row_length():
+        if len(model.weights) != (width := row_length(self.descriptor.channels if self.descriptor is not None else 0)):
             raise ProtocolError(
-                f"the model has {len(model.weights)} weights, the features of a window are {row_length()}: "
+                f"the model has {len(model.weights)} weights, the features of a window are {width}: "
                 "learn it again with this catstream"
             )
         window = Window.around(box, self.settings.search.context)

@@ -16,6 +16,7 @@ from catstream.detection.detector import Detector, Result
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.errors import ObjectError
+from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks
 from catstream.messages.names import check_count, check_name, errors_about, listed
@@ -30,12 +31,16 @@ class Detectors:
     """Follows the objects of one stream, each with a detector of its own, by name in the order in which they began.
 
     For a frame, `begin` or `correct` the objects whose box is given, and `seek` those of saved models; then `step`.
+    Each takes the `pyramid` of the frame.
+
+    SettingsError or MissingExtraError if the network of the settings cannot be used, see `descriptor_of`; `network` is
+    the digest that it must have, if that is known.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, network: str = "") -> None:
         if settings.teaching.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
             import catstream.paper.scm  # noqa: F401
-        self.settings = settings
+        self.settings, self.descriptor = settings, descriptor_of(settings, network)
         self.seq = 0
         self.detectors: dict[str, Detector] = {}
 
@@ -51,7 +56,16 @@ class Detectors:
     def _made(self, name: str) -> Detector:
         """A new detector, for one more object."""
         check_count(len(self.detectors) + 1, self.settings.run.objects_most)
-        return Detector(self.settings, check_name(name))
+        return Detector(self.settings, check_name(name), self.descriptor)
+
+    @property
+    def network(self) -> str:
+        """Digest of the network, empty if there is none."""
+        return digest_of(self.descriptor)
+
+    def pyramid(self, image: np.ndarray) -> Pyramid:
+        """A frame, uint8 (h, w, 3) BGR, for the calls that take one."""
+        return Pyramid(image, self.descriptor)
 
     def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
         """Start an object with its box in the next frame; another one of this name is forgotten.
@@ -102,7 +116,7 @@ class Detectors:
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         parts = {name: results[name][1] for name in names}
-        return Tracks(self.seq, self.seq - 1, tracks), Features(self.seq, self.seq - 1, time, parts)
+        return Tracks(self.seq, self.seq - 1, tracks), Features(self.seq, self.seq - 1, time, parts, self.network)
 
     def forget(self, name: str) -> None:
         """Stop tracking an object; ObjectError if there is none of this name."""

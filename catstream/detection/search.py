@@ -6,7 +6,7 @@ A window is 8 x 8 cells. A search at another size resizes the frame, not the mod
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,15 +15,17 @@ import numpy as np
 from catstream.box import Window
 from catstream.detection import belief, extent
 from catstream.detection.likeness import Likeness
-from catstream.features.layout import WINDOW
+from catstream.features.layout import EDGE, WINDOW
 from catstream.features.pyramid import Pyramid, Region
-from catstream.features.score_map import ScoreMap, vertex
+from catstream.features.score_map import ScoreMap, non_maximum_suppression, vertex
+from catstream.features.vectors import VectorMap
 from catstream.messages.heads import ASPECT, EXTENT, SIZE
 from catstream.messages.kinds import DetectorState, Model
 from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
 _MOST_CELLS = 16_384  # limit of a search of the whole frame in one frame, over all sizes: about 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size
+_MOST_DESCRIBED = 10  # windows of a search of the whole frame, the best by HOG and colours, that a descriptor sees
 _WHOLE_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _SOUGHT_FACTORS = tuple(1.25**k for k in range(-4, 5))  # of the size of an object that has not been found yet
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
@@ -108,8 +110,10 @@ def _at_likely_size(frame: Pyramid, found: Detection, model: Model, likeness: Li
     that of the object's mean, 1. The subspace of the object contains its own outline and margin.
     """
 
+    vectors = _vectors(frame, found)
+
     def tried(step: int) -> tuple[float, Detection]:
-        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
+        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model, vectors)
         best = Detection(*scores.best())
         return min(best.score, 1.0) + likeness(scores.cells.row(*scores.highest())), best
 
@@ -184,14 +188,29 @@ def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[lis
 
 def _best_of(frame: Pyramid, parts: list[_Part], window: Window, model: Model) -> Detection:
     """The best window of several parts of a frame, each searched at the size of a window times a factor."""
-    maps = [ScoreMap.within(frame, region, window.scaled(factor), model) for factor, region in parts]
-    return Detection(*_best_map(maps, [factor for factor, _ in parts]).best())
+    return Detection(*_best_map(_searched(frame, parts, window, model)).best())
 
 
-def _best_map(maps: Sequence[ScoreMap], factors: Sequence[float]) -> ScoreMap:
+def _searched(frame: Pyramid, parts: Iterable[_Part], window: Window, model: Model) -> list[tuple[float, ScoreMap]]:
+    """The factor and the scores of several parts of a frame, each searched at the size of a window times its factor.
+
+    With a descriptor, the scores around the windows that are the best of all by HOG and colours.
+    """
+    maps = [(factor, ScoreMap.within(frame, region, window.scaled(factor), model)) for factor, region in parts]
+    if frame.descriptor is None:
+        return maps
+    windows = [
+        (float(scores.scores[place]), factor, scores.window(*place))
+        for factor, scores in maps
+        for place in non_maximum_suppression(scores.scores, _MOST_DESCRIBED, WINDOW // 2)
+    ]
+    best = sorted(windows, key=lambda each: -each[0])[:_MOST_DESCRIBED]
+    return [(factor, ScoreMap.around(frame, each, _FINE_SIDE, model)) for _, factor, each in best]
+
+
+def _best_map(maps: Sequence[tuple[float, ScoreMap]]) -> ScoreMap:
     """The map with the highest score less the cost of its factor of size."""
-    costs = [extent.cost(math.log(factor)) for factor in factors]
-    return maps[int(np.argmax([float(each.scores.max()) - cost for each, cost in zip(maps, costs, strict=True)]))]
+    return max(maps, key=lambda each: float(each[1].scores.max()) - extent.cost(math.log(each[0])))[1]
 
 
 def _sighting(
@@ -208,10 +227,11 @@ def _sighting(
     In a scene that the model never saw, anything may score high: the rival, the best window that does not touch this
     one, shows how high. The mean of the background that was learned scores 0.
     """
-    maps = [ScoreMap.whole(frame, window.scaled(factor), model) for factor in factors]
-    scores = _best_map(maps, factors)
+    parts = [(factor, frame.region_around(window.scaled(factor))) for factor in factors]
+    maps = _searched(frame, parts, window, model)
+    scores = _best_map(maps)
     best, alike = Detection(*scores.best()), likeness(scores.cells.row(*scores.highest()))
-    apart = max((each.apart(best.window) for each in maps), key=lambda each: float(each.scores.max()))
+    apart = max((each.apart(best.window) for _, each in maps), key=lambda each: float(each.scores.max()))
     rival = max(float(apart.scores.max()), 0.0)
     lead = best.score - rival
     if alike < limits.sighting_likeness or lead < _SIGHTING_LEAD:
@@ -240,9 +260,10 @@ def fitted(frame: Pyramid, found: Detection, first: Window | None, model: Model,
 
 def _at_best_size(frame: Pyramid, found: Detection, first: Window, model: Model, settings: ExtentSettings) -> Detection:
     grown = math.log(found.window.area / first.area) / 2
+    vectors = _vectors(frame, found)
 
     def tried(step: int) -> tuple[float, Detection]:
-        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model)
+        scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model, vectors)
         best = Detection(*scores.best())
         fit = _fit(scores.cells.row(1, 1), model, SIZE, settings)
         return best.score + fit - extent.cost(step * extent.SIZE_CHANGE, grown, settings.prior), best
@@ -255,15 +276,27 @@ def _at_best_aspect(
     frame: Pyramid, found: Detection, first: Window, model: Model, settings: ExtentSettings
 ) -> Detection:
     widened = math.log(found.window.w / found.window.h * first.h / first.w)
+    vectors = _vectors(frame, found)
 
     def tried(step: int) -> tuple[float, Detection]:
-        scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step)), WINDOW, model)
+        scores = ScoreMap.around(frame, found.window.scaled(*extent.stretch(step)), WINDOW, model, vectors)
         fit = _fit(scores.cells.row(0, 0), model, ASPECT, settings)
         cost = extent.cost(step * extent.ASPECT_CHANGE, widened, settings.prior)
         return float(scores.scores[0, 0]) + fit - cost, found
 
     _, step, beside = _climb(tried, settings.aspect_count // 2)
     return replace(found, window=found.window.scaled(*extent.stretch(step + beside)))
+
+
+def _vectors(frame: Pyramid, found: Detection) -> VectorMap | None:
+    """The vectors around a detection, from which those of other sizes are sampled; None without a descriptor."""
+    if found.around is not None:
+        return found.around.vectors
+    return (
+        None
+        if frame.descriptor is None
+        else VectorMap.of(frame.descriptor, frame.around(found.window, WINDOW, EDGE), found.window)
+    )
 
 
 def _fit(row: np.ndarray, model: Model, name: str, settings: ExtentSettings) -> float:

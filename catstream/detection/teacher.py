@@ -21,9 +21,10 @@ from catstream.detection.likeness import Likeness
 from catstream.detection.search import due
 from catstream.errors import BoxError
 from catstream.features.cells import window_rows
-from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW, row_length
+from catstream.features.layout import CELL, COLOURS, EDGE, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
+from catstream.features.vectors import VectorMap
 from catstream.messages.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
 from catstream.messages.kinds import Model, TrainingRows
 from catstream.numerics import ridge
@@ -45,7 +46,6 @@ _MOST_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
 
 _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians
-_PATCH = (WINDOW + 2 * MARGIN) * CELL  # side of a copy with its margin, in pixels
 _NEAREST_OTHER, _FARTHEST_OTHER = 0.3, 1.0  # distance of another background, in windows
 _SOLID, _GONE = 0.8, 1.15  # radii between which the object's ellipse fades; 1 touches the sides of its box
 
@@ -59,13 +59,14 @@ def first_training(
     background look the same.
     """
     teaching, count = settings.teaching, settings.coreset.size
+    around = ScoreMap.around(frame, window, _SIDE, None)
     if teaching.bootstrap == "scm":
-        rows = _appearance(frame, window, None, None, rng, teaching)
+        rows = _appearance(frame, window, around, None, rng, teaching)
     else:
         context, moved = settings.search.context, teaching.other_backgrounds
-        copies = affine_copies(frame, window, count, rng, context=context, moved=moved)
+        copies = affine_copies(frame, window, count, rng, around.vectors, context=context, moved=moved)
         rows = _rows(copies, 1, _OBJECT_WEIGHT, teaching)
-        rows += _surroundings(ScoreMap.around(frame, window, _SIDE, None), window, count, 0, rng, teaching)
+        rows += _surroundings(around, window, count, 0, rng, teaching)
     training = _first_extents(frame, window, rng, settings)
     rows += hard_negatives(frame, window, initial_model(rows), teaching)
     return initial_model(rows), {APPEARANCE: rows, **training}
@@ -99,8 +100,10 @@ def training_at(
     Near misses and background are taken from the windows around it that a search scored, if they reach far enough.
     """
     rng = np.random.default_rng((settings.run.seed, seq))  # of this frame alone: no frame depends on those before
+    if around is None or min(around.cells.shape) < _SIDE:
+        around = ScoreMap.around(frame, window, _SIDE, model)
     rows = _appearance(frame, window, around, model, rng, settings.teaching)
-    return {APPEARANCE: rows, **(_extents(frame, window, rows, settings) if extents else {})}
+    return {APPEARANCE: rows, **(_extents(frame, window, around.vectors, rows, settings) if extents else {})}
 
 
 def training_beside(frame: Pyramid, window: Window, model: Model, likeness: Likeness, settings: Settings) -> Training:
@@ -110,15 +113,16 @@ def training_beside(frame: Pyramid, window: Window, model: Model, likeness: Like
     the object.
     """
     scores = ScoreMap.whole(frame, window, model)
-    rows = _strongest(scores, window, settings.teaching.hard_negatives, settings.belief.weak_score)
-    strange = [row for row in rows if likeness(row) < settings.belief.sighting_likeness]
-    return {APPEARANCE: _rows(strange, 0, 1, settings.teaching)} if strange else {}
+    most, least = settings.teaching.hard_negatives, settings.belief.weak_score
+    rows = _strongest(frame, scores, window, model, most, least)
+    strange = rows[[likeness(row) < settings.belief.sighting_likeness for row in rows]]
+    return {APPEARANCE: _rows(strange, 0, 1, settings.teaching)} if len(strange) else {}
 
 
 def hard_negatives(frame: Pyramid, window: Window, model: Model, teaching: TeachingSettings) -> TrainingRows:
     """The windows of the whole frame that score highest, without those that overlap the object's."""
     scores = ScoreMap.whole(frame, window, model)
-    return _rows(_strongest(scores, window, teaching.hard_negatives), 0, 1, teaching)
+    return _rows(_strongest(frame, scores, window, model, teaching.hard_negatives), 0, 1, teaching)
 
 
 def _mined(frame: Pyramid, window: Window, seq: int, model: Model, teaching: TeachingSettings) -> TrainingRows | None:
@@ -136,14 +140,22 @@ def _mined(frame: Pyramid, window: Window, seq: int, model: Model, teaching: Tea
     if begin == end:
         return None
     scores = ScoreMap.within(frame, parts[number], window, model)
-    return _rows(_strongest(scores, window, end - begin), 0, 1, teaching)
+    return _rows(_strongest(frame, scores, window, model, end - begin), 0, 1, teaching)
 
 
-def _strongest(scores: ScoreMap, window: Window, most: int, least: float = -math.inf) -> list[np.ndarray]:
-    """The rows of the windows with the highest scores above `least` that hardly overlap another window."""
+def _strongest(
+    frame: Pyramid, scores: ScoreMap, window: Window, model: Model, most: int, least: float = -math.inf
+) -> np.ndarray:
+    """The rows, float32 (k, d), of the windows with the highest scores above `least` that hardly overlap another one.
+
+    Of a frame with a descriptor, the scores are those of HOG and colours; it computes only what the rows need.
+    """
     places = non_maximum_suppression(scores.scores, most + 1, WINDOW // 2, least)
-    rows = [scores.cells.row(*place) for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP]
-    return rows[:most]
+    places = [place for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP][:most]
+    if frame.descriptor is None:
+        return scores.cells.rows(places)
+    rows = [ScoreMap.around(frame, scores.window(*place), WINDOW, None).cells.row(0, 0) for place in places]
+    return np.array(rows, np.float32).reshape(-1, len(model.weights))
 
 
 def initial_model(rows: TrainingRows) -> Model:
@@ -166,6 +178,7 @@ def affine_copies(
     window: Window,
     count: int,
     rng: np.random.Generator,
+    vectors: VectorMap | None = None,
     *,
     context: float = 1.0,
     moved: float = 0.0,
@@ -176,20 +189,26 @@ def affine_copies(
     All copies of one frame agree on the corners of the window, which are not the object: the share `moved` of the
     copies is put on another background of the frame. An object that turns shows another side, which often is the mirror
     image: the last copies, `mirrored` in number, are mirrored left to right. Returns float32 (count, d); the first row
-    is that of the window itself, which is `context` times as large as the object's box.
+    is that of the window itself, which is `context` times as large as the object's box. With a descriptor, the copies
+    that are only scaled, shifted and rotated are sampled from its `vectors` around the window.
     """
     change = rng.normal(size=(count, 4))
     if count:
         change[0] = 0
-    patches = []
+    patches, of_vectors = [], []
     for number, (scale, right, down, turn) in enumerate(change):
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _elsewhere(window, rng) if _is_moved(number, moved) else None
         patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
-        if number >= max(count - mirrored, 1):
+        is_mirrored = number >= max(count - mirrored, 1)
+        if is_mirrored:
             patch = patch[:, :, ::-1]
         patches.append(patch)
-    return window_rows(patches)
+        if frame.descriptor is not None and (vectors is None or is_mirrored or offset is not None):
+            of_vectors.append(VectorMap.of(frame.descriptor, patch, copy).row(copy))
+        elif vectors is not None:
+            of_vectors.append(vectors.row(copy, _TURN * turn))
+    return window_rows(patches, of_vectors)
 
 
 def _is_moved(number: int, share: float) -> bool:
@@ -214,25 +233,26 @@ def _patch(
 ) -> np.ndarray:
     """A window and its margin, cut from a frame, rotated by `turn` radians and resized, uint8 (3, 96, 96).
 
-    The object, whose box has the centre of the window, is put on another background `offset` pixels away; None leaves
-    it.
+    With a descriptor, the margin is larger. The object, whose box has the centre of the window, is put on another
+    background `offset` pixels away; None leaves it.
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
+    side = (WINDOW + 2 * (MARGIN if frame.descriptor is None else EDGE)) * CELL
     x, y = window.centre
-    patch = frame.cut(x, y, *pixel, _PATCH, turn)
+    patch = frame.cut(x, y, *pixel, side, turn)
     if offset is None:
         return patch
-    share = _ellipse(window.w / box.w, window.h / box.h)
-    background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
+    share = _ellipse(side, window.w / box.w, window.h / box.h)
+    background = frame.cut(x + offset[0], y + offset[1], *pixel, side, turn)
     return np.stack([cv2.blendLinear(*both, share, 1 - share) for both in zip(patch, background, strict=True)])
 
 
-def _ellipse(across: float, down: float) -> np.ndarray:
-    """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it.
+def _ellipse(side: int, across: float, down: float) -> np.ndarray:
+    """Share of the object in each pixel of a patch, float32 (side, side): 1 inside its ellipse, falling to 0 around it.
 
     The window is `across` times as wide, and `down` times as high as the object.
     """
-    place = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
+    place = (np.arange(side) - (side - 1) / 2) / (WINDOW * CELL / 2)
     out = np.hypot((place * down)[:, None], place * across)
     share: np.ndarray = ((_GONE - out) / (_GONE - _SOLID)).clip(0, 1).astype(np.float32)
     return share
@@ -241,16 +261,14 @@ def _ellipse(across: float, down: float) -> np.ndarray:
 def _appearance(
     frame: Pyramid,
     window: Window,
-    around: ScoreMap | None,
+    around: ScoreMap,
     model: Model | None,
     rng: np.random.Generator,
     teaching: TeachingSettings,
 ) -> TrainingRows:
     """The object, affine copies of it, near misses and background; half of this scores highest, if there is a model."""
-    own = affine_copies(frame, window, 1 + teaching.copies, rng, mirrored=teaching.mirrored)
+    own = affine_copies(frame, window, 1 + teaching.copies, rng, around.vectors, mirrored=teaching.mirrored)
     rows = _rows(own, 1, _OBJECT_WEIGHT / len(own), teaching)
-    if around is None or min(around.cells.shape) < _SIDE:
-        around = ScoreMap.around(frame, window, _SIDE, model)
     hardest = 0 if model is None else _BACKGROUND // 2
     return rows + _surroundings(around, window, _BACKGROUND, hardest, rng, teaching)
 
@@ -277,12 +295,15 @@ def _surroundings(
     return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, teaching)
 
 
-def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
+def _extents(
+    frame: Pyramid, window: Window, vectors: VectorMap | None, rows: TrainingRows, settings: Settings
+) -> Training:
     """Rows of group "extent": the first of `rows`, which fits, and windows of wrong extents."""
     trials = [trial for each in extent.trials(window, settings.extent) for trial in each]
     if not trials:
         return {}
-    cuts = window_rows([frame.around(trial.window, WINDOW) for trial in trials])
+    of_vectors = [] if vectors is None else [vectors.row(trial.window) for trial in trials]
+    cuts = window_rows([frame.around(trial.window, WINDOW) for trial in trials], of_vectors)
     return {EXTENT: _fits([extent.Trial(window), *trials], np.vstack([rows.rows[:1], cuts]), 1, settings.teaching)}
 
 
@@ -293,22 +314,28 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
     """
     kinds = extent.trials(window, settings.extent)
     cuts = [cut for kind in kinds for cut in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings)]
-    rows = window_rows([patch for _, patch in cuts])
-    return {EXTENT: _fits([trial for trial, _ in cuts], rows, 1 / len(kinds), settings.teaching)} if kinds else {}
+    rows = window_rows([patch for _, patch, _ in cuts], [row for _, _, row in cuts if row is not None])
+    return {EXTENT: _fits([trial for trial, _, _ in cuts], rows, 1 / len(kinds), settings.teaching)} if kinds else {}
 
 
 def _first_cuts(
     frame: Pyramid, window: Window, trials: list[extent.Trial], rng: np.random.Generator, settings: Settings
-) -> Iterator[tuple[extent.Trial, np.ndarray]]:
-    """Trials at copies of the object in the first frame, each with its patch."""
+) -> Iterator[tuple[extent.Trial, np.ndarray, np.ndarray | None]]:
+    """Trials at copies of the object in the first frame, each with its patch, and with its vectors.
+
+    A descriptor computes the vectors of the first trial at each copy, from which those of the others are sampled.
+    """
     for number in range(math.ceil(settings.coreset.size / len(trials))):
         right, down, turn = rng.normal(size=3) if number else np.zeros(3)
         copy = _shifted(window, right, down)
         offset = _elsewhere(window, rng) if _is_moved(number, settings.teaching.other_backgrounds) else None
+        vectors = None
         for trial in trials:
             tried = trial.window.centred(*copy.centre)
             patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset)
-            yield trial, patch
+            if frame.descriptor is not None and vectors is None:
+                vectors = VectorMap.of(frame.descriptor, patch, tried)
+            yield trial, patch, None if vectors is None else vectors.row(tried)
 
 
 def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, teaching: TeachingSettings) -> TrainingRows:
@@ -323,12 +350,9 @@ def _gaussian(offset: float, sigma: float) -> float:
     return math.exp(-((offset / sigma) ** 2) / 2)
 
 
-def _rows(
-    rows: Sequence[np.ndarray] | np.ndarray, labels: float | list[float], weight: float, teaching: TeachingSettings
-) -> TrainingRows:
+def _rows(rows: np.ndarray, labels: float | list[float], weight: float, teaching: TeachingSettings) -> TrainingRows:
     """Training rows of one weight; the histogram of colours is 0 unless it is used: then no model weighs it."""
-    table = np.asarray(rows, np.float32).reshape(len(rows), row_length())
     if not teaching.colours:
-        table = table.copy()
-        table[:, COLOURS] = 0
-    return TrainingRows.labelled(table, labels, weight)
+        rows = rows.copy()
+        rows[:, COLOURS] = 0
+    return TrainingRows.labelled(rows, labels, weight)

@@ -7,6 +7,8 @@ HOG and mean colours say what is where. An object that bends or turns moves both
 colours: 288 shades of Lab, 8 of lightness by 6 x 6 of a and b. So a window's row also holds a histogram of the shades
 in its middle 6 x 6 cells, which are mostly object, of 4 x 4 shades each. The square root of each share is a feature, so
 that distances are Hellinger's.
+
+If there is a descriptor, the row ends with its vectors at 4 x 4 places of the window.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from catstream.features import kernels
-from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, WINDOW, row_length
+from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, PLACES, WINDOW, row_length
 from catstream.features.pyramid import planes_of
 from catstream.numerics.arrays import writable
 
@@ -33,24 +35,26 @@ _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with inf
 class Cells:
     """Features of a part of an image, cell by cell.
 
-    grid    float32 (rows, columns, 34), HOG and mean colour
-    shades  uint16 (4 * rows, 4 * columns), 4 x 4 of each cell
+    grid     float32 (rows, columns, 34), HOG and mean colour
+    shades   uint16 (4 * rows, 4 * columns), 4 x 4 of each cell
+    vectors  float32 (rows - 1, columns - 1, channels) of a descriptor, where four cells meet; None without one
     """
 
     grid: np.ndarray
     shades: np.ndarray
+    vectors: np.ndarray | None = None
 
     @classmethod
     def of(cls, image: np.ndarray) -> Cells:
-        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells."""
+        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells, without vectors."""
         planes = planes_of(image)
         return cls(grid(planes), shades(planes))
 
     @classmethod
-    def within(cls, planes: np.ndarray) -> Cells:
+    def within(cls, planes: np.ndarray, vectors: np.ndarray | None = None, margin: int = MARGIN) -> Cells:
         """Cells of a patch, uint8 (3, h, w), without the margin, whose features depend on pixels beyond it."""
-        edge = MARGIN * CELL
-        return cls(grid(planes, MARGIN), shades(planes[:, edge:-edge, edge:-edge]))
+        edge = margin * CELL
+        return cls(grid(planes, margin), shades(planes[:, edge:-edge, edge:-edge]), vectors)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -80,12 +84,21 @@ class Cells:
         features = np.empty((len(places), row_length()), np.float32)
         lines = self.grid.reshape(len(self.grid), -1)
         kernels.cut_rows(lines, self.shades, np.array(places, np.int64).reshape(-1, 2), features)
-        return features
+        if self.vectors is None:
+            return features
+        of_windows = [self.vectors[row : row + WINDOW : 2, column : column + WINDOW : 2] for row, column in places]
+        return np.hstack([features, np.reshape(of_windows, (len(places), -1))])
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
-        """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7)."""
+        """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7).
+
+        Without vectors, it is the part of the score that HOG and colours have.
+        """
         scores = self._places(weights, bias)
         add_colour_scores(self.shades, weights[COLOURS], scores)
+        if self.vectors is not None:
+            of_vectors = writable(weights[COLOURS.stop :]).reshape(PLACES**2, -1)
+            kernels.add_vector_scores(self.vectors, of_vectors, scores)
         return scores
 
     def respond_above(self, weights: np.ndarray, bias: float, least: float) -> np.ndarray:
@@ -111,12 +124,16 @@ class Cells:
         return scores
 
 
-def window_rows(patches: Sequence[np.ndarray]) -> np.ndarray:
-    """Feature rows of windows, each in a patch, uint8 (3, 96, 96), with the margin: float32 (k, d)."""
+def window_rows(patches: Sequence[np.ndarray], vectors: Sequence[np.ndarray] = ()) -> np.ndarray:
+    """Feature rows of windows, each in the middle of a patch, with the vectors of each if there is a descriptor.
+
+    The patches are uint8 (3, 96, 96), or larger by the margin of a descriptor. Returns float32 (k, d).
+    """
     features = np.empty((len(patches), row_length()), np.float32)
     if len(patches):
-        kernels.describe_windows(np.stack(patches), MARGIN, _SHARES, _SHADES_OF, features)
-    return features
+        stacked = np.stack(patches)
+        kernels.describe_windows(stacked, (stacked.shape[2] // CELL - WINDOW) // 2, _SHARES, _SHADES_OF, features)
+    return np.hstack([features, vectors]) if len(vectors) else features
 
 
 def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:

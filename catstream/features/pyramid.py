@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from catstream.box import Window
+from catstream.features.descriptor import Descriptor
 from catstream.features.kernels import sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
 
@@ -60,10 +61,11 @@ class Pyramid:
     Parameters
     ----------
     image : uint8 (h, w, 3) BGR, or (h, w) grey, which cuts are then, too
+    descriptor : computes a part of the features of a window, None for HOG and colours alone
     """
 
-    def __init__(self, image: np.ndarray) -> None:
-        self.image = np.ascontiguousarray(image)
+    def __init__(self, image: np.ndarray, descriptor: Descriptor | None = None) -> None:
+        self.image, self.descriptor = np.ascontiguousarray(image), descriptor
         self._halves = {0: self.image}
 
     @property
@@ -88,11 +90,11 @@ class Pyramid:
                 self._halves[level] = _half(self._halves[level - 1])
         return self._halves[level], 1 << level
 
-    def around(self, window: Window, side: int) -> np.ndarray:
+    def around(self, window: Window, side: int, margin: int = MARGIN) -> np.ndarray:
         """A patch of `side` x `side` cells around a window and a margin, as `cut`; the window has 64 x 64 pixels."""
         x, y = window.centre
         step = window.w / WINDOW, window.h / WINDOW
-        return self.cut(x, y, step[0] / CELL, step[1] / CELL, (side + 2 * MARGIN) * CELL)
+        return self.cut(x, y, step[0] / CELL, step[1] / CELL, (side + 2 * margin) * CELL)
 
     @property
     def region(self) -> Region:

@@ -8,8 +8,9 @@ import numpy as np
 
 from catstream.box import Window
 from catstream.features.cells import Cells
-from catstream.features.layout import WINDOW
+from catstream.features.layout import EDGE, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid, Region
+from catstream.features.vectors import VectorMap
 from catstream.messages.kinds import Model
 
 
@@ -21,28 +22,38 @@ class ScoreMap:
     scores   float32 (rows - 7, columns - 7), each of the window whose first cell is there
     origin   corner of the first cell in the frame, (x, y) in pixels
     step     width and height of a cell, in pixels of the frame
+    vectors  from which those of the cells were sampled; None without a descriptor, or of a region of the frame
     """
 
     cells: Cells
     scores: np.ndarray
     origin: tuple[float, float]
     step: tuple[float, float]
+    vectors: VectorMap | None = None
 
     @classmethod
-    def around(cls, frame: Pyramid, window: Window, side: int, model: Model | None) -> ScoreMap:
-        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0."""
-        patch = frame.around(window, side)
-        cells = Cells.within(patch)
+    def around(
+        cls, frame: Pyramid, window: Window, side: int, model: Model | None, vectors: VectorMap | None = None
+    ) -> ScoreMap:
+        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0.
+
+        If the frame has a descriptor, it computes the vectors around the window, unless they are given.
+        """
+        margin = MARGIN if frame.descriptor is None or vectors is not None else EDGE
+        patch = frame.around(window, side, margin)
+        if frame.descriptor is not None and vectors is None:
+            vectors = VectorMap.of(frame.descriptor, patch, window)
+        cells = Cells.within(patch, None if vectors is None else vectors.grid(window, side), margin)
         if model is None:
             scores = np.zeros((side - WINDOW + 1,) * 2, np.float32)
         else:
             scores = cells.respond(model.weights, model.bias)
         step, (x, y) = (window.w / WINDOW, window.h / WINDOW), window.centre
-        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step)
+        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step, vectors)
 
     @classmethod
     def within(cls, frame: Pyramid, region: Region, window: Window, model: Model) -> ScoreMap:
-        """All windows of a size in a region of a frame."""
+        """All windows of a size in a region of a frame, by HOG and colours alone."""
         image, step = frame.part(region).resized(window)
         cells = Cells.of(image)
         return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)

@@ -168,12 +168,14 @@ class Features:
     frame    number of the frame that the rows were cut from
     time     seconds since the start of the source, or of the run if the source is live
     objects  the part of each object that is tracked, by name
+    network  digest of the network that computed a part of the rows, empty if there is none
     """
 
     seq: Integer
     frame: Integer
     time: Number
     objects: ByObject[ObjectFeatures]
+    network: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +225,7 @@ class Sample:
     centres  centre of the object in each frame of the last complete block, pixels; NaN while absent
     object   name of the object
     began    number of the object's first frame
+    network  digest of the network that computed a part of the rows, empty if there is none
     """
 
     version: Integer
@@ -231,6 +234,7 @@ class Sample:
     centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
     object: ObjectName = ""
     began: Integer = 0
+    network: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +252,7 @@ class Model:
     biases   bias of each of these heads that has one
     object   name of the object
     began    number of the object's first frame
+    network  digest of the network that computes a part of a row, empty if there is none
     """
 
     version: Integer
@@ -261,6 +266,7 @@ class Model:
     biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
     object: ObjectName = ""
     began: Integer = 0
+    network: Text = ""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -131,6 +131,17 @@ def in_parallel(function: Callable[[_Item], _Result], items: Iterable[_Item]) ->
     return [call.result() for call in calls]
 
 
+def one_at_a_time(function: Callable[[_Item], _Result]) -> Callable[[_Item], _Result]:
+    """The same function, of which no two threads are inside at once."""
+    lock = threading.Lock()
+
+    def alone(item: _Item) -> _Result:
+        with lock:
+            return function(item)
+
+    return alone
+
+
 @cache
 def _cores() -> int:
     """Number of cores that this process may use."""

@@ -71,6 +71,7 @@ class Job:
     started   seconds since 1970 at which the run first started
     results   files that `catstream track` writes
     paused    whether the run starts paused, until the command `resume`
+    network   digest of the file `features.network`, empty if there is none, or the processes were started by hand
 
     The others hold for one start of the run, and are not in the copy that is kept:
 
@@ -91,6 +92,7 @@ class Job:
     started: float = 0.0
     results: Results = Results()
     paused: bool = False
+    network: str = ""
     endpoint: str = ""
     state: Path | None = None
     resume: bool = False
@@ -127,7 +129,7 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {path}")
-        metadata = storage.read(file)[1]
+        metadata = {"network": ""} | storage.read(file)[1]  # which an older job lacks
         try:
             settings = Settings.from_values(metadata.pop("settings"))
             read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}

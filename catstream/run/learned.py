@@ -75,20 +75,28 @@ class Learned:
             raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
         trees = {each: tree.copy() for each, tree in compressor.trees.items()}
         centres, name = compressor.centres, compressor.name
-        model = _trained(trees, centres, compressor.version, name, settings)
+        model = _trained(trees, centres, compressor.version, name, settings, compressor.network)
         return cls(name, trees, centres, compressor.origins, compressor.box, model, settings)
 
-    def compressor(self, settings: Settings, name: str = "") -> Compressor:
+    def compressor(self, settings: Settings, network: str = "", name: str = "") -> Compressor:
         """A compressor that inserts the frames of another stream into copies of the trees; versions continue.
 
-        The object has this name in that stream. SettingsError if the settings do not suit the trees.
+        The object has this name in that stream. SettingsError as of `check_fits`.
         """
-        self.check_fits(settings)
-        return Compressor.continuing(self.trees, self.model.version, self.centres, self.origins, settings, name)
+        self.check_fits(settings, network)
+        version = self.model.version
+        return Compressor.continuing(self.trees, version, self.centres, self.origins, settings, name, network)
 
-    def check_fits(self, settings: Settings) -> None:
-        """Raise SettingsError if a run with these settings cannot continue the trees."""
+    def check_fits(self, settings: Settings, network: str) -> None:
+        """Raise SettingsError if a run with these settings, and a network of this digest, cannot continue the trees."""
         _check_same(self.settings, settings, "the saved model was learned", "this run has")
+        self.check_network(network)
+
+    def check_network(self, network: str, one: str = "the saved model", other: str = "this run has") -> None:
+        """Raise SettingsError unless it was learned with the network of this digest; empty is none."""
+        if (own := self.model.network) != network:
+            ours, theirs = (f"the network of digest {each}" if each else "no network" for each in (own, network))
+            raise SettingsError(f"{one} was learned with {ours}, {other} {theirs}: give the same file features.network")
 
     @one_thread()
     def likeness(self) -> Likeness:
@@ -157,8 +165,8 @@ class Learned:
             learned._check()
         except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{name} is not a saved model ({error}): `catstream save` writes one") from None
-        width = len(learned.model.weights)
-        if width != row_length():
+        width, network = len(learned.model.weights), learned.model.network
+        if width != row_length() and not network:
             raise ProtocolError(
                 f"{name} has {width} features of a window, this catstream has {row_length()}: "
                 "learn the object again with this catstream"
@@ -193,14 +201,14 @@ class Learned:
                 raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
 
 
-def check_files(files: Mapping[str, Path], settings: Settings) -> None:
+def check_files(files: Mapping[str, Path], settings: Settings, network: str) -> None:
     """Raise an error unless objects can begin with the saved models in these files, by name, in the first frame.
 
     ServiceError or ProtocolError if one cannot be read; SettingsError if one was learned with other settings, or they
     are too large.
     """
     for file in files.values():
-        Learned.load(file).check_fits(settings)
+        Learned.load(file).check_fits(settings, network)
     check_sizes({name: file.stat().st_size for name, file in files.items()})
 
 
@@ -227,7 +235,9 @@ def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
     """
     models = {name: part.model for name, part in features.objects.items() if part.model}
     return {
-        name: Learned.from_bytes(model, f"the saved model of {listed([name])}").compressor(settings, name)
+        name: Learned.from_bytes(model, f"the saved model of {listed([name])}").compressor(
+            settings, features.network, name
+        )
         for name, model in models.items()
     }
 
@@ -281,7 +291,7 @@ def merge(parts: Iterable[Learned], *, force: bool = False) -> Learned:
         centres=centres,
         origins=tuple(origin for part in parts for origin in part.origins),
         box=first.box.scaled(float(width) / first.box.w, float(height) / first.box.h),
-        model=_trained(trees, centres, version, name, first.settings),
+        model=_trained(trees, centres, version, name, first.settings, first.model.network),
     )
 
 
@@ -293,6 +303,7 @@ def _check_merge(one: Learned, other: Learned, origins: set[str]) -> None:
             "only models of the same object can be merged"
         )
     _check_same(one.settings, other.settings, "one saved model was learned", "another")
+    one.check_network(other.model.network, "one saved model", "another with")
     if origins & set(other.origins):
         raise SettingsError(
             "two of the saved models have learned from the same frames, which would count twice: "
@@ -328,11 +339,13 @@ def _check_alike(parts: Sequence[Learned]) -> None:
         )
 
 
-def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings) -> Model:
+def _trained(
+    trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings, network: str
+) -> Model:
     from catstream.training.trainer import Trainer  # with filterpy, whose second of imports no client has to pay
 
     with one_thread():  # as a pipeline's own trainer: the model has the same bits
-        return Trainer(settings).train(sample_of(trees, version, 0, centres, name))
+        return Trainer(settings).train(sample_of(trees, version, 0, centres, name, network=network))
 
 
 def _check_same(ours: Settings, theirs: Settings, one: str, other: str) -> None:

@@ -25,6 +25,7 @@ from catstream.detection.likeness import Likeness
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
 from catstream.errors import SettingsError, VideoError, without_password
 from catstream.features.cells import Cells
+from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
@@ -238,12 +239,17 @@ class Scan:
 
     threshold : least score of a sighting
     sizes : smallest and largest size, as multiples of the learned size
+    descriptor : that the models were learned with, if there is one
     """
 
     def __init__(
-        self, learned: Iterable[Learned], threshold: float = THRESHOLD, sizes: tuple[float, float] = SIZES
+        self,
+        learned: Iterable[Learned],
+        threshold: float = THRESHOLD,
+        sizes: tuple[float, float] = SIZES,
+        descriptor: Descriptor | None = None,
     ) -> None:
-        self._threshold = threshold
+        self._threshold, self._descriptor = threshold, descriptor
         self._models = [
             _Template(each.model, each.likeness(), Window.around(each.box, each.settings.search.context), each.settings)
             for each in learned
@@ -256,7 +262,7 @@ class Scan:
     @one_thread()
     def __call__(self, image: np.ndarray) -> list[list[Seen]]:
         """Search a frame, uint8 (h, w, 3): for each model, fitted windows that do not overlap, best first."""
-        frame = Pyramid(image)
+        frame = Pyramid(image, self._descriptor)
         found = []
         for searched, windows in zip(self._models, self.windows(frame), strict=True):
             seen = [_fitted(frame, each.window, searched) for each in windows]
@@ -273,12 +279,23 @@ class Scan:
             image, step = frame.resized(window, averaged=False)
             cells = Cells.of(image)
             for number in numbers:
-                found[number] += self._maxima(cells, step, self._models[number])
+                found[number] += self._maxima(frame, cells, step, self._models[number])
         return [_suppressed(each) for each in found]
 
-    def _maxima(self, cells: Cells, step: tuple[float, float], searched: _Template) -> list[Seen]:
-        """The best windows of one size, whose cells are `step` pixels wide and high."""
+    def _maxima(self, frame: Pyramid, cells: Cells, step: tuple[float, float], searched: _Template) -> list[Seen]:
+        """The best windows of one size, whose cells are `step` pixels wide and high.
+
+        With a descriptor, HOG and colours choose the windows, and it describes only these.
+        """
         least = _FITTED * self._threshold
+        if frame.descriptor is not None:
+            model = searched.model
+            scores = ScoreMap(cells, cells.respond(model.weights, model.bias), (0.0, 0.0), step)
+            windows = [
+                scores.window(*place) for place in non_maximum_suppression(scores.scores, _MOST_MAXIMA, WINDOW // 2)
+            ]
+            found = [searched.seen(ScoreMap.around(frame, each, WINDOW, model), 0, 0, each) for each in windows]
+            return [each for each in found if each.score >= least]
         # No likeness is above 1 / share.
         appearance = cells.respond_above(searched.model.weights, searched.model.bias, least * searched.likeness.share)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
@@ -342,6 +359,7 @@ class Search:
     threshold   least score of a sighting
     every       seconds of a video between two frames that are searched, 0 for every frame
     sizes       smallest and largest size that is searched, as multiples of the learned size
+    network     file of the network that the models were learned with, empty for none
     """
 
     models: Mapping[str, Learned]
@@ -349,13 +367,17 @@ class Search:
     threshold: float = THRESHOLD
     every: float = EVERY
     sizes: tuple[float, float] = SIZES
+    network: str = ""
     _scan: Scan = field(init=False)
 
     def __post_init__(self) -> None:
         low, high = self.sizes
         if not 0 < low <= high < 100:
             raise SettingsError(f"expected two positive sizes, the smaller one first, got {low:g},{high:g}: give 0.5,2")
-        self._scan = Scan(self.models.values(), self.threshold, self.sizes)
+        descriptor = descriptor_of(Settings(features={"network": self.network}))
+        for name, learned in self.models.items():
+            learned.check_network(digest_of(descriptor), f"the model of {name!r}", "this search has")
+        self._scan = Scan(self.models.values(), self.threshold, self.sizes, descriptor)
 
     @property
     def description(self) -> dict[str, Any]:
@@ -391,6 +413,7 @@ def find(
     every: float = EVERY,
     sizes: tuple[float, float] = SIZES,
     skip_damaged: bool = False,
+    network: str | os.PathLike[str] = "",
 ) -> Iterator[Sighting]:
     """Find the objects of saved models in videos, folders and images.
 
@@ -408,6 +431,8 @@ def find(
         Smallest and largest size that is searched, as multiples of the size that was learned.
     skip_damaged : bool
         Continue after a damaged place in a video.
+    network : path
+        The file `features.network` that the models were learned with, if there was one.
 
     Yields
     ------
@@ -419,7 +444,8 @@ def find(
     ServiceError, ProtocolError
         If a model does not exist, or is damaged or of other features.
     SettingsError
-        If two models have one name, or the sizes are not positive, the smaller one first.
+        If two models have one name, the sizes are not positive, the smaller one first, or a model was learned with
+        another network.
     VideoError
         If a path does not exist or has nothing to search; after all other files, for the first file that is damaged.
 
@@ -428,7 +454,8 @@ def find(
     >>> for sighting in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
     ...     print(sighting.file, sighting.time, sighting.box, sighting.score)
     """
-    search = Search(load_models(_several(models)), RunSettings(skip_damaged=skip_damaged), threshold, every, sizes)
+    reading = RunSettings(skip_damaged=skip_damaged)
+    search = Search(load_models(_several(models)), reading, threshold, every, sizes, os.fspath(network))
     return _sightings(search, find_files(_several(paths)))
 
 

@@ -1,0 +1,221 @@
+"""Makes the file of a network for `features.network` from a backbone, and measures what such a file is good for.
+
+The backbone is cut at a layer of stride 16. A 1 x 1 convolution in front of it does to the pixels what its training
+did, and one behind it keeps the principal components of its vectors in photographs, centred and scaled.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from catstream.box import Window
+from catstream.errors import SettingsError, VideoError, require_extra
+from catstream.features.layout import CELL, EDGE, STRIDE, WINDOW
+from catstream.features.network import ENERGY, MOST_CHANNELS, Network, by_onnxruntime
+from catstream.features.pyramid import Pyramid
+from catstream.features.vectors import VectorMap
+from catstream.messages import storage
+from catstream.video.images import IMAGES, ImageReader, natural_order, pages_of
+from catstream.video.rendered import render
+
+if TYPE_CHECKING:
+    import onnx
+
+_CROP = 224  # side of a crop of a photograph, in pixels
+_CROPS = 256  # of all photographs together
+_SMALLEST = 64  # side of the part of a photograph that becomes a crop, at least
+_VECTORS = _CROP // STRIDE
+_INNER = slice(EDGE * CELL // STRIDE, -EDGE * CELL // STRIDE)  # vectors that hardly depend on the edge of a crop
+_KEPT = "catstream.kept_variance"  # in the metadata of the file
+
+
+def prepare(
+    backbone: str | os.PathLike[str],
+    layer: str,
+    images: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    rgb: bool = False,
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0),
+    std: tuple[float, ...] = (1.0, 1.0, 1.0),
+) -> Network:
+    """Write the file of a network for `features.network`, and return the network.
+
+    Parameters
+    ----------
+    backbone : path of an ONNX file with one image as its input
+    layer : name of a tensor, or of the node that makes it, with one vector for each 16 x 16 pixels
+    images : folder of photographs, a hundred or more; its subfolders count, too
+    output : path of the file
+    rgb : whether the backbone takes red, green and blue, not blue, green and red
+    mean, std : what is subtracted from the levels, 0 to 255, of its first, second and third channel, and by what the
+        rest is divided
+
+    Raises
+    ------
+    SettingsError
+        If the backbone is no ONNX file, has no such layer, or the layer another stride.
+    VideoError
+        If the folder has no photographs.
+    """
+    require_extra("network")
+    import onnx
+
+    try:
+        model = onnx.shape_inference.infer_shapes(onnx.load(os.fspath(backbone)))
+    except Exception as error:  # of the file, of protobuf, or of ONNX
+        raise SettingsError(f"cannot read the backbone {str(backbone)!r} ({error}): give an ONNX file") from None
+    crops = list(_crops(Path(images)))
+    model = _cut(model, layer, str(backbone))
+    _put_in_front(model, (np.eye(3)[::-1] if rgb else np.eye(3)) / np.array(std)[:, None], -np.divide(mean, std))
+    run = by_onnxruntime(Path(backbone), model.SerializeToString())
+    vectors = np.concatenate([_inner_vectors(run, each, layer) for each in crops])
+    centre = vectors.mean(axis=0)
+    variances, directions = np.linalg.eigh((vectors - centre).T @ (vectors - centre) / len(vectors))
+    kept = variances[-MOST_CHANNELS:].sum()
+    basis = directions[:, -MOST_CHANNELS:].T[::-1] * np.sqrt(ENERGY / kept)
+    _put_behind(model, basis, -basis @ centre)
+    onnx.helper.set_model_props(model, {_KEPT: f"{kept / variances.sum():.4f}"})
+    with storage.writing(output):
+        storage.write_atomically(output, model.SerializeToString())
+    return Network(Path(output))
+
+
+def _crops(folder: Path) -> Iterator[np.ndarray]:
+    """Squares of all sizes from all photographs below a folder, uint8 (3, 224, 224)."""
+    files = sorted((file for file in folder.rglob("*") if file.suffix.lower() in IMAGES), key=natural_order)
+    chosen = [files[i] for i in np.linspace(0, len(files) - 1, min(len(files), _CROPS)).astype(int)]
+    images = [image for file in chosen if (image := ImageReader(pages_of(file) or [(file, 0)])(0)) is not None]
+    if not images:
+        raise VideoError(f"the folder {str(folder)!r} and its subfolders hold no images: give a folder of photographs")
+    rng = np.random.default_rng(0)
+    for number in range(_CROPS):
+        frame = Pyramid(images[number % len(images)])
+        most = max(*frame.size, _SMALLEST) if min(frame.size) < _SMALLEST else min(frame.size)
+        side = _SMALLEST * (most / _SMALLEST) ** rng.uniform()
+        x, y = (side / 2 + rng.uniform() * max(length - side, 0) for length in frame.size)
+        yield frame.cut(x, y, side / _CROP, side / _CROP, _CROP)
+
+
+def _cut(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto:
+    """The part of a model from its image to a layer, for images of any height and width."""
+    import onnx
+
+    weights = {each.name for each in model.graph.initializer}
+    inputs = [each.name for each in model.graph.input if each.name not in weights]
+    if len(inputs) != 1:
+        raise SettingsError(
+            f"the backbone {name!r} has the inputs {', '.join(inputs)}, expected one image: give another"
+        )
+    made = {tensor: tensor for node in model.graph.node for tensor in node.output}
+    tensors = {node.name: node.output[0] for node in model.graph.node} | made
+    if layer not in tensors:
+        near = difflib.get_close_matches(layer, tensors, n=3, cutoff=0.0)
+        raise SettingsError(f"the backbone {name!r} has no layer {layer!r}: the nearest names are {', '.join(near)}")
+    part = onnx.utils.Extractor(model).extract_model(inputs, [tensors[layer]])
+    del part.graph.value_info[:]  # the sizes of one image
+    for each in (*part.graph.input, *part.graph.output):
+        for side in list(each.type.tensor_type.shape.dim)[2:]:
+            side.Clear()
+    return part
+
+
+def _put_in_front(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
+    """Add a 1 x 1 convolution of the pixels."""
+    (image,) = model.graph.input
+    node = _convolution(model, f"{image.name}.levels", image.name, weights, bias)
+    image.name = node.input[0]
+    model.graph.node.insert(0, node)
+
+
+def _put_behind(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
+    """Add a 1 x 1 convolution of the vectors."""
+    (vectors,) = model.graph.output
+    node = _convolution(model, vectors.name, f"{vectors.name}.components", weights, bias)
+    vectors.name = node.output[0]
+    vectors.type.tensor_type.shape.dim[1].dim_value = len(weights)
+    model.graph.node.append(node)
+
+
+def _convolution(
+    model: onnx.ModelProto, source: str, target: str, weights: np.ndarray, bias: np.ndarray
+) -> onnx.NodeProto:
+    """A 1 x 1 convolution from one tensor to another."""
+    import onnx
+
+    parts = {f"{target}.weights": weights[:, :, None, None], f"{target}.bias": bias}
+    for part, array in parts.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(array.astype(np.float32), part))
+    return onnx.helper.make_node("Conv", [source, *parts], [target], name=target)
+
+
+def _inner_vectors(run: Callable[[np.ndarray], np.ndarray], planes: np.ndarray, layer: str) -> np.ndarray:
+    """The vectors of a crop, float64 (k, channels); SettingsError if the layer has another stride than 16."""
+    found = run(planes[None].astype(np.float32))
+    if found.shape != (1, found.shape[1], _VECTORS, _VECTORS):
+        raise SettingsError(
+            f"the layer {layer!r} is {found.shape} for an image of {_CROP} x {_CROP}, expected (1, any, {_VECTORS}, "
+            f"{_VECTORS}): choose a layer of stride {STRIDE}"
+        )
+    return found[0, :, _INNER, _INNER].reshape(found.shape[1], -1).T.astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """What a network costs, and what it is good for.
+
+    channels   length of a vector
+    digest     identifies the file in models and messages
+    kept       share of the variance of the backbone's vectors, None if the file does not say it
+    region     seconds that the network takes for the surroundings of an object, 224 x 224 pixels, once a frame
+    copy       seconds for a copy of the object, 128 x 128 pixels, once a frame and ten times in a whole frame
+    agreement  by how many pixels a picture is shifted -> correlation of its vectors with those that are sampled there
+               from the picture before
+    """
+
+    channels: int
+    digest: str
+    kept: float | None
+    region: float
+    copy: float
+    agreement: dict[int, float]
+
+
+def check(path: str | os.PathLike[str]) -> Check:
+    """Measure a network; errors as of `Network`."""
+    require_extra("network")
+    import onnx
+
+    network = Network(Path(path))
+    model = onnx.load(os.fspath(path))
+    kept = next((float(each.value) for each in model.metadata_props if each.key == _KEPT), None)
+    ((image, _),) = render(1)
+    frame, side = Pyramid(image), _CROP // CELL - 2 * EDGE
+    window = Window(0.0, 0.0, WINDOW * CELL, WINDOW * CELL).centred(image.shape[1] / 2, image.shape[0] / 2)
+    (x, y), agreement = window.centre, {}
+    before = VectorMap.of(network, frame.around(window, side, EDGE), window)
+    for shift in (CELL, STRIDE):
+        moved = window.centred(x + shift, y + shift)
+        sampled = before.grid(moved, WINDOW)
+        own = VectorMap.of(network, frame.around(moved, side, EDGE), moved).grid(moved, WINDOW)
+        agreement[shift] = float((sampled * own).sum() / np.sqrt((sampled**2).sum() * (own**2).sum()))
+    region, copy = (_seconds(network, frame.around(window, each, EDGE)) for each in (side, WINDOW))
+    return Check(network.channels, network.digest, kept, region, copy, agreement)
+
+
+def _seconds(network: Network, planes: np.ndarray) -> float:
+    """The least of several times that a network takes for an image."""
+    times = []
+    for _ in range(20):
+        began = time.perf_counter()
+        network(planes)
+        times.append(time.perf_counter() - began)
+    return min(times)
