@@ -129,7 +129,8 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {path}")
-        metadata = {"network": ""} | storage.read(file)[1]  # which an older job lacks
+        metadata = storage.read(file)[1]
+        metadata.setdefault("network", "")  # which an older job lacks
         try:
             settings = Settings.from_values(metadata.pop("settings"))
             read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}
