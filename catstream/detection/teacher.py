@@ -41,6 +41,7 @@ _EXTENT_INTERVAL = 2  # frames from one set of rows of windows of wrong extents 
 _OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
 _BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
+_DESCRIBED = (_SIDE - WINDOW) // 2 + EDGE  # cells around a copy that a descriptor sees: as many as around the object
 _MINING_INTERVAL = 8  # frames between two searches for hard negatives; a large frame is searched in parts
 _MOST_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4 ms
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
@@ -199,15 +200,18 @@ def affine_copies(
     for number, (scale, right, down, turn) in enumerate(change):
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _elsewhere(window, rng) if _is_moved(number, moved) else None
-        patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
         is_mirrored = number >= max(count - mirrored, 1)
+        descriptor = frame.descriptor if vectors is None or is_mirrored or offset is not None else None
+        margin = MARGIN if descriptor is None else _DESCRIBED
+        patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset, margin)
         if is_mirrored:
             patch = patch[:, :, ::-1]
-        patches.append(patch)
-        if frame.descriptor is not None and (vectors is None or is_mirrored or offset is not None):
-            of_vectors.append(VectorMap.of(frame.descriptor, patch, copy).row(copy))
+        if descriptor is not None:
+            of_vectors.append(VectorMap.of(descriptor, patch, copy).row(copy))
+            patch = _inner(patch)
         elif vectors is not None:
             of_vectors.append(vectors.row(copy, _TURN * turn))
+        patches.append(patch)
     return window_rows(patches, of_vectors)
 
 
@@ -229,15 +233,20 @@ def _elsewhere(window: Window, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _patch(
-    frame: Pyramid, window: Window, turn: float, box: Box, offset: tuple[float, float] | None = None
+    frame: Pyramid,
+    window: Window,
+    turn: float,
+    box: Box,
+    offset: tuple[float, float] | None = None,
+    margin: int = MARGIN,
 ) -> np.ndarray:
-    """A window and its margin, cut from a frame, rotated by `turn` radians and resized, uint8 (3, 96, 96).
+    """A window and its margin, cut from a frame, rotated by `turn` radians and resized, uint8 (3, 96, 96) by default.
 
-    With a descriptor, the margin is larger. The object, whose box has the centre of the window, is put on another
-    background `offset` pixels away; None leaves it.
+    The object, whose box has the centre of the window, is put on another background `offset` pixels away; None leaves
+    it.
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
-    side = (WINDOW + 2 * (MARGIN if frame.descriptor is None else EDGE)) * CELL
+    side = (WINDOW + 2 * margin) * CELL
     x, y = window.centre
     patch = frame.cut(x, y, *pixel, side, turn)
     if offset is None:
@@ -245,6 +254,12 @@ def _patch(
     share = _ellipse(side, window.w / box.w, window.h / box.h)
     background = frame.cut(x + offset[0], y + offset[1], *pixel, side, turn)
     return np.stack([cv2.blendLinear(*both, share, 1 - share) for both in zip(patch, background, strict=True)])
+
+
+def _inner(patch: np.ndarray) -> np.ndarray:
+    """The window and the usual margin of a patch that was cut for a descriptor."""
+    edge = (_DESCRIBED - MARGIN) * CELL
+    return patch[:, edge:-edge, edge:-edge]
 
 
 def _ellipse(side: int, across: float, down: float) -> np.ndarray:
@@ -332,9 +347,11 @@ def _first_cuts(
         vectors = None
         for trial in trials:
             tried = trial.window.centred(*copy.centre)
-            patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset)
-            if frame.descriptor is not None and vectors is None:
-                vectors = VectorMap.of(frame.descriptor, patch, tried)
+            descriptor = frame.descriptor if vectors is None else None
+            margin = MARGIN if descriptor is None else _DESCRIBED
+            patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset, margin)
+            if descriptor is not None:
+                vectors, patch = VectorMap.of(descriptor, patch, tried), _inner(patch)
             yield trial, patch, None if vectors is None else vectors.row(tried)
 
 

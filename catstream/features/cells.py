@@ -127,12 +127,11 @@ class Cells:
 def window_rows(patches: Sequence[np.ndarray], vectors: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Feature rows of windows, each in the middle of a patch, with the vectors of each if there is a descriptor.
 
-    The patches are uint8 (3, 96, 96), or larger by the margin of a descriptor. Returns float32 (k, d).
+    The patches are uint8 (3, 96, 96). Returns float32 (k, d).
     """
     features = np.empty((len(patches), row_length()), np.float32)
     if len(patches):
-        stacked = np.stack(patches)
-        kernels.describe_windows(stacked, (stacked.shape[2] // CELL - WINDOW) // 2, _SHARES, _SHADES_OF, features)
+        kernels.describe_windows(np.stack(patches), MARGIN, _SHARES, _SHADES_OF, features)
     return np.hstack([features, vectors]) if len(vectors) else features
 
 

@@ -8,7 +8,7 @@ from onnx import helper
 
 from catstream.box import Window
 from catstream.errors import MissingExtraError, SettingsError
-from catstream.features.cells import Cells, window_rows
+from catstream.features.cells import Cells
 from catstream.features.descriptor import descriptor_of
 from catstream.features.layout import EDGE, PLACES, WINDOW, row_length
 from catstream.features.pyramid import Pyramid
@@ -121,8 +121,3 @@ def test_a_window_sampled_from_the_region_is_nearly_as_if_it_was_described_by_it
         sampled = around.row(window)
         assert sampled.shape == (PLACES**2 * 32,)
         assert np.linalg.norm(own - sampled) < 0.2 * np.linalg.norm(own)
-
-
-def test_rows_of_patches_are_the_same_with_a_larger_margin(frame):
-    narrow, wide = (frame.around(OBJECT, WINDOW, margin) for margin in (2, EDGE))
-    np.testing.assert_allclose(window_rows([wide]), window_rows([narrow]), atol=1e-6)
