@@ -1,7 +1,7 @@
 """Makes the file of a network for `features.network` from a backbone, and measures what such a file is good for.
 
-The backbone is cut at a layer of stride 16. A 1 x 1 convolution in front of it does to the pixels what its training
-did, and one behind it keeps the principal components of its vectors in photographs, centred and scaled.
+The backbone is cut at a layer of stride 16. What its training did to the pixels is put in front of it, and behind it a
+1 x 1 convolution that keeps the principal components of its vectors in photographs, centred and scaled.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def prepare(
         raise SettingsError(f"cannot read the backbone {str(backbone)!r} ({error}): give an ONNX file") from None
     crops = list(_crops(Path(images)))
     model = _cut(model, layer, str(backbone))
-    _put_in_front(model, (np.eye(3)[::-1] if rgb else np.eye(3)) / np.array(std)[:, None], -np.divide(mean, std))
+    _put_in_front(model, rgb, np.array(mean), np.array(std))
     run = by_onnxruntime(Path(backbone), model.SerializeToString())
     vectors = np.concatenate([_inner_vectors(run, each, layer) for each in crops])
     centre = vectors.mean(axis=0)
@@ -128,33 +128,34 @@ def _cut(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto:
     return part
 
 
-def _put_in_front(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
-    """Add a 1 x 1 convolution of the pixels."""
+def _put_in_front(model: onnx.ModelProto, rgb: bool, mean: np.ndarray, std: np.ndarray) -> None:
+    """Add what orders and normalises the channels of the pixels; a convolution of three channels would be slow."""
+    import onnx
+
     (image,) = model.graph.input
-    node = _convolution(model, f"{image.name}.levels", image.name, weights, bias)
-    image.name = node.input[0]
-    model.graph.node.insert(0, node)
+    steps: list[tuple[str, np.ndarray]] = [("Gather", np.array([2, 1, 0]))] if rgb else []
+    steps += [("Sub", mean)] if mean.any() else []
+    steps += [("Div", std)] if (std != 1).any() else []
+    for operation, values in reversed(steps):
+        source, how = f"{operation} {image.name}", {"axis": 1} if operation == "Gather" else {}
+        constant = values if operation == "Gather" else values.astype(np.float32)[None, :, None, None]
+        model.graph.initializer.append(onnx.numpy_helper.from_array(constant, f"of {source}"))
+        node = onnx.helper.make_node(operation, [source, f"of {source}"], [image.name], name=source, **how)
+        model.graph.node.insert(0, node)
+        image.name = source
 
 
 def _put_behind(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
     """Add a 1 x 1 convolution of the vectors."""
-    (vectors,) = model.graph.output
-    node = _convolution(model, vectors.name, f"{vectors.name}.components", weights, bias)
-    vectors.name = node.output[0]
-    vectors.type.tensor_type.shape.dim[1].dim_value = len(weights)
-    model.graph.node.append(node)
-
-
-def _convolution(
-    model: onnx.ModelProto, source: str, target: str, weights: np.ndarray, bias: np.ndarray
-) -> onnx.NodeProto:
-    """A 1 x 1 convolution from one tensor to another."""
     import onnx
 
-    parts = {f"{target}.weights": weights[:, :, None, None], f"{target}.bias": bias}
-    for part, array in parts.items():
-        model.graph.initializer.append(onnx.numpy_helper.from_array(array.astype(np.float32), part))
-    return onnx.helper.make_node("Conv", [source, *parts], [target], name=target)
+    (vectors,) = model.graph.output
+    names, source = ("components of vectors", "bias of components"), vectors.name
+    for name, array in zip(names, (weights[:, :, None, None], bias), strict=True):
+        model.graph.initializer.append(onnx.numpy_helper.from_array(array.astype(np.float32), name))
+    vectors.name = "vectors"
+    vectors.type.tensor_type.shape.dim[1].dim_value = len(weights)
+    model.graph.node.append(onnx.helper.make_node("Conv", [source, *names], ["vectors"], name="components"))
 
 
 def _inner_vectors(run: Callable[[np.ndarray], np.ndarray], planes: np.ndarray, layer: str) -> np.ndarray:
