@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 _CROP = 224  # side of a crop of a photograph, in pixels
 _CROPS = 256  # of all photographs together
 _SMALLEST = 64  # side of the part of a photograph that becomes a crop, at least
-_VECTORS = _CROP // STRIDE
 _INNER = slice(EDGE * CELL // STRIDE, -EDGE * CELL // STRIDE)  # vectors that hardly depend on the edge of a crop
 _KEPT = "catstream.kept_variance"  # in the metadata of the file
 
@@ -44,10 +43,10 @@ def prepare(
     output: str | os.PathLike[str],
     *,
     rgb: bool = False,
-    mean: tuple[float, ...] = (0.0, 0.0, 0.0),
-    std: tuple[float, ...] = (1.0, 1.0, 1.0),
-) -> Network:
-    """Write the file of a network for `features.network`, and return the network.
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> None:
+    """Write the file of a network for `features.network`.
 
     Parameters
     ----------
@@ -86,7 +85,6 @@ def prepare(
     onnx.helper.set_model_props(model, {_KEPT: f"{kept / variances.sum():.4f}"})
     with storage.writing(output):
         storage.write_atomically(output, model.SerializeToString())
-    return Network(Path(output))
 
 
 def _crops(folder: Path) -> Iterator[np.ndarray]:
@@ -130,41 +128,46 @@ def _cut(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto:
 
 def _put_in_front(model: onnx.ModelProto, rgb: bool, mean: np.ndarray, std: np.ndarray) -> None:
     """Add what orders and normalises the channels of the pixels; a convolution of three channels would be slow."""
-    import onnx
-
     (image,) = model.graph.input
-    steps: list[tuple[str, np.ndarray]] = [("Gather", np.array([2, 1, 0]))] if rgb else []
-    steps += [("Sub", mean)] if mean.any() else []
-    steps += [("Div", std)] if (std != 1).any() else []
-    for operation, values in reversed(steps):
-        source, how = f"{operation} {image.name}", {"axis": 1} if operation == "Gather" else {}
-        constant = values if operation == "Gather" else values.astype(np.float32)[None, :, None, None]
-        model.graph.initializer.append(onnx.numpy_helper.from_array(constant, f"of {source}"))
-        node = onnx.helper.make_node(operation, [source, f"of {source}"], [image.name], name=source, **how)
-        model.graph.node.insert(0, node)
-        image.name = source
+    steps: list[tuple[bool, str, np.ndarray, dict[str, Any]]] = [
+        (bool((std != 1).any()), "Div", std.astype(np.float32)[:, None, None], {}),
+        (bool(mean.any()), "Sub", mean.astype(np.float32)[:, None, None], {}),
+        (rgb, "Gather", np.array([2, 1, 0]), {"axis": 1}),
+    ]
+    for used, operation, values, how in steps:
+        if used:
+            node = _node(model, operation, f"{operation} {image.name}", image.name, values, **how)
+            model.graph.node.insert(0, node)
+            image.name = node.input[0]
 
 
 def _put_behind(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
     """Add a 1 x 1 convolution of the vectors."""
-    import onnx
-
     (vectors,) = model.graph.output
-    names, source = ("components of vectors", "bias of components"), vectors.name
-    for name, array in zip(names, (weights[:, :, None, None], bias), strict=True):
-        model.graph.initializer.append(onnx.numpy_helper.from_array(array.astype(np.float32), name))
+    parts = weights.astype(np.float32)[:, :, None, None], bias.astype(np.float32)
+    model.graph.node.append(_node(model, "Conv", vectors.name, "vectors", *parts))
     vectors.name = "vectors"
     vectors.type.tensor_type.shape.dim[1].dim_value = len(weights)
-    model.graph.node.append(onnx.helper.make_node("Conv", [source, *names], ["vectors"], name="components"))
+
+
+def _node(
+    model: onnx.ModelProto, operation: str, source: str, target: str, *constants: np.ndarray, **how: Any
+) -> onnx.NodeProto:
+    """A node from one tensor to another, whose constants are added to the model."""
+    import onnx
+
+    names = [f"{target}, constant {number}" for number in range(len(constants))]
+    model.graph.initializer.extend(map(onnx.numpy_helper.from_array, constants, names))
+    return onnx.helper.make_node(operation, [source, *names], [target], name=target, **how)
 
 
 def _inner_vectors(run: Callable[[np.ndarray], np.ndarray], planes: np.ndarray, layer: str) -> np.ndarray:
     """The vectors of a crop, float64 (k, channels); SettingsError if the layer has another stride than 16."""
-    found = run(planes[None].astype(np.float32))
-    if found.shape != (1, found.shape[1], _VECTORS, _VECTORS):
+    found, side = run(planes[None].astype(np.float32)), _CROP // STRIDE
+    if found.shape != (1, found.shape[1], side, side):
         raise SettingsError(
-            f"the layer {layer!r} is {found.shape} for an image of {_CROP} x {_CROP}, expected (1, any, {_VECTORS}, "
-            f"{_VECTORS}): choose a layer of stride {STRIDE}"
+            f"the layer {layer!r} is {found.shape} for an image of {_CROP} x {_CROP}, expected (1, any, {side}, "
+            f"{side}): choose a layer of stride {STRIDE}"
         )
     return found[0, :, _INNER, _INNER].reshape(found.shape[1], -1).T.astype(np.float64)
 
@@ -173,21 +176,16 @@ def _inner_vectors(run: Callable[[np.ndarray], np.ndarray], planes: np.ndarray, 
 class Check:
     """What a network costs, and what it is good for.
 
-    channels   length of a vector
-    digest     identifies the file in models and messages
-    kept       share of the variance of the backbone's vectors, None if the file does not say it
-    region     seconds that the network takes for the surroundings of an object, 224 x 224 pixels, once a frame
-    copy       seconds for a copy of the object, 128 x 128 pixels, once a frame and ten times in a whole frame
-    agreement  by how many pixels a picture is shifted -> correlation of its vectors with those that are sampled there
-               from the picture before
+    network    the network
+    kept       share of the variance of the backbone's vectors, 0 if the file does not say it
+    seconds    that it takes for the surroundings of an object, 224 x 224 pixels
+    agreement  correlation of the vectors of a shifted picture with those that are sampled from the picture before
     """
 
-    channels: int
-    digest: str
-    kept: float | None
-    region: float
-    copy: float
-    agreement: dict[int, float]
+    network: Network
+    kept: float
+    seconds: float
+    agreement: float
 
 
 def check(path: str | os.PathLike[str]) -> Check:
@@ -196,27 +194,16 @@ def check(path: str | os.PathLike[str]) -> Check:
     import onnx
 
     network = Network(Path(path))
-    model = onnx.load(os.fspath(path))
-    kept = next((float(each.value) for each in model.metadata_props if each.key == _KEPT), None)
+    kept = {each.key: each.value for each in onnx.load(os.fspath(path)).metadata_props}.get(_KEPT, "0")
     ((image, _),) = render(1)
     frame, side = Pyramid(image), _CROP // CELL - 2 * EDGE
     window = Window(0.0, 0.0, WINDOW * CELL, WINDOW * CELL).centred(image.shape[1] / 2, image.shape[0] / 2)
-    (x, y), agreement = window.centre, {}
-    before = VectorMap.of(network, frame.around(window, side, EDGE), window)
-    for shift in (CELL, STRIDE):
-        moved = window.centred(x + shift, y + shift)
-        sampled = before.grid(moved, WINDOW)
-        own = VectorMap.of(network, frame.around(moved, side, EDGE), moved).grid(moved, WINDOW)
-        agreement[shift] = float((sampled * own).sum() / np.sqrt((sampled**2).sum() * (own**2).sum()))
-    region, copy = (_seconds(network, frame.around(window, each, EDGE)) for each in (side, WINDOW))
-    return Check(network.channels, network.digest, kept, region, copy, agreement)
-
-
-def _seconds(network: Network, planes: np.ndarray) -> float:
-    """The least of several times that a network takes for an image."""
+    moved = window.centred(window.centre[0] + CELL, window.centre[1] + CELL)  # half of the way to the next vector
+    before, after = (VectorMap.of(network, frame.around(each, side, EDGE), each) for each in (window, moved))
+    sampled, own = before.grid(moved, WINDOW).ravel(), after.grid(moved, WINDOW).ravel()
     times = []
     for _ in range(20):
         began = time.perf_counter()
-        network(planes)
+        network(frame.around(window, side, EDGE))
         times.append(time.perf_counter() - began)
-    return min(times)
+    return Check(network, float(kept), min(times), float(sampled @ own / np.sqrt((sampled @ sampled) * (own @ own))))

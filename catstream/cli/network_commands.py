@@ -10,13 +10,7 @@ from catstream.cli.common import INTERRUPTS, check_file
 from catstream.errors import require_extra
 from catstream.services.options import PATH, with_overwrite
 
-
-def _levels(_: click.Context, __: click.Parameter, text: str) -> tuple[float, ...]:
-    try:
-        one, two, three = map(float, text.split(","))
-    except ValueError:
-        raise click.BadParameter(f"{text!r} is not three numbers: for example 123.7,116.3,103.5") from None
-    return one, two, three
+_Levels = tuple[float, float, float]
 
 
 @click.group()
@@ -37,20 +31,11 @@ def network() -> None:
 @click.option("--images", required=True, type=PATH, metavar="FOLDER", help="Photographs, a hundred or more.")
 @click.option("-o", "--output", required=True, type=PATH, metavar="FILE.onnx", help="File to write.")
 @click.option("--rgb", is_flag=True, help="The backbone takes red, green, blue; not blue, green, red.")
-@click.option(
-    "--mean", default="0,0,0", callback=_levels, metavar="A,B,C", help="Subtracted from its channels, 0 to 255."
-)
-@click.option("--std", default="1,1,1", callback=_levels, metavar="A,B,C", help="By what the rest is divided.")
+@click.option("--mean", nargs=3, type=float, default=(0, 0, 0), help="Subtracted from its channels, of 0 to 255.")
+@click.option("--std", nargs=3, type=float, default=(1, 1, 1), help="By what the rest is divided.")
 @with_overwrite
 def prepare(
-    backbone: Path,
-    layer: str,
-    images: Path,
-    output: Path,
-    rgb: bool,
-    mean: tuple[float, ...],
-    std: tuple[float, ...],
-    overwrite: bool,
+    backbone: Path, layer: str, images: Path, output: Path, rgb: bool, mean: _Levels, std: _Levels, overwrite: bool
 ) -> None:
     """Make the file for the setting features.network from a backbone.
 
@@ -63,14 +48,14 @@ def prepare(
     EXAMPLES
       catstream network prepare backbone.onnx --layer output --images photos/ -o net.onnx
       catstream network prepare mobilenet.onnx --layer block14 --images photos/ -o net.onnx \\
-        --rgb --mean 123.675,116.28,103.53 --std 58.395,57.12,57.375
+        --rgb --mean 123.675 116.28 103.53 --std 58.395 57.12 57.375
     """
     require_extra("network")
     with INTERRUPTS.leaving():
-        from catstream.applications.backbone import prepare as prepared
+        from catstream.applications import backbone as backbones
 
     check_file(output, overwrite=overwrite)
-    prepared(backbone, layer, images, output, rgb=rgb, mean=mean, std=std)
+    backbones.prepare(backbone, layer, images, output, rgb=rgb, mean=mean, std=std)
     _print(output)
 
 
@@ -79,24 +64,20 @@ def prepare(
 def check(file: Path) -> None:
     """Measure a file for the setting features.network.
 
-    Prints what it costs in a frame, how much of the variance of the backbone is
-    kept, and whether its vectors move with the picture: near 1, all windows of a
-    frame can be sampled from one run, as tracking does. Squeeze-and-excitation
-    and large strides lower it.
+    Prints its cost, the variance of the backbone that is kept, and the
+    correlation of its vectors with those sampled from a run beside them. Near 1,
+    all windows of a frame can be sampled from one run, as tracking does.
     """
     _print(file)
 
 
 def _print(file: Path) -> None:
     with INTERRUPTS.leaving():
-        from catstream.applications.backbone import check as measured
+        from catstream.applications import backbone as backbones
 
-    found = measured(file)
-    click.echo(f"{file}: {found.channels} channels, digest {found.digest}")
-    if found.kept is not None:
+    found = backbones.check(file)
+    click.echo(f"{file}: {found.network.channels} channels, digest {found.network.digest}")
+    if found.kept:
         click.echo(f"kept variance {found.kept:.0%}")
-    click.echo(f"a frame takes {found.region * 1e3:.1f} ms for the search region, {found.copy * 1e3:.1f} ms for a copy")
-    for shift, agreement in found.agreement.items():
-        click.echo(
-            f"after a shift of {shift} pixels, vectors correlate by {agreement:.2f} with those sampled before it"
-        )
+    click.echo(f"{found.seconds * 1e3:.1f} ms for the surroundings of an object, twice a frame")
+    click.echo(f"correlation {found.agreement:.2f} with vectors that are sampled from a run 8 pixels beside")

@@ -292,11 +292,9 @@ def _vectors(frame: Pyramid, found: Detection) -> VectorMap | None:
     """The vectors around a detection, from which those of other sizes are sampled; None without a descriptor."""
     if found.around is not None:
         return found.around.vectors
-    return (
-        None
-        if frame.descriptor is None
-        else VectorMap.of(frame.descriptor, frame.around(found.window, WINDOW, EDGE), found.window)
-    )
+    if frame.descriptor is None:
+        return None
+    return VectorMap.of(frame.descriptor, frame.around(found.window, WINDOW, EDGE), found.window)
 
 
 def _fit(row: np.ndarray, model: Model, name: str, settings: ExtentSettings) -> float:

@@ -153,9 +153,8 @@ def _strongest(
     """
     places = non_maximum_suppression(scores.scores, most + 1, WINDOW // 2, least)
     places = [place for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP][:most]
-    if frame.descriptor is None:
-        return scores.cells.rows(places)
-    rows = [ScoreMap.around(frame, scores.window(*place), WINDOW, None).cells.row(0, 0) for place in places]
+    described = [scores.complete(frame, place, model) for place in places]
+    rows = [each.cells.row(row, column) for each, row, column in described]
     return np.array(rows, np.float32).reshape(-1, len(model.weights))
 
 

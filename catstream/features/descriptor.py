@@ -39,16 +39,13 @@ def descriptor_of(settings: Settings, digest: str = "") -> Descriptor | None:
     SettingsError if its file cannot be used, or its digest is not the one that is given; MissingExtraError if it needs
     a package that is not installed.
     """
-    found = None
-    if settings.features.network:
-        path = Path(settings.features.network)
-        try:
-            found = _opened(path, path.stat().st_mtime_ns)
-        except OSError as error:
-            raise SettingsError(
-                f"cannot read features.network={str(path)!r} ({error.strerror}): give the file that "
-                "`catstream network prepare` wrote"
-            ) from None
+    path = Path(settings.features.network)
+    try:
+        found = _opened(path, path.stat().st_mtime_ns) if settings.features.network else None
+    except OSError as error:
+        raise SettingsError(
+            f"cannot read features.network={str(path)!r} ({error.strerror}): give one of `catstream network prepare`"
+        ) from None
     if digest and digest != digest_of(found):
         raise SettingsError(
             f"the run was started with a network of digest {digest}, features.network={settings.features.network!r} "

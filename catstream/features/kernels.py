@@ -452,23 +452,15 @@ def _spline(offset: float, weights: Float32) -> None:
     weights[3] = offset * offset * offset / 6
 
 
-@_kernel("void(float32[:,:,::1], float64, float64, float64, float64, float64, float64, float32[:,:,::1])")
-def sample_vectors(
-    vectors: Float32,
-    left: float,
-    top: float,
-    right_x: float,
-    right_y: float,
-    below_x: float,
-    below_y: float,
-    found: Float32,
-) -> None:
-    """Cubic B-spline of vectors at (left, top), from there in steps to the right, and in steps to the rows below."""
+@_kernel("void(float32[:,:,::1], float64[:,::1], float32[:,:,::1])")
+def sample_vectors(vectors: Float32, places: Float64, found: Float32) -> None:
+    """Cubic B-spline of vectors: at the first of three places, then in steps to the right, and to the row below."""
     across, down = np.empty(4, np.float32), np.empty(4, np.float32)
     rows, columns = vectors.shape[0], vectors.shape[1]
     for row in range(found.shape[0]):
         for column in range(found.shape[1]):
-            x, y = left + column * right_x + row * below_x, top + column * right_y + row * below_y
+            x = places[0, 0] + column * places[1, 0] + row * places[2, 0]
+            y = places[0, 1] + column * places[1, 1] + row * places[2, 1]
             _spline(x - np.floor(x), across)
             _spline(y - np.floor(y), down)
             total = found[row, column]

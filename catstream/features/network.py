@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.errors import MissingExtraError, SettingsError, require_extra
-from catstream.features.layout import CELL, EDGE, STRIDE
+from catstream.errors import MissingExtraError, SettingsError, install_command
+from catstream.features.layout import CELL, STRIDE
 from catstream.numerics.threads import one_at_a_time
 
 #: Mean square length of a vector: so much does the HOG of a cell vary.
@@ -38,38 +38,28 @@ class Network:
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
         self.digest = blake2b(data, digest_size=8).hexdigest()
-        self._path = path
         self._run = by_onnxruntime(path, data) if find_spec("onnxruntime") else _by_opencv(path, data)
-        self.channels = 0
-        for size in _TEST_SIZES:
-            self._check(_test_image(*size))
+        self.channels = max(_checked(path, self._run, *size) for size in _TEST_SIZES)
 
     def __call__(self, planes: np.ndarray) -> np.ndarray:
         """Vectors of an image: see `catstream.features.descriptor.Descriptor`."""
-        found = self._run(planes[None].astype(np.float32))[0]
-        return np.ascontiguousarray(found.transpose(1, 2, 0))
+        return np.ascontiguousarray(self._run(planes[None].astype(np.float32))[0].transpose(1, 2, 0))
 
-    def _check(self, planes: np.ndarray) -> None:
-        """Raise SettingsError unless the vectors of an image have the right shape and about the right length."""
-        height, width = planes.shape[1:]
-        try:
-            found = self._run(planes[None].astype(np.float32))
-        except Exception as error:  # of onnxruntime or of OpenCV
-            raise _misfit(self._path, f"it cannot take a float32 (1, 3, {height}, {width}) ({_first(error)})") from None
-        channels, expected = found.shape[1] if found.ndim == 4 else 0, (height // STRIDE, width // STRIDE)
-        if found.dtype != np.float32 or found.shape != (1, channels, *expected) or not 0 < channels <= MOST_CHANNELS:
-            raise _misfit(
-                self._path,
-                f"for an image of {height} x {width} its output is {found.dtype} {found.shape}, expected float32 "
-                f"(1, 1 to {MOST_CHANNELS}, {expected[0]}, {expected[1]})",
-            )
-        inner = found[
-            :, :, EDGE * CELL // STRIDE : -EDGE * CELL // STRIDE, EDGE * CELL // STRIDE : -EDGE * CELL // STRIDE
-        ]
-        length = float((inner**2).sum(axis=1).mean())
-        if not ENERGY / _FACTOR < length < ENERGY * _FACTOR:
-            raise _misfit(self._path, f"the mean square length of its vectors is {length:.3g}, expected about {ENERGY}")
-        self.channels = channels
+
+def _checked(path: Path, run: _Run, height: int, width: int) -> int:
+    """Number of channels; SettingsError unless the vectors of an image have the right shape, and about the length."""
+    try:
+        found = run(_test_image(height, width))
+    except Exception as error:  # of onnxruntime or of OpenCV
+        raise _misfit(path, f"it cannot take a float32 (1, 3, {height}, {width}) ({_first_line(error)})") from None
+    channels, sides = found.shape[1] if found.ndim == 4 else 0, (height // STRIDE, width // STRIDE)
+    if found.dtype != np.float32 or found.shape != (1, channels, *sides) or not 0 < channels <= MOST_CHANNELS:
+        what = f"for an image of {height} x {width} its output is {found.dtype} {found.shape}, expected float32"
+        raise _misfit(path, f"{what} (1, 1 to {MOST_CHANNELS}, {sides[0]}, {sides[1]})")
+    length = float((found**2).sum(axis=1).mean())
+    if not ENERGY / _FACTOR < length < ENERGY * _FACTOR:
+        raise _misfit(path, f"the mean square length of its vectors is {length:.3g}, expected about {ENERGY}")
+    return channels
 
 
 def _misfit(path: Path, why: str) -> SettingsError:
@@ -79,7 +69,7 @@ def _misfit(path: Path, why: str) -> SettingsError:
     )
 
 
-def _first(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """The first line of what a runtime says."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
@@ -94,12 +84,10 @@ def by_onnxruntime(path: Path, data: bytes) -> _Run:
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # it has a class for each kind, all of them private
-        raise _misfit(path, f"onnxruntime cannot read it ({_first(error)})") from None
+        raise _misfit(path, f"onnxruntime cannot read it ({_first_line(error)})") from None
     inputs, outputs = ([each.name for each in ends] for ends in (session.get_inputs(), session.get_outputs()))
     if len(inputs) != 1 or len(outputs) != 1:
-        raise _misfit(
-            path, f"it has the inputs {', '.join(inputs)} and the outputs {', '.join(outputs)}, one each is needed"
-        )
+        raise _misfit(path, f"it has {len(inputs)} inputs and {len(outputs)} outputs, expected one each")
     return lambda images: np.asarray(session.run(outputs, {inputs[0]: images})[0])
 
 
@@ -113,20 +101,13 @@ def _by_opencv(path: Path, data: bytes) -> _Run:
 
     try:
         net = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
-        run(_test_image(*_TEST_SIZES[0])[None].astype(np.float32))
     except cv2.error:
-        try:
-            require_extra("network")
-        except MissingExtraError as error:
-            raise MissingExtraError(f"OpenCV cannot read {str(path)!r}; {error}") from None
-        raise
+        install = install_command("network")
+        raise MissingExtraError(f"OpenCV cannot read {str(path)!r}, and onnxruntime is missing: {install}") from None
     return one_at_a_time(run)
 
 
 def _test_image(height: int, width: int) -> np.ndarray:
-    """Blobs of all sizes, uint8 (3, h, w)."""
-    rng, image = np.random.default_rng(0), np.zeros((3, height, width))
-    for size in (2, 4, 8, 16, 32):
-        blobs = rng.normal(size=(3, -(-height // size), -(-width // size)))
-        image += size * np.kron(blobs, np.ones((size, size)))[:, :height, :width]
-    return (image * 1.5 + 128).clip(0, 255).astype(np.uint8)
+    """Blobs of random colours, float32 (1, 3, h, w)."""
+    colours = np.random.default_rng(0).integers(0, 256, (3, height // CELL, width // CELL))
+    return np.kron(colours, np.ones((CELL, CELL)))[None].astype(np.float32)

@@ -63,6 +63,12 @@ class ScoreMap:
         """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
         return cls.within(frame, frame.region_around(window), window, model)
 
+    def complete(self, frame: Pyramid, place: tuple[int, int], model: Model) -> tuple[ScoreMap, int, int]:
+        """The map, row and column of a window with all its features: a map of its own if vectors are missing here."""
+        if frame.descriptor is None:
+            return self, *place
+        return ScoreMap.around(frame, self.window(*place), WINDOW, model), 0, 0
+
     def window(self, row: float, column: float) -> Window:
         """The window at (row, column), which may lie between cells."""
         (x, y), (w, h) = self.origin, self.step

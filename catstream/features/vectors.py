@@ -46,10 +46,9 @@ class VectorMap:
         step_x, step_y = self.window.w / PLACES, self.window.h / PLACES  # of the vectors, in pixels of the frame
         w, h, cos, sin = window.w / WINDOW, window.h / WINDOW, math.cos(turn), math.sin(turn)
         right, below = (w * cos / step_x, w * sin / step_y), (-h * sin / step_x, h * cos / step_y)
-        middle = (side - 2) / 2
-        left = (columns - 1) / 2 + (x - middle_x) / step_x - middle * (right[0] + below[0])
-        top = (rows - 1) / 2 + (y - middle_y) / step_y - middle * (right[1] + below[1])
-        kernels.sample_vectors(self.vectors, left, top, *right, *below, found)
+        left = (columns - 1 - (side - 2) * (right[0] + below[0])) / 2 + (x - middle_x) / step_x
+        top = (rows - 1 - (side - 2) * (right[1] + below[1])) / 2 + (y - middle_y) / step_y
+        kernels.sample_vectors(self.vectors, np.array([(left, top), right, below]), found)
         return found
 
     def row(self, window: Window, turn: float = 0.0) -> np.ndarray:

@@ -288,19 +288,14 @@ class Scan:
         With a descriptor, HOG and colours choose the windows, and it describes only these.
         """
         least = _FITTED * self._threshold
-        if frame.descriptor is not None:
-            model = searched.model
-            scores = ScoreMap(cells, cells.respond(model.weights, model.bias), (0.0, 0.0), step)
-            windows = [
-                scores.window(*place) for place in non_maximum_suppression(scores.scores, _MOST_MAXIMA, WINDOW // 2)
-            ]
-            found = [searched.seen(ScoreMap.around(frame, each, WINDOW, model), 0, 0, each) for each in windows]
-            return [each for each in found if each.score >= least]
-        # No likeness is above 1 / share.
-        appearance = cells.respond_above(searched.model.weights, searched.model.bias, least * searched.likeness.share)
+        model = searched.model
+        if frame.descriptor is None:  # no likeness is above 1 / share
+            appearance = cells.respond_above(model.weights, model.bias, least * searched.likeness.share)
+        else:
+            appearance = cells.respond(model.weights, model.bias)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
         places = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
-        found = [searched.seen(scores, *place, scores.window(*place)) for place in places]
+        found = [searched.seen(*scores.complete(frame, place, model), scores.window(*place)) for place in places]
         return [each for each in found if each.score >= least]
 
 
