@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
@@ -18,8 +19,9 @@ from catstream.errors import VideoError
 from catstream.messages.names import counted, listed
 from catstream.services.options import PATH, with_overwrite
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
+from catstream.sinks.destinations import EXPORTS, SINKS, About, Origin, TrackedFrame
 from catstream.sinks.track_log import is_log, read_frames
+from catstream.video.source import open_source
 
 Command = Callable[..., Any]
 
@@ -96,15 +98,22 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
 @click.argument("log", type=PATH)
 @click.argument("dest", type=PATH)
 @click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
+@click.option(
+    "--size",
+    metavar="WIDTHxHEIGHT|SOURCE",
+    help="Size of the frames, or the video or folder of them; for coco, cvat and yolo, which cut boxes at its edges.",
+)
+@click.option("--label", default="", help="Class of all objects; by default, the name of each is its class.")
 @with_overwrite
 @with_table(sinks=False)
-def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
+def export(log: Path, dest: Path, name: str | None, size: str | None, label: str, overwrite: bool) -> None:
     """Make another format from the log of a run.
 
     LOG is an .ndjson or .csv file of `catstream track` or `catstream sink`. The
     extension of DEST selects the format, or --format, which a folder needs. A
     folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
-    that of LOG. Processing times are in .csv only.
+    that of LOG. Processing times are in .csv only, marks of doubtful boxes and
+    which object was given a name anew in .ndjson only.
 
     {table}
 
@@ -112,6 +121,8 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
     EXAMPLES
       catstream export out/walk.ndjson walk.sqlite
       catstream export out/walk.csv results --format otb
+      catstream export out/walk.ndjson walk.xml --size walk.mp4 --label person
+      catstream export out/walk.ndjson dataset --format yolo --size 640x360
     """
     row = destinations.export_of(dest, name)
     if not is_log(log) or not log.is_file():
@@ -120,4 +131,13 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:
         destinations.check_file(dest, may_exist=overwrite, source=str(log))
-    destinations.export((frame for frame, _ in read_frames(log)), dest, row, log.stem)
+    about = About(log.stem, None if size is None else _size(size), label)
+    destinations.export((frame for frame, _ in read_frames(log)), dest, row, about)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Return the width and height that a text states, or those of the source that it names."""
+    if stated := re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text):
+        return int(stated[1]), int(stated[2])
+    with open_source(text) as source:
+        return source.size

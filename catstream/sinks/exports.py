@@ -14,7 +14,7 @@ import numpy as np
 
 from catstream.errors import VideoError
 from catstream.numerics.arrays import Float64
-from catstream.sinks.destinations import TrackedFrame
+from catstream.sinks.destinations import About, TrackedFrame
 
 #: Layout -> the files of boxes, scores and times of an object, in the folder of the results; NAME is that of the log,
 #: or NAME-OBJECT. The toolkits of got10k (which has OTB, too) and VOT read them.
@@ -50,7 +50,7 @@ def write_layout(
             np.savetxt(file, column, fmt=form, delimiter=",")
 
 
-def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+def write_mot(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
     """Write boxes as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
 
     Frames, ids and pixels count from 1 there. The first object that appears has the id 1, and a name keeps its id. A
@@ -66,7 +66,7 @@ def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
                 file.write(f"{track.frame + 1},{number},{box},{track.score:.4f},-1,-1,-1\n")
 
 
-def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
     """Write the table `tracks` of a database."""
     columns = ", ".join(f"{name} {kind}" for name, kind in _COLUMNS.items())
     path.unlink(missing_ok=True)  # left by a process that was killed
@@ -79,7 +79,7 @@ def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
         raise VideoError(f"cannot write {path}: {error}") from None
 
 
-def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
     """Write the columns of the same table, which pyarrow, pandas, DuckDB and Spark read."""
     import pyarrow as arrow
     import pyarrow.parquet
@@ -103,7 +103,7 @@ def _rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:
         )
 
 
-def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, name: str) -> None:
+def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
     """Write the files of each object; those of times only if the log has them, as a CSV file has."""
     rows: dict[str, dict[int, tuple[float, ...]]] = {}
     times: dict[int, float] = {}
@@ -116,7 +116,7 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, na
         table[list(found), :5] = list(found.values())
         table[list(times), 5] = list(times.values())
         seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
-        whole = f"{name}-{thing}" if thing else name
+        whole = f"{about.name}-{thing}" if thing else about.name
         write_layout(layout, folder, whole, table[:, :4], table[:, 4], seconds)
 
 
