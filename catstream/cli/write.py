@@ -20,7 +20,7 @@ from catstream.messages.names import counted, listed
 from catstream.services.options import PATH, with_overwrite
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, SINKS, About, Origin, TrackedFrame
-from catstream.sinks.track_log import is_log, read_frames
+from catstream.sinks.track_log import LOGS, is_log, read_frames
 from catstream.video.source import open_source
 
 Command = Callable[..., Any]
@@ -109,11 +109,11 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
 def export(log: Path, dest: Path, name: str | None, size: str | None, label: str, overwrite: bool) -> None:
     """Make another format from the log of a run.
 
-    LOG is an .ndjson or .csv file of `catstream track` or `catstream sink`. The
+    LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream sink`. The
     extension of DEST selects the format, or --format, which a folder needs. A
     folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
     that of LOG. Processing times are in .csv only, marks of doubtful boxes and
-    which object was given a name anew in .ndjson only.
+    which object was given a name anew not in .csv.
 
     {table}
 
@@ -126,7 +126,7 @@ def export(log: Path, dest: Path, name: str | None, size: str | None, label: str
     """
     row = destinations.export_of(dest, name)
     if not is_log(log) or not log.is_file():
-        raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
+        raise VideoError(f"{log} is no log of a run: give one of its files, {', '.join(LOGS)}")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:

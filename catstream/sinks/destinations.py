@@ -119,6 +119,7 @@ SINKS = {
     ".ndjson": Row("track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
     STDOUT: Row("track_log.StdoutSink", "the same, on standard output", repeats=False),
     ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
     ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
     ".mcap": Row(
         "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
@@ -128,7 +129,7 @@ SINKS = {
 #: Name of a format -> the export.
 EXPORTS = {
     "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
-    "sqlite": Row("exports.write_sqlite", "the table tracks of a database", ".sqlite"),
+    "sqlite": Row("database.write_sqlite", "the table tracks of a database", ".sqlite"),
     "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
     "coco": Row("annotations.write_coco", "COCO, with the tracks and the video as in TAO", ".json", sized=True),
     "cvat": Row("annotations.write_cvat", "CVAT for video 1.1", ".xml", sized=True),

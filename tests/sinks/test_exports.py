@@ -193,6 +193,6 @@ def test_a_name_that_does_not_say_the_format_needs_the_option(tmp_path, name):
         export_of(tmp_path / name, None)
 
 
-def test_a_log_is_continued_by_no_export_and_an_export_is_no_sink(tmp_path):
+def test_an_export_is_no_sink(tmp_path):
     with pytest.raises(VideoError, match="use catstream export"):
-        open_sink(str(tmp_path / "t.sqlite"), Origin())
+        open_sink(str(tmp_path / "t.json"), Origin())
