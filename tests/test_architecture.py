@@ -46,6 +46,7 @@ IMPORTERS = {
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
         "services/detector_process.py",
+        "catstream/sinks/events.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/kernels.py"],
@@ -91,7 +92,7 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py"),
+    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/sinks/events.py"),
     *("services/decisions.py", "services/control_commands.py"),
 ]
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
+from itertools import chain
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,12 @@ from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endp
 from catstream.cli.common import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
-from catstream.messages.names import counted, listed
-from catstream.services.options import PATH, with_overwrite
+from catstream.messages.names import counted, is_name, listed
+from catstream.run.job import SinkOptions
+from catstream.services.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
+from catstream.sinks.events import KINDS
 from catstream.sinks.track_log import is_log, read_frames
 
 Command = Callable[..., Any]
@@ -35,13 +39,100 @@ def with_table(*, sinks: bool) -> Callable[[Command], Command]:
     return changed
 
 
+def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[tuple[float, float], ...]]:
+    """The corners of the zones by name."""
+    zones = {}
+    for text in texts:
+        name, _equals, corners = text.partition("=")
+        try:
+            points = tuple((float(x), float(y)) for x, y in (corner.split(",") for corner in corners.split()))
+        except ValueError:
+            points = ()
+        if not is_name(name) or not name or len(points) < 3 or not all(map(isfinite, chain(*points))) or name in zones:
+            raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three or more corners, got {text!r}')
+        zones[name] = points
+    return zones
+
+
+def _when(_: click.Context, __: click.Parameter, text: str | None) -> tuple[tuple[str, ...], float]:
+    """The kinds of events, and the seconds of `lost`."""
+    kinds, seconds = [], SinkOptions().lost_seconds
+    for part in text.split(",") if text is not None else ():
+        kind, equals, value = part.strip().partition("=")
+        if equals and kind == "lost":
+            seconds = NumberRange(0).convert(value, None, None)
+        elif equals or kind not in KINDS:
+            raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {part!r}")
+        kinds.append(kind)
+    return tuple(kinds), seconds
+
+
+def _options(
+    zone: dict[str, tuple[tuple[float, float], ...]],
+    zone_margin: float,
+    when: tuple[tuple[str, ...], float],
+    rate: float,
+    picture: bool,
+    secret_file: Path | None,
+) -> SinkOptions:
+    return SinkOptions(zone, zone_margin, *when, rate, picture, secret_file and secret_file.absolute())
+
+
+#: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
+with_sink_options = combined(
+    "options",
+    _options,
+    click.option(
+        "--zone",
+        multiple=True,
+        metavar='NAME="X,Y X,Y X,Y ..."',
+        callback=_zones,
+        help="Corners of a zone, in pixels, for the events entered and left; may be repeated.",
+    ),
+    click.option(
+        "--zone-margin",
+        type=NumberRange(0),
+        default=SinkOptions().margin,
+        show_default=True,
+        metavar="PIXELS",
+        help="An object leaves a zone once its centre is farther than this outside.",
+    ),
+    click.option(
+        "--when",
+        metavar="EVENT,...",
+        callback=_when,
+        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, else 2.",
+    ),
+    click.option(
+        "--rate",
+        type=NumberRange(0, min_open=True),
+        default=SinkOptions().rate,
+        show_default=True,
+        metavar="N",
+        help="Messages per second about each object, between its events, to mqtt://.",
+    ),
+    click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
+    click.option("--secret-file", type=PATH, help="File of a key, with which events to http:// are signed."),
+)
+
+
+def check_used(options: SinkOptions, places: Iterable[str]) -> None:
+    """Raise UsageError if options were given, and no destination has any."""
+    if options != SinkOptions() and not any("://" in place for place in places):
+        raise click.UsageError(
+            "--zone, --when, --rate, --picture and --secret-file are for destinations that send events: give one, "
+            "mqtt://HOST/TOPIC or https://HOST/PATH"
+        )
+
+
 @click.command()
 @click.argument("places", nargs=-1, required=True, metavar="DEST...")
 @with_overwrite
+@with_sink_options
 @with_endpoint
 @with_wait
 @with_table(sinks=True)
-def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wait: float) -> None:
+def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoint: str, keys: str, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives, and stays written however the command
@@ -59,9 +150,12 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
       catstream sink tracks.csv
       catstream sink tracks.ndjson walk.mp4 walk.mcap --endpoint run
       catstream sink - | jq .box
+      catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
+      catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
+    check_used(options, places)
     for place in places:
-        destinations.sink_of(place).load()
+        destinations.check_sink(place, options)
         if destinations.is_file(place):
             destinations.check_file(Path(place), may_exist=overwrite)
     written, reason, run = 0, "", ""
@@ -69,7 +163,7 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
-            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys)
+            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys, options=options)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
