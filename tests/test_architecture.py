@@ -66,6 +66,7 @@ IMPORTERS = {
         "catstream/wire/keys.py",
         "catstream/client/subscription.py",
     ],
+    "paho": ["catstream/sinks/mqtt_sink.py"],
     "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
@@ -225,6 +226,7 @@ def test_every_dependency_has_an_entry():
     """The dependencies of pyproject.toml, and no others."""
     distributions = {
         "opencv-python-headless": "cv2",
+        "paho-mqtt": "paho",
         "prometheus-client": "prometheus_client",
         "pyzmq": "zmq",
         "scikit-learn": "sklearn",

@@ -19,7 +19,7 @@ from rich.text import Text
 from catstream.box import Box
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.view import PORT, Address, AddressType, with_token
-from catstream.cli.write import check_used, with_sink_options, with_table
+from catstream.cli.write import with_sink_options, with_table
 from catstream.errors import require_extra
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted, doubtful, listed
@@ -199,8 +199,6 @@ class _Run:
             raise click.UsageError(
                 "--resume continues the existing results, and --overwrite replaces them: give one of them"
             )
-        if not self.resume:
-            check_used(self.options, self.write)
         if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
             raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
-from itertools import chain
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.console import Console
 
 from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
@@ -39,90 +38,64 @@ def with_table(*, sinks: bool) -> Callable[[Command], Command]:
     return changed
 
 
-def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[tuple[float, float], ...]]:
+def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:
     """The corners of the zones by name."""
-    zones = {}
+    zones: dict[str, Any] = {}
     for text in texts:
         name, _equals, corners = text.partition("=")
+        pairs = [corner.split(",") for corner in corners.split()]
         try:
-            points = tuple((float(x), float(y)) for x, y in (corner.split(",") for corner in corners.split()))
+            points = tuple((float(x), float(y)) for x, y in pairs)
         except ValueError:
             points = ()
-        if not is_name(name) or not name or len(points) < 3 or not all(map(isfinite, chain(*points))) or name in zones:
-            raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three or more corners, got {text!r}')
+        if not (name and is_name(name) and name not in zones and len(points) > 2 and np.isfinite(points).all()):
+            raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three corners or more, got {text!r}')
         zones[name] = points
     return zones
 
 
-def _when(_: click.Context, __: click.Parameter, text: str | None) -> tuple[tuple[str, ...], float]:
+def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, ...], float]:
     """The kinds of events, and the seconds of `lost`."""
-    kinds, seconds = [], SinkOptions().lost_seconds
-    for part in text.split(",") if text is not None else ():
-        kind, equals, value = part.strip().partition("=")
-        if equals and kind == "lost":
-            seconds = NumberRange(0).convert(value, None, None)
-        elif equals or kind not in KINDS:
-            raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {part!r}")
-        kinds.append(kind)
-    return tuple(kinds), seconds
-
-
-def _options(
-    zone: dict[str, tuple[tuple[float, float], ...]],
-    zone_margin: float,
-    when: tuple[tuple[str, ...], float],
-    rate: float,
-    picture: bool,
-    secret_file: Path | None,
-) -> SinkOptions:
-    return SinkOptions(zone, zone_margin, *when, rate, picture, secret_file and secret_file.absolute())
+    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
+    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
+        raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
+    return tuple(kinds), NumberRange(0).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
 
 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
 with_sink_options = combined(
     "options",
-    _options,
+    lambda zone, margin, when, rate, picture, secret: SinkOptions(
+        zone, margin, when[0], when[1], rate, picture, secret and secret.absolute()
+    ),
     click.option(
-        "--zone",
-        multiple=True,
-        metavar='NAME="X,Y X,Y X,Y ..."',
-        callback=_zones,
-        help="Corners of a zone, in pixels, for the events entered and left; may be repeated.",
+        "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A zone, by its corners in pixels."
     ),
     click.option(
         "--zone-margin",
+        "margin",
         type=NumberRange(0),
-        default=SinkOptions().margin,
-        show_default=True,
+        default=10,
         metavar="PIXELS",
-        help="An object leaves a zone once its centre is farther than this outside.",
+        help="An object has left a zone if it is farther outside than this; 10 by default.",
     ),
     click.option(
         "--when",
+        default=",".join(KINDS),
         metavar="EVENT,...",
         callback=_when,
-        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, else 2.",
+        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, by default 2.",
     ),
     click.option(
         "--rate",
         type=NumberRange(0, min_open=True),
-        default=SinkOptions().rate,
-        show_default=True,
+        default=1,
         metavar="N",
-        help="Messages per second about each object, between its events, to mqtt://.",
+        help="To mqtt://: states of each object per second; 1 by default.",
     ),
     click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
-    click.option("--secret-file", type=PATH, help="File of a key, with which events to http:// are signed."),
+    click.option("--secret-file", "secret", type=PATH, help="File of a key, with which events to http:// are signed."),
 )
-
-
-def check_used(options: SinkOptions, places: Iterable[str]) -> None:
-    """Raise UsageError if options were given, and no destination has any."""
-    if options != SinkOptions() and not any("://" in place for place in places):
-        raise click.UsageError(
-            "--zone, --when, --rate, --picture and --secret-file are for destinations that send events: give one, "
-            "mqtt://HOST/TOPIC or https://HOST/PATH"
-        )
 
 
 @click.command()
@@ -153,7 +126,6 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
-    check_used(options, places)
     for place in places:
         destinations.check_sink(place, options)
         if destinations.is_file(place):

@@ -39,7 +39,7 @@ class SinkOptions:
 
     zones         corners x, y of each zone, a polygon, in pixels of the frame, by name
     margin        pixels by which the centre of a box has to be outside a zone that it was in to leave it
-    events        kinds of events that are sent, see `catstream.sinks.events`; all if empty
+    events        kinds of events that are sent, see `catstream.sinks.events`
     lost_seconds  time without a box after which an object is lost
     rate          messages per second at most about each object, in between its events
     picture       whether each event has the newest picture of the pipeline
@@ -48,7 +48,7 @@ class SinkOptions:
 
     zones: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     margin: float = 10.0
-    events: tuple[str, ...] = ()
+    events: tuple[str, ...] = ("found", "lost", "returned", "entered", "left", "ended")
     lost_seconds: float = 2.0
     rate: float = 1.0
     picture: bool = False

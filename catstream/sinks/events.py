@@ -111,8 +111,7 @@ class Events:
         return {"present": thing.seen is not None and not thing.lost, "zones": thing.zones}
 
     def _wanted(self, events: list[Event]) -> list[Event]:
-        kinds = self._options.events or KINDS
-        return [event for event in events if event.kind in kinds]
+        return [event for event in events if event.kind in self._options.events]
 
     def _of(self, track: Track) -> Iterator[Event]:
         """Yield the events of a track, except the end of other objects."""
