@@ -125,6 +125,8 @@ SINKS = {
     ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
     ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
     ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    "rtsp://": Row("restream.StreamSink", "the pictures with their boxes, live, to an RTSP server, as H.264"),
+    "rtmp://": Row("restream.StreamSink", "the same to an RTMP server"),
     ".mcap": Row(
         "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
     ),
