@@ -112,7 +112,7 @@ class _Pusher:
                 socket.create_connection(address, _STUCK_SECONDS).close()  # no picture is made for one that is away
                 return self._push()
             except (OSError, CatstreamError) as error:
-                self._warn(f"not connected ({getattr(error, 'strerror', error)}), it is tried again")
+                self._warn(f"not connected ({getattr(error, 'strerror', None) or error}), it is tried again")
             sleep(_PAUSE_SECONDS)
 
     def _push(self) -> None:
