@@ -19,7 +19,7 @@ from rich.text import Text
 from catstream.box import Box
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.view import PORT, Address, AddressType, with_token
-from catstream.cli.write import with_sink_options, with_table
+from catstream.cli.write import check_used, with_sink_options, with_table
 from catstream.errors import require_extra
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted, doubtful, listed
@@ -109,7 +109,9 @@ def track(**options: Any) -> None:
 
     {table}
 
-    Existing files are not replaced without --overwrite.
+    Existing files are not replaced without --overwrite. A destination on the
+    network that is away or slow does not slow the run down: what it misses is
+    counted. --zone and the options after it are for mqtt:// and http://.
 
     \b
     EXAMPLES
@@ -122,6 +124,8 @@ def track(**options: Any) -> None:
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
+      catstream track 0 --model walker.safetensors --write mqtt://10.0.0.7/yard \\
+                        --zone "door=300,80 420,80 420,400 300,400" --when lost=10,entered
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
     """
@@ -230,6 +234,7 @@ class _Run:
         if results.video and results.output is None:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
+        check_used(self.options, places)
         origin = Origin(
             pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys, options=results.options
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
 from pathlib import Path
@@ -100,6 +100,14 @@ with_sink_options = combined(
 )
 
 
+def check_used(options: SinkOptions, places: Iterable[str]) -> None:
+    """Raise UsageError if options were given that none of the destinations has."""
+    if options != SinkOptions() and not any("://" in place for place in places):
+        raise click.UsageError(
+            "--zone, --when, --rate, --picture and --secret-file are for mqtt:// and http://: add one"
+        )
+
+
 @click.command()
 @click.argument("places", nargs=-1, required=True, metavar="DEST...")
 @with_overwrite
@@ -128,6 +136,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
+    check_used(options, places)
     for place in places:
         destinations.check_sink(place, options)
         if destinations.is_file(place):

@@ -130,7 +130,7 @@ SINKS = {
     ".mcap": Row(
         "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
     ),
-    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states, for a broker", extra="mqtt"),
+    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker", extra="mqtt"),
     "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt"),
     "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
     "https://": Row("webhook.Webhook", "the same with TLS"),

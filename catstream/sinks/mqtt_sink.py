@@ -45,7 +45,7 @@ class MqttSink:
         self._topic, self._options, self._reports = unquote(url.path)[1:], origin.options, Reports(place, origin)
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
         self._published = self._acknowledged = self.missed = 0
-        self._is_new = False  # whether there is a new connection: its broker may have lost what was retained
+        self._is_away = self._is_back = False  # a broker that is back may have lost what was retained
         self._client = client = Client(CallbackAPIVersion.VERSION2)
         client.max_queued_messages_set(QUEUED)
         client.reconnect_delay_set(1, _LONGEST_PAUSE)
@@ -58,6 +58,7 @@ class MqttSink:
         client.on_disconnect, client.on_publish = self._disconnected, self._was_published
         client.connect_async(url.hostname or "", url.port or (8883 if url.scheme == "mqtts" else 1883), _KEEPALIVE)
         client.loop_start()
+        self._publish("availability", "online", retain=True)
 
     @staticmethod
     def check(place: str, _: SinkOptions) -> None:
@@ -66,11 +67,12 @@ class MqttSink:
 
     def write(self, frame: TrackedFrame) -> None:
         """Publish the events of a frame, and the states that have changed or are due."""
-        if self._is_new:
-            self._is_new = False
+        if self._is_back:
+            self._is_back = False
             self._publish("availability", "online", retain=True)
             for name in self._sent:
                 self._announce(name)
+                self._sent[name] = None, 0.0
         for body in self._reports.update(frame.tracks):
             self._publish("events", body)
         now, status_of = time.monotonic(), self._reports.events.status
@@ -82,10 +84,10 @@ class MqttSink:
             if status and (status != last or now >= due):
                 self._sent[track.object] = status, now + 1 / self._options.rate
                 state = {**track.to_dict(), **status, "sent": time.time()}
-                if self._client.is_connected():
-                    self._publish(f"objects/{track.object or '-'}", json.dumps(state), retain=True)
-                else:
+                if self._is_away:
                     self.missed += 1
+                else:
+                    self._publish(f"objects/{track.object or '-'}", json.dumps(state), retain=True)
         for name in [name for name in self._sent if status_of(name) is None]:
             self._announce(name, ended=True)
             self._remove(name)
@@ -142,15 +144,22 @@ class MqttSink:
     # Called by paho, in its thread.
 
     def _connected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
-        self._is_new = not reason.is_failure
-        self._reports.warn(f"the broker refuses the connection ({reason})" if reason.is_failure else "")
+        if reason.is_failure:
+            self._leave(f"the broker refuses the connection ({reason})")
+        else:
+            self._is_back, self._is_away = self._is_away, False
+            self._reports.warn("")
 
     def _not_connected(self, _: Client, __: object) -> None:
-        self._reports.warn(f"no connection ({sys.exception()}), it is tried again")
+        self._leave(f"no connection ({sys.exception()})")
 
     def _disconnected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
         if reason.is_failure:
-            self._reports.warn(f"the connection was lost ({reason}), it is opened again")
+            self._leave(f"the connection was lost ({reason})")
+
+    def _leave(self, why: str) -> None:
+        self._is_away = True
+        self._reports.warn(f"{why}, it is tried again")
 
     def _was_published(self, *_: object) -> None:
         self._acknowledged += 1
@@ -164,6 +173,6 @@ def _id(text: str) -> str:
 def _checked(place: str) -> SplitResult:
     """The parts of the address; VideoError if it is not valid."""
     url = split(place, "mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC")
-    if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or url.query or url.fragment:
+    if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or set("?#") & set(place):
         raise VideoError(f"{shown(place)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")
     return url

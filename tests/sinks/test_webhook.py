@@ -210,3 +210,48 @@ def test_a_key_that_cannot_be_used_is_an_error_before_the_run(tmp_path, text, wo
         (tmp_path / "key").write_text(text)
     with pytest.raises(VideoError, match=re.escape(str(tmp_path / "key")) + f".*{words}"):
         check_sink("http://host/hook", SinkOptions(key=tmp_path / "key"))
+
+
+def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_video, succeed):
+    video, boxes = demo_video(32)
+    url = f"http://me:secret@127.0.0.1:{receiver.port}/T0/secret"
+    frame = "all=0,0 320,0 320,240 0,240"
+    _, errors = succeed(
+        "track", video, "--box", f"flower={boxes[0]}", "--write", url, "--zone", frame, "--when", "entered,left"
+    )
+    assert [(body["event"], body["zone"], body["track"]["frame"]) for body in receiver.bodies] == [
+        ("entered", "all", 0), ("left", "all", 31),
+    ]  # fmt: skip
+    assert f"results: http://127.0.0.1:{receiver.port}/..." in errors
+    assert "secret" not in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["--zone", "door=1,2 3,4"], "three corners or more"),
+        (["--zone", "1,2 3,4 5,6"], "three corners or more"),
+        (["--zone", "door=1,2 3,4 5,nan"], "three corners or more"),
+        (["--zone", "a=1,2 3,4 5,6", "--zone", "a=1,2 3,4 5,6"], "expected a new NAME="),
+        (["--when", "gone"], "expected some of found, lost, returned"),
+        (["--when", "found=3"], "expected some of found, lost, returned"),
+        (["--when", ""], "expected some of found, lost, returned"),
+        (["--when", "lost=soon"], "'soon' is not a valid float"),
+        (["--rate", "0"], "is not in the range x>0"),
+        (["--write", "mqtt://me:secret@host/#"], "has no valid topic"),
+        (["--write", "ftp://me:secret@host/a"], "ftp://host/a is no destination"),
+    ],
+)
+def test_an_option_that_is_not_valid_is_an_error_of_one_line_before_the_run(demo_video, fail, words, error):
+    video, boxes = demo_video(32)
+    said = fail("track", video, "--box", boxes[0], "--write", "http://127.0.0.1:9/hook", *words)
+    assert error in said
+    assert "secret" not in said
+
+
+def test_options_that_no_destination_has_are_an_error(demo_video, fail, tmp_path):
+    video, boxes = demo_video(32)
+    assert "are for mqtt:// and http://: add one" in fail(
+        "track", video, "--box", boxes[0], "--output", tmp_path / "out", "--when", "lost=10"
+    )
+    assert "are for mqtt:// and http://: add one" in fail("sink", tmp_path / "t.csv", "--picture")
