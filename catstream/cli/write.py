@@ -126,7 +126,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
     {table}
 
     A video has the small pictures that the pipeline sends to its page, with
-    their tracks. For MOT text, a database and others: `catstream export`.
+    their tracks. For CVAT, COCO, MOT and others: `catstream export`.
 
     \b
     EXAMPLES
