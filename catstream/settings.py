@@ -98,7 +98,7 @@ class RunSettings(_Group):
     objects_most: Annotated[int, _about("Objects that a stream may have at most.", ge=1, le=64)] = 32
     checkpoint_seconds: Annotated[
         float, _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600)
-    ] = 1.0
+    ] = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
