@@ -168,7 +168,7 @@ def _flock(handle: int, kind: int) -> bool:
 
 
 def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> None:
-    """Write arrays and JSON metadata to a file for its owner only, as `write_atomically` does, without a copy in memory.
+    """Write arrays and JSON metadata to a file for its owner only, as `write_atomically` does; memory holds no copy.
 
     OSError if the file cannot be written; the old one stays unchanged.
     """
