@@ -175,8 +175,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> N
     path = Path(path)
     remove_parts(path.parent, path.name)
     # In a folder of its own, because safetensors makes a file beside the one that it writes.
-    beside = {"prefix": f".{path.name}.", "suffix": ".part", "dir": path.parent}
-    with tempfile.TemporaryDirectory(**beside, ignore_cleanup_errors=True) as folder:  # of a disk now read-only
+    with tempfile.TemporaryDirectory(".part", f".{path.name}.", path.parent, ignore_cleanup_errors=True) as folder:
         part, (contiguous, header) = Path(folder, path.name), _content(arrays, metadata)
         try:
             safetensors.numpy.save_file(contiguous, part, header)

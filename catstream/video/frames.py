@@ -148,7 +148,7 @@ def open_video(text: str, hardware: str, **options: Any) -> InputContainer:
     device = HWAccel(hardware, allow_software_fallback=False) if hardware else None
     try:
         # Text in the file, as its title, may be in any encoding.
-        return av.open(text, hwaccel=device, metadata_errors="replace", **options)
+        opened: InputContainer = av.open(text, hwaccel=device, metadata_errors="replace", **options)
     except (av.PermissionError, RuntimeError) as error:
         if device is None:
             raise
@@ -156,6 +156,7 @@ def open_video(text: str, hardware: str, **options: Any) -> InputContainer:
             f"no device of the kind {hardware!r} can decode this video here ({error}): this FFmpeg knows "
             f"{', '.join(hwdevices_available())}; without run.hardware, the processor decodes it"
         ) from None
+    return opened
 
 
 def video_stream(container: InputContainer) -> Any:
