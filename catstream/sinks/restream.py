@@ -93,7 +93,7 @@ class StreamSink:
         os.set_blocking(self._output, False)
 
     def _stop(self) -> None:
-        with self._process, suppress(BrokenPipeError):
+        with self._process:
             self._process.kill()
 
 
