@@ -85,6 +85,10 @@ class RunSettings(_Group):
     poll_seconds: Annotated[
         float, _about("Time from one picture to the next at the http:// address of a still picture.", ge=0.01, le=3600)
     ] = 1.0
+    hardware: Annotated[
+        str,
+        _about("Device that decodes video, by FFmpeg's name for its kind, as cuda or qsv (empty: the processor)."),
+    ] = ""
     skip_damaged: Annotated[
         bool, _about("Continue after a damaged place in a video file. Without it, the run ends there.")
     ] = False
@@ -98,7 +102,7 @@ class RunSettings(_Group):
     objects_most: Annotated[int, _about("Objects that a stream may have at most.", ge=1, le=64)] = 32
     checkpoint_seconds: Annotated[
         float, _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600)
-    ] = 1.0
+    ] = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
