@@ -25,7 +25,7 @@ COLUMNS = {
 _NAMES = ", ".join(COLUMNS)
 _TYPES = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
 _CREATE = f"CREATE TABLE IF NOT EXISTS tracks ({_TYPES}, PRIMARY KEY (frame, object)) STRICT"
-_INSERT = f"INSERT OR REPLACE INTO tracks ({_NAMES}) VALUES ({', '.join('?' for _ in COLUMNS)})"  # nosec B608
+_INSERT = f"INSERT OR REPLACE INTO tracks ({_NAMES}) VALUES ({', '.join('?' for _ in COLUMNS)})"
 
 
 class SqliteSink:
