@@ -214,6 +214,9 @@ class TeachingSettings(_Group):
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10
+    interval: Annotated[
+        int, _about("Of the frames that the model explains, every which one is taught (1: all).", ge=1, le=1024)
+    ] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -429,6 +432,7 @@ _PAPER: dict[str, Value] = {
     "teaching.colours": False,
     "teaching.other_backgrounds": 0.0,
     "teaching.mirrored": 0,
+    "teaching.interval": 1,
     "belief.weak_score": 0.3,
     "belief.trusted_score": 0.0,
 }
