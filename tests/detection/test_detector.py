@@ -92,6 +92,18 @@ def test_of_a_still_scene_every_seventh_frame_teaches_and_of_a_moving_one_every_
     assert teaches((80, 50)), "it moves again"
 
 
+@pytest.mark.parametrize("interval", [1, 3])
+def test_of_the_frames_that_the_model_explains_every_third_teaches_once_the_object_is_known(scene, interval):
+    detector = started(scene, {"teaching.interval": interval})
+    detector.adopt(dataclasses.replace(detector.model, version=1))
+    steps = [detector.step(scene((60 + 2 * (number % 2) + number // 2, 50))) for number in range(80)]
+    taught = [bool(features.training) for _, features in steps]
+    explained = [track.score >= 0.9 for track, _ in steps]
+    assert all(taught[:48])
+    assert all(explained[50:])
+    assert sum(taught[50:]) == 30 / interval
+
+
 def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
     detector = started(scene)
     for _ in range(3):
@@ -110,12 +122,14 @@ def test_each_frame_that_scm_follows_is_learned_from_whatever_its_score(scene):
 
 @pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
-def test_a_redetected_object_is_learned_from_only_if_it_is_trusted(scene, trust, teaches, detection):
+def test_a_redetected_object_is_learned_from_only_if_it_is_trusted_and_is_doubtful_otherwise(
+    scene, trust, teaches, detection
+):
     detector = started(scene, {"belief.trusted_score": trust, "search.mode": detection})
     detector.step(scene())
-    _, features = detector.step(scene((250, 180)))
+    track, features = detector.step(scene((250, 180)))
     assert features.box.overlap(Box(250, 180, 48, 40)) > 0.6
-    assert bool(features.training) == teaches
+    assert (bool(features.training), track.doubtful) == (teaches, not teaches)
 
 
 def test_older_models_are_ignored(scene):
