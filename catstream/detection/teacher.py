@@ -21,6 +21,7 @@ from catstream.detection.likeness import Likeness
 from catstream.detection.search import due
 from catstream.errors import BoxError
 from catstream.features.cells import window_rows
+from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, COLOURS, EDGE, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
@@ -41,11 +42,12 @@ _EXTENT_INTERVAL = 2  # frames from one set of rows of windows of wrong extents 
 _OBJECT_WEIGHT = 8.0  # of a frame's rows of the object together; any other row has weight 1
 _BACKGROUND = 12  # windows of the background around the object, of each frame
 _SIDE = 20  # cells around the object, at least, from which background is taken
-_DESCRIBED = (_SIDE - WINDOW) // 2 + EDGE  # cells around a copy that a descriptor sees: as many as around the object
+_DESCRIBED = _SIDE + 2 * EDGE  # cells of which a descriptor sees a copy of the object in the middle: as of the object
 _MINING_INTERVAL = 8  # frames between two searches for hard negatives; a large frame is searched in parts
 _MOST_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4 ms
 _HARD_OVERLAP = 0.2  # of a hard negative with the object's window, at most
 
+_PATCH = (WINDOW + 2 * MARGIN) * CELL  # side of a copy with its margin, in pixels
 _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians
 _NEAREST_OTHER, _FARTHEST_OTHER = 0.3, 1.0  # distance of another background, in windows
 _SOLID, _GONE = 0.8, 1.15  # radii between which the object's ellipse fades; 1 touches the sides of its box
@@ -200,17 +202,16 @@ def affine_copies(
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _elsewhere(window, rng) if _is_moved(number, moved) else None
         is_mirrored = number >= max(count - mirrored, 1)
-        descriptor = frame.descriptor if vectors is None or is_mirrored or offset is not None else None
-        margin = MARGIN if descriptor is None else _DESCRIBED
-        patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset, margin)
+        patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
         if is_mirrored:
             patch = patch[:, :, ::-1]
-        if descriptor is not None:
-            of_vectors.append(VectorMap.of(descriptor, patch, copy).row(copy))
-            patch = _inner(patch)
+        patches.append(patch)
+        if frame.descriptor is not None and (vectors is None or is_mirrored or offset is not None):
+            of_vectors.append(
+                _described(frame, frame.descriptor, copy, _TURN * turn, patch, offset, is_mirrored).row(copy)
+            )
         elif vectors is not None:
             of_vectors.append(vectors.row(copy, _TURN * turn))
-        patches.append(patch)
     return window_rows(patches, of_vectors)
 
 
@@ -232,41 +233,48 @@ def _elsewhere(window: Window, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _patch(
-    frame: Pyramid,
-    window: Window,
-    turn: float,
-    box: Box,
-    offset: tuple[float, float] | None = None,
-    margin: int = MARGIN,
+    frame: Pyramid, window: Window, turn: float, box: Box, offset: tuple[float, float] | None = None
 ) -> np.ndarray:
-    """A window and its margin, cut from a frame, rotated by `turn` radians and resized, uint8 (3, 96, 96) by default.
+    """A window and its margin, cut from a frame, rotated by `turn` radians and resized, uint8 (3, 96, 96).
 
     The object, whose box has the centre of the window, is put on another background `offset` pixels away; None leaves
     it.
     """
     pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
-    side = (WINDOW + 2 * margin) * CELL
     x, y = window.centre
-    patch = frame.cut(x, y, *pixel, side, turn)
+    patch = frame.cut(x, y, *pixel, _PATCH, turn)
     if offset is None:
         return patch
-    share = _ellipse(side, window.w / box.w, window.h / box.h)
-    background = frame.cut(x + offset[0], y + offset[1], *pixel, side, turn)
+    share = _ellipse(window.w / box.w, window.h / box.h)
+    background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
     return np.stack([cv2.blendLinear(*both, share, 1 - share) for both in zip(patch, background, strict=True)])
 
 
-def _inner(patch: np.ndarray) -> np.ndarray:
-    """The window and the usual margin of a patch that was cut for a descriptor."""
-    edge = (_DESCRIBED - MARGIN) * CELL
-    return patch[:, edge:-edge, edge:-edge]
+def _described(
+    frame: Pyramid,
+    descriptor: Descriptor,
+    window: Window,
+    turn: float,
+    patch: np.ndarray,
+    offset: tuple[float, float] | None,
+    is_mirrored: bool = False,
+) -> VectorMap:
+    """The vectors of a patch, in the middle of the background around it."""
+    (x, y), (right, down) = window.centre, offset or (0.0, 0.0)
+    pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
+    whole = frame.cut(x + right, y + down, *pixel, _DESCRIBED * CELL, turn)
+    whole = whole[:, :, ::-1].copy() if is_mirrored else whole
+    edge = (_DESCRIBED * CELL - _PATCH) // 2
+    whole[:, edge:-edge, edge:-edge] = patch
+    return VectorMap.of(descriptor, whole, window)
 
 
-def _ellipse(side: int, across: float, down: float) -> np.ndarray:
-    """Share of the object in each pixel of a patch, float32 (side, side): 1 inside its ellipse, falling to 0 around it.
+def _ellipse(across: float, down: float) -> np.ndarray:
+    """Share of the object in each pixel of a patch, float32: 1 inside its ellipse, falling to 0 around it.
 
     The window is `across` times as wide, and `down` times as high as the object.
     """
-    place = (np.arange(side) - (side - 1) / 2) / (WINDOW * CELL / 2)
+    place = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
     out = np.hypot((place * down)[:, None], place * across)
     share: np.ndarray = ((_GONE - out) / (_GONE - _SOLID)).clip(0, 1).astype(np.float32)
     return share
@@ -346,11 +354,9 @@ def _first_cuts(
         vectors = None
         for trial in trials:
             tried = trial.window.centred(*copy.centre)
-            descriptor = frame.descriptor if vectors is None else None
-            margin = MARGIN if descriptor is None else _DESCRIBED
-            patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset, margin)
-            if descriptor is not None:
-                vectors, patch = VectorMap.of(descriptor, patch, tried), _inner(patch)
+            patch = _patch(frame, tried, _TURN * turn, copy.box(settings.search.context), offset)
+            if frame.descriptor is not None and vectors is None:
+                vectors = _described(frame, frame.descriptor, tried, _TURN * turn, patch, offset)
             yield trial, patch, None if vectors is None else vectors.row(tried)
 
 
