@@ -46,24 +46,11 @@ def prepare(
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0),
     std: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> None:
-    """Write the file of a network for `features.network`.
+    """Write the file of a network for `features.network`, from a layer of a backbone and a folder of photographs.
 
-    Parameters
-    ----------
-    backbone : path of an ONNX file with one image as its input
-    layer : name of a tensor, or of the node that makes it, with one vector for each 16 x 16 pixels
-    images : folder of photographs, a hundred or more; its subfolders count, too
-    output : path of the file
-    rgb : whether the backbone takes red, green and blue, not blue, green and red
-    mean, std : what is subtracted from the levels, 0 to 255, of its first, second and third channel, and by what the
-        rest is divided
-
-    Raises
-    ------
-    SettingsError
-        If the backbone is no ONNX file, has no such layer, or the layer another stride.
-    VideoError
-        If the folder has no photographs.
+    The layer is the name of a tensor, or of the node that makes it. The backbone takes red, green and blue if `rgb`;
+    `mean` is subtracted from their levels, 0 to 255, and the rest is divided by `std`. SettingsError if the backbone is
+    no ONNX file, has no such layer, or the layer another stride; VideoError if there are no photographs.
     """
     require_extra("network")
     import onnx
