@@ -31,6 +31,7 @@ from catstream.wire.keys import create
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+DOOR = ((50, 0), (90, 0), (90, 90), (50, 90))
 MODULES = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
 
 
@@ -243,6 +244,39 @@ def test_a_ground_station_finds_the_camera_selects_an_object_and_is_told_where_i
         *_, begun, forgotten = camera.stdout.read().decode().splitlines()
         assert "begins" in begun
         assert "no longer tracked" in forgotten
+
+
+def test_the_zone_counter_counts_the_visits_of_an_object_and_their_time(capsys):
+    example = runpy.run_path(str(EXAMPLES / "zone_counter.py"))
+    events, counter = example["Events"](example["SinkOptions"](zones={"door": DOOR})), example["Counter"]()
+    for frame, x in enumerate([0, 60, 70, 0, 60, 0]):
+        track = Track(frame + 1, frame, frame / 2, "present", catstream.Box(x, 40, 20, 20), 0.9, 1, object="anna")
+        for event in events.update([track]):
+            counter.take(event)
+    assert dict(counter.visits)["door"] == [1.0, 0.5]
+    assert capsys.readouterr().out.splitlines()[:2] == [
+        "0.5 s: anna entered door, 1 inside",
+        "1.5 s: anna left door, 0 inside",
+    ]
+
+
+def test_the_zone_counter_counts_beside_a_run(demo_video):
+    source, boxes = demo_video(60)
+    with ExitStack() as stack:
+        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], {"run.unstored_frames": 1}))
+        words = [*command("zone_counter.py"), pipeline.endpoint, "all=0,0 320,0 320,240 0,240", "none=0,0 1,0 1,1"]
+        counter = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        stack.callback(counter.kill)
+        counts = []
+        for _ in pipeline:
+            counts = counts or select.select([counter.stdout], [], [], 0.3)[0]  # while it starts, few pass
+        printed, _ = counter.communicate(timeout=60)
+    assert counter.returncode == 0
+    entered, left, everywhere, nowhere = printed.splitlines()
+    assert entered.endswith("the object entered all, 1 inside")
+    assert left.endswith("the object left all, 0 inside")
+    assert re.fullmatch(r"all: 1 visits, [0-2]\.\d s in all", everywhere)
+    assert nowhere == "none: 0 visits, 0.0 s in all"
 
 
 def test_the_collector_stores_the_tracks_of_two_pipelines_and_survives_one_that_does_not_run(demo_video, tmp_path):
