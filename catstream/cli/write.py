@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.console import Console
 
 from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
-from catstream.messages.names import counted, listed
-from catstream.services.options import PATH, with_overwrite
+from catstream.messages.names import counted, is_name, listed
+from catstream.run.job import SinkOptions
+from catstream.services.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
+from catstream.sinks.events import KINDS
 from catstream.sinks.track_log import is_log, read_frames
 
 Command = Callable[..., Any]
@@ -35,13 +38,82 @@ def with_table(*, sinks: bool) -> Callable[[Command], Command]:
     return changed
 
 
+def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:
+    """The corners of the zones by name."""
+    zones: dict[str, Any] = {}
+    for text in texts:
+        name, _equals, corners = text.partition("=")
+        pairs = [corner.split(",") for corner in corners.split()]
+        try:
+            points = tuple((float(x), float(y)) for x, y in pairs)
+        except ValueError:
+            points = ()
+        if not (name and is_name(name) and name not in zones and len(points) > 2 and np.isfinite(points).all()):
+            raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three corners or more, got {text!r}')
+        zones[name] = points
+    return zones
+
+
+def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, ...], float]:
+    """The kinds of events, and the seconds of `lost`."""
+    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
+    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
+        raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
+    return tuple(kinds), NumberRange(0).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
+
+
+#: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
+with_sink_options = combined(
+    "options",
+    lambda zone, margin, when, rate, picture, secret: SinkOptions(
+        zone, margin, when[0], when[1], rate, picture, secret and secret.absolute()
+    ),
+    click.option(
+        "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A zone, by its corners in pixels."
+    ),
+    click.option(
+        "--zone-margin",
+        "margin",
+        type=NumberRange(0),
+        default=10,
+        metavar="PIXELS",
+        help="An object has left a zone if it is farther outside than this; 10 by default.",
+    ),
+    click.option(
+        "--when",
+        default=",".join(KINDS),
+        metavar="EVENT,...",
+        callback=_when,
+        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, by default 2.",
+    ),
+    click.option(
+        "--rate",
+        type=NumberRange(0, min_open=True),
+        default=1,
+        metavar="N",
+        help="To mqtt://: states of each object per second; 1 by default.",
+    ),
+    click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
+    click.option("--secret-file", "secret", type=PATH, help="File of a key, with which events to http:// are signed."),
+)
+
+
+def check_used(options: SinkOptions, places: Iterable[str]) -> None:
+    """Raise UsageError if options were given that none of the destinations has."""
+    if options != SinkOptions() and not any("://" in place for place in places):
+        raise click.UsageError(
+            "--zone, --when, --rate, --picture and --secret-file are for mqtt:// and http://: add one"
+        )
+
+
 @click.command()
 @click.argument("places", nargs=-1, required=True, metavar="DEST...")
 @with_overwrite
+@with_sink_options
 @with_endpoint
 @with_wait
 @with_table(sinks=True)
-def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wait: float) -> None:
+def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoint: str, keys: str, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives, and stays written however the command
@@ -59,9 +131,12 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
       catstream sink tracks.csv
       catstream sink tracks.ndjson walk.mp4 walk.mcap --endpoint run
       catstream sink - | jq .box
+      catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
+      catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
+    check_used(options, places)
     for place in places:
-        destinations.sink_of(place).load()
+        destinations.check_sink(place, options)
         if destinations.is_file(place):
             destinations.check_file(Path(place), may_exist=overwrite)
     written, reason, run = 0, "", ""
@@ -69,7 +144,7 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
-            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys)
+            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys, options=options)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))

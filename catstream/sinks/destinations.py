@@ -14,9 +14,10 @@ from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
-from catstream.errors import VideoError, require_extra
+from catstream.errors import VideoError, require_extra, without_password
 from catstream.messages.kinds import Track
 from catstream.messages.storage import why_not_writable, writing
+from catstream.run.job import SinkOptions
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
@@ -49,6 +50,7 @@ class Origin:
     endpoint    of the running pipeline, for a sink that receives other messages, too
     keys        folder of the keys for this endpoint
     last        number of the last frame in the log of a run that is resumed; -1 for a new run
+    options     of the destinations, beside their addresses
     """
 
     source: str | None = None
@@ -57,13 +59,15 @@ class Origin:
     endpoint: str = ""
     keys: str = ""
     last: int = -1
+    options: SinkOptions = field(default_factory=SinkOptions)
 
 
 class Sink(Protocol):
     """Takes the frames in their order; made as `Class(place, origin)`.
 
     A sink may have the attribute `last`, the number of the last frame that it holds, -1 for none: when a run is
-    resumed, it gets all later frames of the log first.
+    resumed, it gets all later frames of the log first. Its class may have a function `check(place, options)`, which
+    raises VideoError before the run if the address or an option is not valid.
     """
 
     def write(self, frame: TrackedFrame) -> None:
@@ -107,6 +111,10 @@ SINKS = {
     ".mcap": Row(
         "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
     ),
+    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker", extra="mqtt"),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt"),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
+    "https://": Row("webhook.Webhook", "the same with TLS"),
 }
 
 #: Name of a format -> the export.
@@ -126,8 +134,8 @@ def sink_of(place: str) -> Row:
     row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
     if row is None:
         raise VideoError(
-            f"{place} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where - is "
-            "standard output; for other formats use catstream export"
+            f"{shown(place)} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where "
+            "- is standard output; for other formats use catstream export"
         )
     return row
 
@@ -156,6 +164,26 @@ def check_file(path: Path, *, may_exist: bool, source: str = "", made: Path | No
         raise VideoError(f"{path} exists already: replace it with --overwrite, or give another name")
     if reason := why_not_writable(path, made):
         raise VideoError(reason)
+
+
+def check_sink(place: str, options: SinkOptions) -> None:
+    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid."""
+    home = sink_of(place).load()
+    if hasattr(home, "check"):
+        home.check(place, options)
+
+
+def shown(place: str) -> str:
+    """Return a destination as messages name it: an address without its password, of a webhook its host alone.
+
+    >>> shown("mqtt://me:secret@10.0.0.7/yard"), shown("https://example.com/hooks/T0/B0/secret"), shown("a@b:c.csv")
+    ('mqtt://10.0.0.7/yard', 'https://example.com/...', 'a@b:c.csv')
+    """
+    if is_file(place):
+        return place
+    address = without_password(place)
+    scheme, _, rest = address.partition("://")
+    return f"{scheme}://{rest.partition('/')[0]}/..." if scheme in ("http", "https") else address
 
 
 def open_sink(place: str, origin: Origin) -> Sink:

@@ -25,7 +25,7 @@ from catstream.messages.kinds import State, Track
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing
 from catstream.run.job import Results
-from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
+from catstream.sinks.destinations import Origin, TrackedFrame, check_file, check_sink, is_file, open_sink, sink_of
 from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
@@ -215,7 +215,7 @@ class RunFiles:
         source = self.origin.source or ""
         for place in self.places:
             row = sink_of(place)
-            row.load()
+            check_sink(place, self.origin.options)
             if place.endswith(".mp4") and is_live(source):
                 raise VideoError(
                     f"a video needs its frames once more, but {without_password(source)} is live: omit the video"
