@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import base64
 import json
+from itertools import zip_longest
 from typing import Any
 from uuid import uuid4
 
@@ -35,16 +36,16 @@ def init_context(context: Any) -> None:
 
 def handler(context: Any, event: Any) -> Any:
     """Answer a request of CVAT."""
-    shapes, states = event.body.get("shapes", []), event.body.get("states") or []
+    shapes, states = event.body.get("shapes", []), event.body.get("states", [])
     picture = cv2.imdecode(np.frombuffer(base64.b64decode(event.body["image"]), np.uint8), cv2.IMREAD_COLOR)
     trackers: dict[str, catstream.Tracker] = context.user_data.trackers
     try:
         if picture is None:
             raise FrameError("expected a picture as PNG or JPEG, in base64")
-        if states:
-            found = [follow(trackers, picture, state) for state in states]
-        else:
-            found = [(shape, begin(trackers, picture, shape)) for shape in shapes]
+        found = [
+            follow(trackers, picture, state) if state else (shape, begin(trackers, picture, shape))
+            for shape, state in zip_longest(shapes, states)
+        ]
     except (BoxError, FrameError) as error:
         return context.Response(body=str(error), content_type="text/plain", status_code=400)
     while len(trackers) > MOST:
