@@ -102,8 +102,8 @@ def track(**options: Any) -> None:
       OUTPUT/NAME.mp4      with --video
 
     NAME is the name of the source, so that several sources can share a folder;
-    a/walk.mp4 and b/walk.mp4 need a folder each. `catstream export` makes MOT
-    text, the files of benchmarks, SQLite and Parquet from these.
+    a/walk.mp4 and b/walk.mp4 need a folder each. `catstream export` makes files
+    of annotation tools and benchmarks, and others, from these.
 
     --write DEST, may be repeated; the suffix selects the format
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
@@ -20,9 +21,10 @@ from catstream.messages.names import counted, is_name, listed
 from catstream.run.job import SinkOptions
 from catstream.services.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
+from catstream.sinks.destinations import EXPORTS, SINKS, About, Origin, TrackedFrame
 from catstream.sinks.events import KINDS
-from catstream.sinks.track_log import is_log, read_frames
+from catstream.sinks.track_log import LOGS, is_log, read_frames
+from catstream.video.source import open_source
 
 Command = Callable[..., Any]
 
@@ -124,7 +126,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
     {table}
 
     A video has the small pictures that the pipeline sends to its page, with
-    their tracks. For MOT text, a database and others: `catstream export`.
+    their tracks. For CVAT, COCO, MOT and others: `catstream export`.
 
     \b
     EXAMPLES
@@ -171,15 +173,22 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
 @click.argument("log", type=PATH)
 @click.argument("dest", type=PATH)
 @click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
+@click.option(
+    "--size",
+    metavar="WIDTHxHEIGHT|SOURCE",
+    help="Size of the frames, or the video or folder of them; for coco, cvat and yolo, which cut boxes at its edges.",
+)
+@click.option("--label", default="", help="Class of all objects; by default, the name of each is its class.")
 @with_overwrite
 @with_table(sinks=False)
-def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
+def export(log: Path, dest: Path, name: str | None, size: str | None, label: str, overwrite: bool) -> None:
     """Make another format from the log of a run.
 
-    LOG is an .ndjson or .csv file of `catstream track` or `catstream sink`. The
+    LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream sink`. The
     extension of DEST selects the format, or --format, which a folder needs. A
     folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
-    that of LOG. Processing times are in .csv only.
+    that of LOG. Processing times are in .csv only, marks of doubtful boxes and
+    which object was given a name anew not in .csv.
 
     {table}
 
@@ -187,12 +196,23 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
     EXAMPLES
       catstream export out/walk.ndjson walk.sqlite
       catstream export out/walk.csv results --format otb
+      catstream export out/walk.ndjson walk.xml --size walk.mp4 --label person
+      catstream export out/walk.ndjson dataset --format yolo --size 640x360
     """
     row = destinations.export_of(dest, name)
     if not is_log(log) or not log.is_file():
-        raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
+        raise VideoError(f"{log} is no log of a run: give one of its files, {', '.join(LOGS)}")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:
         destinations.check_file(dest, may_exist=overwrite, source=str(log))
-    destinations.export((frame for frame, _ in read_frames(log)), dest, row, log.stem)
+    about = About(log.stem, None if size is None else _size(size), label)
+    destinations.export((frame for frame, _ in read_frames(log)), dest, row, about)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Return the width and height that a text states, or those of the source that it names."""
+    if stated := re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text):
+        return int(stated[1]), int(stated[2])
+    with open_source(text) as source:
+        return source.size

@@ -62,6 +62,20 @@ class Origin:
     options: SinkOptions = field(default_factory=SinkOptions)
 
 
+@dataclass(frozen=True, slots=True)
+class About:
+    """What an export has to know beside the tracks.
+
+    name   that of the log, for the files in a folder
+    size   width and height of a frame in pixels; None if it is not known
+    label  the class of all objects; empty if the name of each is its class
+    """
+
+    name: str
+    size: tuple[int, int] | None = None
+    label: str = ""
+
+
 class Sink(Protocol):
     """Takes the frames in their order; made as `Class(place, origin)`.
 
@@ -81,9 +95,10 @@ class Sink(Protocol):
 class Row:
     """A row of the table.
 
-    home     the class of a sink, or the function `export(frames, path, name)`
+    home     the class of a sink, or the function `export(frames, path, about)`
     meaning  a line of the help
     suffix   of the file of an export; empty for a folder
+    sized    whether an export needs the size of a frame
     extra    the extra that it needs
     repeats  whether a sink can be continued, or made again from the log, when a run is resumed
     """
@@ -91,6 +106,7 @@ class Row:
     home: str
     meaning: str
     suffix: str = ""
+    sized: bool = False
     extra: str = ""
     repeats: bool = True
 
@@ -107,7 +123,10 @@ SINKS = {
     ".ndjson": Row("track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
     STDOUT: Row("track_log.StdoutSink", "the same, on standard output", repeats=False),
     ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
     ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    "rtsp://": Row("restream.StreamSink", "the pictures with their boxes, live, to an RTSP server, as H.264"),
+    "rtmp://": Row("restream.StreamSink", "the same to an RTMP server"),
     ".mcap": Row(
         "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
     ),
@@ -120,8 +139,12 @@ SINKS = {
 #: Name of a format -> the export.
 EXPORTS = {
     "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
-    "sqlite": Row("exports.write_sqlite", "the table tracks of a database", ".sqlite"),
+    "sqlite": Row("database.write_sqlite", "the table tracks of a database", ".sqlite"),
     "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
+    "coco": Row("annotations.write_coco", "COCO, with the tracks and the video as in TAO", ".json", sized=True),
+    "cvat": Row("annotations.write_cvat", "CVAT for video 1.1", ".xml", sized=True),
+    "yolo": Row("annotations.write_yolo", "a folder: a file of labels for each frame, and data.yaml", sized=True),
+    "via": Row("annotations.write_via", "VIA tracks, which movement and napari open", ".via.csv"),
     "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB"),
     "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k"),
     "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment"),
@@ -142,7 +165,7 @@ def sink_of(place: str) -> Row:
 
 def export_of(path: Path, name: str | None) -> Row:
     """Return the row of an export, by its name, or else by the suffix; raises VideoError if that selects not one."""
-    rows = [row for row in EXPORTS.values() if row.suffix and row.suffix == path.suffix]
+    rows = [row for row in EXPORTS.values() if row.suffix and path.name.endswith(row.suffix)]
     if name is None and len(rows) != 1:
         raise VideoError(f"the format of {path} is not known: give --format, one of {', '.join(EXPORTS)}")
     return rows[0] if name is None else EXPORTS[name]
@@ -191,16 +214,21 @@ def open_sink(place: str, origin: Origin) -> Sink:
     return cast(Sink, sink_of(place).load()(place, origin))
 
 
-def export(frames: Iterable[TrackedFrame], path: Path, row: Row, name: str) -> None:
+def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -> None:
     """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
 
-    They are named after `name`, that of the log. Raises VideoError if they cannot be written.
+    Raises VideoError if they cannot be written, or if the size of a frame is needed and not known.
     """
-    make: Callable[[Iterable[TrackedFrame], Path, str], None] = row.load()
+    make: Callable[[Iterable[TrackedFrame], Path, About], None] = row.load()
+    if row.sized and about.size is None:
+        raise VideoError(
+            f"this format needs the size of a frame, for {path}: give --size WIDTHxHEIGHT, or --size SOURCE with the "
+            "video or folder that was tracked"
+        )
     part = path.with_name(f"{path.name}.part")
     with writing(path, VideoError):
         try:
-            make(frames, part if row.suffix else path, name)
+            make(frames, part if row.suffix else path, about)
             if row.suffix:
                 part.replace(path)
         finally:

@@ -43,13 +43,14 @@ class MqttSink:
     def __init__(self, place: str, origin: Origin) -> None:
         url = _checked(place)
         self._topic, self._options, self._reports = unquote(url.path)[1:], origin.options, Reports(place, origin)
+        self._availability = f"{self._topic}/availability"
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
         self._published = self._acknowledged = self.missed = 0
         self._is_away = self._is_back = False  # a broker that is back may have lost what was retained
         self._client = client = Client(CallbackAPIVersion.VERSION2)
         client.max_queued_messages_set(QUEUED)
         client.reconnect_delay_set(1, _LONGEST_PAUSE)
-        client.will_set(f"{self._topic}/availability", "offline", qos=1, retain=True)
+        client.will_set(self._availability, "offline", qos=1, retain=True)
         if url.scheme == "mqtts":
             client.tls_set_context(ssl.create_default_context())
         if url.username is not None:
@@ -58,7 +59,7 @@ class MqttSink:
         client.on_disconnect, client.on_publish = self._disconnected, self._was_published
         client.connect_async(url.hostname or "", url.port or (8883 if url.scheme == "mqtts" else 1883), _KEEPALIVE)
         client.loop_start()
-        self._publish("availability", "online", retain=True)
+        self._publish(self._availability, "online", retain=True)
 
     @staticmethod
     def check(place: str, _: SinkOptions) -> None:
@@ -69,12 +70,12 @@ class MqttSink:
         """Publish the events of a frame, and the states that have changed or are due."""
         if self._is_back:
             self._is_back = False
-            self._publish("availability", "online", retain=True)
+            self._publish(self._availability, "online", retain=True)
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
         for body in self._reports.update(frame.tracks):
-            self._publish("events", body)
+            self._publish(f"{self._topic}/events", body)
         now, status_of = time.monotonic(), self._reports.events.status
         for track in frame.tracks:
             if track.object not in self._sent:
@@ -87,7 +88,7 @@ class MqttSink:
                 if self._is_away:
                     self.missed += 1
                 else:
-                    self._publish(f"objects/{track.object or '-'}", json.dumps(state), retain=True)
+                    self._publish(self._state_topic(track.object), json.dumps(state), retain=True)
         for name in [name for name in self._sent if status_of(name) is None]:
             self._announce(name, ended=True)
             self._remove(name)
@@ -95,10 +96,10 @@ class MqttSink:
     def close(self) -> None:
         """Publish the last events; wait some seconds until the broker has everything, and warn about what it missed."""
         for body in self._reports.close():
-            self._publish("events", body)
+            self._publish(f"{self._topic}/events", body)
         for name in [*self._sent]:
             self._remove(name)
-        self._publish("availability", "offline", retain=True)
+        self._publish(self._availability, "offline", retain=True)
         deadline = time.monotonic() + CLOSE_SECONDS
         while self._acknowledged < self._published and time.monotonic() < deadline:
             time.sleep(0.02)
@@ -107,24 +108,25 @@ class MqttSink:
             self._client.loop_stop()
         self.missed += self._published - self._acknowledged
         if self.missed:
-            self._reports.warn(f"the broker has not received {counted(self.missed, 'message')}")
+            self._reports.tell(f"the broker has not received {counted(self.missed, 'message')}")
 
     def _publish(self, topic: str, payload: bytes | str, *, retain: bool = False) -> None:
-        """Publish below the topic of the address, or anywhere if the topic begins with a slash."""
-        whole = topic[1:] if topic[0] == "/" else f"{self._topic}/{topic}"
-        if self._client.publish(whole, payload, 1, retain).rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:
+        if self._client.publish(topic, payload, 1, retain).rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:
             self.missed += 1
         else:
             self._published += 1
 
+    def _state_topic(self, name: str) -> str:
+        return f"{self._topic}/objects/{name or '-'}"
+
     def _remove(self, name: str) -> None:
         """Remove what is retained of an object."""
         del self._sent[name]
-        self._publish(f"objects/{name or '-'}", b"", retain=True)
+        self._publish(self._state_topic(name), b"", retain=True)
 
     def _announce(self, name: str, *, ended: bool = False) -> None:
         """Have Home Assistant make the sensors of an object, or remove them if it has ended."""
-        state, label = f"{self._topic}/objects/{name or '-'}", name or "object"
+        state, label = self._state_topic(name), name or "object"
         sensors = {label: "value_json.present"}
         sensors |= {f"{label} in {zone}": f"'{zone}' in value_json.zones" for zone in self._options.zones}
         for sensor, condition in sensors.items():
@@ -133,12 +135,12 @@ class MqttSink:
                 **{"name": sensor, "unique_id": f"catstream_{number}", "device_class": "occupancy"},
                 **{"state_topic": state, "json_attributes_topic": state},
                 "value_template": f"{{{{ 'ON' if value_json is defined and {condition} else 'OFF' }}}}",
-                "availability_topic": f"{self._topic}/availability",
+                "availability_topic": self._availability,
                 "expire_after": max(_EXPIRE_SECONDS, round(3 / self._options.rate)),
                 "device": {"identifiers": [f"catstream_{_id(self._topic)}"], "name": self._topic},
                 "origin": {"name": "catstream"},
             }
-            topic = f"/homeassistant/binary_sensor/catstream/{number}/config"
+            topic = f"homeassistant/binary_sensor/catstream/{number}/config"
             self._publish(topic, b"" if ended else json.dumps(config), retain=True)
 
     # Called by paho, in its thread.

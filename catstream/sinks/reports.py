@@ -59,7 +59,11 @@ class Reports:
         """Warn of a problem of the destination, once however often it occurs; with "", say that it is over."""
         if problem != self._problem:
             self._problem = problem
-            _log.warning("%s: %s", self._place, problem or "is back")
+            self.tell(problem or "is back")
+
+    def tell(self, text: str) -> None:
+        """Warn of something about the destination."""
+        _log.warning("%s: %s", self._place, text)
 
     def _json(self, event: Event) -> bytes:
         picture = {"picture": self._picture} if self._previews is not None else {}

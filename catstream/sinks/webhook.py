@@ -61,7 +61,7 @@ class Webhook:
         self._hurry.set()
         self.missed = self._events - self._delivered
         if self.missed:
-            self._reports.warn(f"{counted(self.missed, 'event')} of {self._events} were not delivered")
+            self._reports.tell(f"{counted(self.missed, 'event')} of {self._events} were not delivered")
 
     def _queue(self, bodies: list[bytes]) -> None:
         for body in bodies:

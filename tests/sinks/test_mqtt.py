@@ -1,11 +1,13 @@
 """MQTT, with a real broker: what a subscriber gets, while the broker is there, away, back, silent, or asks for more."""
 
+import gc
 import json
 import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 from contextlib import ExitStack, closing
 from dataclasses import replace
 
@@ -239,7 +241,7 @@ def test_a_wrong_password_is_told_once_and_not_shown(broker, until, caplog, monk
 
 @needs_broker
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no certificate without it: apt-get install openssl")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close that connection
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close it
 def test_tls_needs_a_certificate_that_this_machine_trusts(tmp_path, until, monkeypatch, caplog):
     broker = Broker(tmp_path, until, tls=True)
     broker.start()
@@ -247,6 +249,8 @@ def test_tls_needs_a_certificate_that_this_machine_trusts(tmp_path, until, monke
         with monkeypatch.context() as patch, opened(broker.url):
             until(lambda: "certificate verify failed" in caplog.text)
             quick(patch)
+        until(lambda: not any(thread.name.startswith("paho") for thread in threading.enumerate()))
+        gc.collect()
         got = broker.subscriber()
         monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "crt"))
         with opened(broker.url) as sink:
