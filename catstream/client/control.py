@@ -150,10 +150,12 @@ class Control:
         first = min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
         answer = self._commands.ask(command, first)
         if answer is None and first and is_deserted(self._place):
-            raise SilenceError(
-                f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
-                "or give the endpoint of one that runs (--endpoint)"
-            )
+            answer = self._commands.receive(command.id, 0)  # of a pipeline that has just ended
+            if answer is None:
+                raise SilenceError(
+                    f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
+                    "or give the endpoint of one that runs (--endpoint)"
+                )
         answer = answer or self._commands.ask(command, self.timeout - first)
         if answer is None:
             raise SilenceError(
