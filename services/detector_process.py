@@ -358,7 +358,7 @@ class DetectorLoop:
         frames = [frame]
         if command.time is not None and (kept := self._outputs.previews.since(command.time)):
             frames = [*kept, frame]
-            at = f"at {box} {frame.time - command.time:.1f} s before frame {detectors.seq}"
+            at = f"at {box} in the picture {frame.time - command.time:.1f} s before frame {detectors.seq}"
         elif command.time is not None:
             at += ", as the picture in which it was drawn is not kept any more"
         later = (Pyramid(each.image) for each in frames)
