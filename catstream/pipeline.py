@@ -67,7 +67,7 @@ class Pipeline:
     part : slice
         The frames of a file or folder to track: `slice(100, 200, 2)` for 100, 102 ... 198.
     state : path
-        Folder for checkpoints, written once a second and at the end, from which the run can be resumed.
+        Folder for checkpoints, written every two seconds and at the end, from which the run can be resumed.
     resume : path
         State folder of an earlier run, which continues at the frame that it had reached. The folder also contains the
         source, the box, the part and the settings.

@@ -85,6 +85,10 @@ class RunSettings(_Group):
     poll_seconds: Annotated[
         float, _about("Time from one picture to the next at the http:// address of a still picture.", ge=0.01, le=3600)
     ] = 1.0
+    hardware: Annotated[
+        str,
+        _about("Device that decodes video, by FFmpeg's name for its kind, as cuda or qsv (empty: the processor)."),
+    ] = ""
     skip_damaged: Annotated[
         bool, _about("Continue after a damaged place in a video file. Without it, the run ends there.")
     ] = False
@@ -98,7 +102,7 @@ class RunSettings(_Group):
     objects_most: Annotated[int, _about("Objects that a stream may have at most.", ge=1, le=64)] = 32
     checkpoint_seconds: Annotated[
         float, _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600)
-    ] = 1.0
+    ] = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,6 +214,9 @@ class TeachingSettings(_Group):
     hard_negatives: Annotated[
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10
+    interval: Annotated[
+        int, _about("Of the frames that the model explains, every which one is taught (1: all).", ge=1, le=1024)
+    ] = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -425,6 +432,7 @@ _PAPER: dict[str, Value] = {
     "teaching.colours": False,
     "teaching.other_backgrounds": 0.0,
     "teaching.mirrored": 0,
+    "teaching.interval": 1,
     "belief.weak_score": 0.3,
     "belief.trusted_score": 0.0,
 }

@@ -91,7 +91,7 @@ def track(**options: Any) -> None:
     Ctrl-C, SIGTERM and the loss of the terminal end them; the results so far
     are kept.
 
-    With --state, a checkpoint is written once a second. After a power failure,
+    With --state, a checkpoint is written every two seconds. After a power failure,
     a crash or Ctrl-C, --resume continues the run with the objects that it had,
     and with the same source, settings and results unless they are given again.
     --state with --continue resumes the run if there is one in the folder, and

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from zlib import crc32
 
 import numpy as np
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 Result = tuple[Track, ObjectFeatures]
 
 _STILL_INTERVAL = 7  # frames from one taught frame of a still scene to the next; not even, as other intervals are
+_EXPLAINED = 0.9  # score from which the model explains a frame; the mean of the object has the score 1
+_YOUNG = 50  # frames of an object that are all taught
 
 
 class Detector:
@@ -109,13 +112,22 @@ class Detector:
         else:  # never absent: the first leaf is of the first n frames, whatever the score of this tracker is
             state = replace(state, level="confident", window=found.window)
         self.state = state
-        if self._shows_nothing_new(found, seq):
+        if self._is_explained(found, seq) or self._is_still(found, seq):
             return self._result(seq, time, found.score, {})
         training = taught(state, found, frame, seq, model, self.likeness, settings)
         self._taught = (seq, found.around.cells) if training and found.around is not None else None
         return self._result(seq, time, found.score, training)
 
-    def _shows_nothing_new(self, found: Detection, seq: int) -> bool:
+    def _is_explained(self, found: Detection, seq: int) -> bool:
+        """Whether the model explains the object in a frame that is not due (docs/paper.md)."""
+        state = self._known()
+        if not self.model.version or state.level != "confident" or seq - state.first_frame <= _YOUNG:
+            return False
+        # Several objects are taught in different frames, as far as their names allow.
+        is_due = (seq + crc32(self.name.encode())) % self.settings.teaching.interval == 0
+        return found.score >= _EXPLAINED and not is_due
+
+    def _is_still(self, found: Detection, seq: int) -> bool:
         """Whether the surroundings of the object are still those of a recent frame that was taught (docs/paper.md)."""
         if found.around is None or self._taught is None or not self.model.version:
             return False

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import fcntl
 import glob
 import json
 import os
 import secrets
+import shutil
 import tempfile
 import time
 import zlib
@@ -83,7 +85,7 @@ def remove_parts(folder: Path, name: str = "") -> None:
     for part in folder.glob(f".{glob.escape(name)}{'.' if name else ''}*.part"):
         with contextlib.suppress(OSError):
             if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
-                part.unlink()
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
 
 
 @contextlib.contextmanager
@@ -165,9 +167,23 @@ def _flock(handle: int, kind: int) -> bool:
     return True
 
 
-def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, mode: int = 0o666) -> None:
-    """Write arrays and JSON metadata to a file, as `write_atomically` does."""
-    write_atomically(path, encode(arrays, metadata), mode=mode)
+def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> None:
+    """Write arrays and JSON metadata to a file for its owner only, as `write_atomically` does; memory holds no copy.
+
+    OSError if the file cannot be written; the old one stays unchanged.
+    """
+    path = Path(path)
+    remove_parts(path.parent, path.name)
+    # In a folder of its own, because safetensors makes a file beside the one that it writes.
+    with tempfile.TemporaryDirectory(".part", f".{path.name}.", path.parent, ignore_cleanup_errors=True) as folder:
+        part, (contiguous, header) = Path(folder, path.name), _content(arrays, metadata)
+        try:
+            safetensors.numpy.save_file(contiguous, part, header)
+        except safetensors.SafetensorError as error:
+            raise OSError(errno.EIO, str(error)) from None
+        _sync(part)  # the content must be on disk before the new name
+        part.replace(path)
+    _sync(path.parent)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
@@ -182,9 +198,14 @@ def read_metadata(path: str | os.PathLike[str]) -> Metadata:
 
 def encode(arrays: Arrays, metadata: Metadata) -> bytes:
     """The content of the file that `write` writes."""
+    return safetensors.numpy.save(*_content(arrays, metadata))
+
+
+def _content(arrays: Arrays, metadata: Metadata) -> tuple[Arrays, dict[str, str]]:
+    """The arrays and the metadata as safetensors takes them."""
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}  # as safetensors expects
     facts = {"version": _VERSION, "facts": metadata, "checksum": _checksum(contiguous, metadata)}
-    return safetensors.numpy.save(contiguous, {_KEY: json.dumps(facts, sort_keys=True)})
+    return contiguous, {_KEY: json.dumps(facts, sort_keys=True)}
 
 
 def decode(data: bytes, name: str) -> tuple[Arrays, Metadata]:
@@ -216,9 +237,9 @@ def with_prefix(arrays: Arrays, prefix: str) -> Arrays:
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
-def _sync(folder: Path) -> None:
-    """Write the directory entries of a folder to disk."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+def _sync(path: Path) -> None:
+    """Write the content of a file, or the entries of a folder, to disk."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

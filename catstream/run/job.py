@@ -114,7 +114,7 @@ class Job:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
         with storage.writing(folder):
-            storage.write(folder / _NAME, {}, metadata, mode=0o600)
+            storage.write(folder / _NAME, {}, metadata)
         return folder / _NAME
 
     @classmethod

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import cv2
 import numpy as np
 
-from catstream.errors import FrameError
+from catstream.errors import FrameError, VideoError
 from catstream.numerics.arrays import is_finite
 
 if TYPE_CHECKING:
@@ -135,6 +135,28 @@ def _displayed(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     if abs(right) < abs(matrix[0, 1]):
         image, down, right = image.swapaxes(0, 1), matrix[0, 1], matrix[1, 0]
     return image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
+
+
+def open_video(text: str, hardware: str, **options: Any) -> InputContainer:
+    """Open a video or a stream with PyAV, to be decoded by a device of the kind `hardware` if that is not empty.
+
+    Raises PyAV's errors, and VideoError if there is no such device, or it cannot decode this video.
+    """
+    import av
+    from av.codec.hwaccel import HWAccel, hwdevices_available
+
+    device = HWAccel(hardware, allow_software_fallback=False) if hardware else None
+    try:
+        # Text in the file, as its title, may be in any encoding.
+        opened: InputContainer = av.open(text, hwaccel=device, metadata_errors="replace", **options)
+    except (av.PermissionError, RuntimeError) as error:
+        if device is None:
+            raise
+        raise VideoError(
+            f"no device of the kind {hardware!r} can decode this video here ({error}): this FFmpeg knows "
+            f"{', '.join(hwdevices_available())}; without run.hardware, the processor decodes it"
+        ) from None
+    return opened
 
 
 def video_stream(container: InputContainer) -> Any:

@@ -27,7 +27,7 @@ import cv2
 
 from catstream.errors import VideoError, without_password
 from catstream.settings import RunSettings
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, video_stream
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -196,7 +196,7 @@ class LiveSource(Source):
         if _is_http(self._text) and self._format is None and not is_known:
             due -= settings.open_seconds / 5
         timeouts = max(1.0, due - monotonic()), settings.silent_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
-        with _open_container(self._text, self._format, timeouts) as container:
+        with _open_container(self._text, self._format, timeouts, settings.hardware) as container:
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
@@ -257,17 +257,15 @@ def _is_http(text: str) -> bool:
     return text.startswith(("http:", "https:"))
 
 
-def _open_container(text: str, form: str | None, timeouts: tuple[float, float]) -> InputContainer:
+def _open_container(text: str, form: str | None, timeouts: tuple[float, float], hardware: str) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
-    import av
-
     is_address = "://" in text
-    container = av.open(
+    container = open_video(
         f"/dev/video{text}" if text.isdigit() else text,
+        hardware,
         format=form if is_address else "v4l2",
         options=_JPEG_OPTIONS if form else _OPTIONS,
         timeout=timeouts,
-        metadata_errors="replace",
     )
     problem, kind = "", container.format.name
     has_end = container.duration if kind in ("hls", "dash") else (container.size or 0) > 0

@@ -41,7 +41,7 @@ import numpy as np
 
 from catstream.errors import VideoError, without_password
 from catstream.settings import RunSettings
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, video_stream
+from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
 from catstream.video.images import EXPECTED, IMAGES, ImageReader, first_pages, image_files, pages_of, visible
 from catstream.video.times import FrameClock
 
@@ -139,7 +139,7 @@ def open_source(
     idle      is called ten times a second while a live source gives no frame; if it returns True, iteration ends. With
               it, opening a live source never fails: iteration waits for the first frame for any length of time, and the
               size is known with that frame
-    settings  the settings of a run, of which `image_rate`, `skip_damaged` and `resize` are used
+    settings  the settings of a run, of which `image_rate`, `hardware`, `skip_damaged` and `resize` are used
     single    single ones of them by name, in the place of those in `settings`
 
     VideoError if the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the
@@ -287,8 +287,7 @@ class _Video:
 
         self.path, self.settings, self.damaged, self.scaled = path, settings, 0, 0
         try:
-            # Text in the file, as its title, may be in any encoding.
-            self.container = av.open(str(path.absolute()), metadata_errors="replace")
+            self.container = open_video(str(path.absolute()), settings.hardware)
         except (av.FFmpegError, OSError) as error:
             raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {EXPECTED}") from None
         self.stream = video_stream(self.container)

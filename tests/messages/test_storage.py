@@ -22,7 +22,7 @@ WHOLE = storage.encode(ARRAYS, METADATA)
 def test_a_file_without_a_secret_has_the_permissions_of_the_umask(tmp_path):
     before = os.umask(0o027)
     try:
-        storage.write(tmp_path / "tree", {}, {})
+        storage.write_atomically(tmp_path / "tree", WHOLE)
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "tree").stat().st_mode) == 0o640

@@ -194,6 +194,11 @@ def test_a_camera_that_does_not_exist_is_an_error():
         open_source("987")
 
 
+def test_a_device_that_cannot_decode_a_stream_is_an_error(camera):
+    with pytest.raises(VideoError, match=r"no device of the kind 'abacus' can decode.*without run.hardware"):
+        open_source(camera(numbered).url, hardware="abacus")
+
+
 def test_with_an_idle_function_the_first_frame_is_waited_for_too(camera):
     cam, turns = camera(numbered), []
     cam.leave()
