@@ -117,7 +117,7 @@ class Subscriber(ChannelSocket[Message]):
 
     If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
     message of the object that has waited longest is received first. `only` limits it to one kind of message, and
-    `about` to those of this kind about one object. With `newest`, older messages are passed over on any channel.
+    `about` to those of this kind about one object. With `newest`, this holds for any channel.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Subscriber(ChannelSocket[Message]):
         newest: bool = False,
     ) -> None:
         self._newest = channel.keeps == "newest"
-        self._passes_over = newest or (self._newest and len(channel.senders) == 1)
+        self._passes_over = (newest or self._newest) and len(channel.senders) == 1
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
         self._arrived: dict[Topic, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
