@@ -101,6 +101,7 @@ EXTRAS = {
     "view": ("the web page", ("prometheus_client", "starlette", "uvicorn")),
     "loadtest": ("the load test", ("psutil",)),
     "mcap": ("an MCAP file", ("mcap",)),
+    "mqtt": ("an MQTT broker", ("paho",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "fleet": ("a fleet", ("ray", "obstore")),
     "s3": ("a store on S3", ("boto3",)),

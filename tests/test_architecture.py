@@ -46,6 +46,7 @@ IMPORTERS = {
         "catstream/numerics/threads.py",
         "catstream/applications/evaluation/peers.py",
         "services/detector_process.py",
+        "catstream/sinks/events.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
     "numba": ["catstream/features/kernels.py"],
@@ -65,6 +66,7 @@ IMPORTERS = {
         "catstream/wire/keys.py",
         "catstream/client/subscription.py",
     ],
+    "paho": ["catstream/sinks/mqtt_sink.py"],
     "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
@@ -91,7 +93,7 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py"),
+    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/sinks/events.py"),
     *("services/decisions.py", "services/control_commands.py"),
 ]
 
@@ -224,6 +226,7 @@ def test_every_dependency_has_an_entry():
     """The dependencies of pyproject.toml, and no others."""
     distributions = {
         "opencv-python-headless": "cv2",
+        "paho-mqtt": "paho",
         "prometheus-client": "prometheus_client",
         "pyzmq": "zmq",
         "scikit-learn": "sklearn",

@@ -19,12 +19,12 @@ from rich.text import Text
 from catstream.box import Box
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.view import PORT, Address, AddressType, with_token
-from catstream.cli.write import with_table
+from catstream.cli.write import check_used, with_sink_options, with_table
 from catstream.errors import require_extra
 from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted, doubtful, listed
 from catstream.pipeline import Pipeline
-from catstream.run.job import Results
+from catstream.run.job import Results, SinkOptions
 from catstream.run.state import contains_run
 from catstream.services.options import (
     FOLDER,
@@ -36,7 +36,7 @@ from catstream.services.options import (
     with_part,
     with_reading,
 )
-from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file
+from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file, shown
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SHORTEST_SECONDS = 1.0  # a shorter run is reported without its frames per second
@@ -48,6 +48,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @click.option("--output", type=PATH, help="Folder for the results.")
 @click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--write", multiple=True, metavar="DEST", help="Also write the tracks to DEST; may be repeated.")
+@with_sink_options
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
 @click.option(
@@ -105,14 +106,16 @@ def track(**options: Any) -> None:
       OUTPUT/NAME.mp4      with --video
 
     NAME is the name of the source, so that several sources can share a folder;
-    a/walk.mp4 and b/walk.mp4 need a folder each. `catstream export` makes MOT
-    text, the files of benchmarks, SQLite and Parquet from these.
+    a/walk.mp4 and b/walk.mp4 need a folder each. `catstream export` makes files
+    of annotation tools and benchmarks, and others, from these.
 
     --write DEST, may be repeated; the suffix selects the format
 
     {table}
 
-    Existing files are not replaced without --overwrite.
+    Existing files are not replaced without --overwrite. A destination on the
+    network that is away or slow does not slow the run down: what it misses is
+    counted. --zone and the options after it are for mqtt:// and http://.
 
     \b
     EXAMPLES
@@ -125,6 +128,8 @@ def track(**options: Any) -> None:
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
+      catstream track 0 --model walker.safetensors --write mqtt://10.0.0.7/yard \\
+                        --zone "door=300,80 420,80 420,400 300,400" --when lost=10,entered
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out --state checkpoints --continue
@@ -151,6 +156,7 @@ class _Run:
     output: Path | None
     video: bool
     write: tuple[str, ...]
+    options: SinkOptions
     overwrite: bool
     saved: dict[str, Path]
     view: Address | None
@@ -180,8 +186,8 @@ class _Run:
             interrupted = self._run(pipeline, files, progress, console)
         finally:
             if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
-                output = [] if files.output is None else [files.output]
-                console.print(progress.summary([*output, *map(Path, pipeline.results.write)]))
+                output = [] if files.output is None else [str(files.output)]
+                console.print(progress.summary([*output, *map(shown, pipeline.results.write)]))
         if self.resume is not None and not progress.frames and not interrupted:
             console.print(
                 f"no frames were left to track, the run in {self.resume} is complete: to track the source again, "
@@ -229,6 +235,7 @@ class _Run:
                 video=self.video,
                 write=tuple(str(Path(it).absolute()) if is_file(it) else it for it in self.write if it != STDOUT),
                 models={name: file.absolute() for name, file in self.saved.items()},
+                options=self.options,
             ),
         )
 
@@ -240,7 +247,10 @@ class _Run:
         if results.video and results.output is None:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
-        origin = Origin(pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys)
+        check_used(self.options, places)
+        origin = Origin(
+            pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys, options=results.options
+        )
         files = RunFiles(origin, results.output, places)
         files.check(overwrite=self.overwrite, earlier=places_of(pipeline.name, pipeline.earlier_results))
         for file in self.saved.values():
@@ -377,7 +387,7 @@ class RunProgress:
             figures += [f"{name or '(no name)'} {track.score:+.2f}" for name, track in tracks.items()]
         return "  ".join([*figures, f"{self._pipeline.health.get('compressor', {}).get('leaves', 0):.0f} leaves"])
 
-    def summary(self, results: Sequence[Path]) -> str:
+    def summary(self, results: Sequence[str]) -> str:
         """The closing lines of the run."""
         rate = f"first track after {self._first:.2f} s"
         if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
@@ -404,9 +414,8 @@ class RunProgress:
         if self._pipeline.restarts:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
         if results:
-            here = Path.cwd()
-            shown = (str(path.relative_to(here) if path.is_relative_to(here) else path) for path in results)
-            lines.append(f"results: {', '.join(shown)}")
+            here = f"{Path.cwd()}/"
+            lines.append(f"results: {', '.join(place.removeprefix(here) for place in results)}")
         return "\n".join(lines)
 
     def _detector(self, counter: str) -> float:

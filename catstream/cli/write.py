@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.console import Console
 
 from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
-from catstream.messages.names import counted, listed
-from catstream.services.options import PATH, with_overwrite
+from catstream.messages.names import counted, is_name, listed
+from catstream.run.job import SinkOptions
+from catstream.services.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, SINKS, Origin, TrackedFrame
-from catstream.sinks.track_log import is_log, read_frames
+from catstream.sinks.destinations import EXPORTS, SINKS, About, Origin, TrackedFrame
+from catstream.sinks.events import KINDS
+from catstream.sinks.track_log import LOGS, is_log, read_frames
+from catstream.video.source import open_source
 
 Command = Callable[..., Any]
 
@@ -35,13 +40,82 @@ def with_table(*, sinks: bool) -> Callable[[Command], Command]:
     return changed
 
 
+def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:
+    """The corners of the zones by name."""
+    zones: dict[str, Any] = {}
+    for text in texts:
+        name, _equals, corners = text.partition("=")
+        pairs = [corner.split(",") for corner in corners.split()]
+        try:
+            points = tuple((float(x), float(y)) for x, y in pairs)
+        except ValueError:
+            points = ()
+        if not (name and is_name(name) and name not in zones and len(points) > 2 and np.isfinite(points).all()):
+            raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three corners or more, got {text!r}')
+        zones[name] = points
+    return zones
+
+
+def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, ...], float]:
+    """The kinds of events, and the seconds of `lost`."""
+    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
+    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
+        raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
+    return tuple(kinds), NumberRange(0).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
+
+
+#: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
+with_sink_options = combined(
+    "options",
+    lambda zone, margin, when, rate, picture, secret: SinkOptions(
+        zone, margin, when[0], when[1], rate, picture, secret and secret.absolute()
+    ),
+    click.option(
+        "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A zone, by its corners in pixels."
+    ),
+    click.option(
+        "--zone-margin",
+        "margin",
+        type=NumberRange(0),
+        default=10,
+        metavar="PIXELS",
+        help="An object has left a zone if it is farther outside than this; 10 by default.",
+    ),
+    click.option(
+        "--when",
+        default=",".join(KINDS),
+        metavar="EVENT,...",
+        callback=_when,
+        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, by default 2.",
+    ),
+    click.option(
+        "--rate",
+        type=NumberRange(0, min_open=True),
+        default=1,
+        metavar="N",
+        help="To mqtt://: states of each object per second; 1 by default.",
+    ),
+    click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
+    click.option("--secret-file", "secret", type=PATH, help="File of a key, with which events to http:// are signed."),
+)
+
+
+def check_used(options: SinkOptions, places: Iterable[str]) -> None:
+    """Raise UsageError if options were given that none of the destinations has."""
+    if options != SinkOptions() and not any("://" in place for place in places):
+        raise click.UsageError(
+            "--zone, --when, --rate, --picture and --secret-file are for mqtt:// and http://: add one"
+        )
+
+
 @click.command()
 @click.argument("places", nargs=-1, required=True, metavar="DEST...")
 @with_overwrite
+@with_sink_options
 @with_endpoint
 @with_wait
 @with_table(sinks=True)
-def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wait: float) -> None:
+def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoint: str, keys: str, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives, and stays written however the command
@@ -52,16 +126,19 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
     {table}
 
     A video has the small pictures that the pipeline sends to its page, with
-    their tracks. For MOT text, a database and others: `catstream export`.
+    their tracks. For CVAT, COCO, MOT and others: `catstream export`.
 
     \b
     EXAMPLES
       catstream sink tracks.csv
       catstream sink tracks.ndjson walk.mp4 walk.mcap --endpoint run
       catstream sink - | jq .box
+      catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
+      catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
+    check_used(options, places)
     for place in places:
-        destinations.sink_of(place).load()
+        destinations.check_sink(place, options)
         if destinations.is_file(place):
             destinations.check_file(Path(place), may_exist=overwrite)
     written, reason, run = 0, "", ""
@@ -69,7 +146,7 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
-            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys)
+            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys, options=options)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
@@ -96,15 +173,22 @@ def sink(places: tuple[str, ...], overwrite: bool, endpoint: str, keys: str, wai
 @click.argument("log", type=PATH)
 @click.argument("dest", type=PATH)
 @click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
+@click.option(
+    "--size",
+    metavar="WIDTHxHEIGHT|SOURCE",
+    help="Size of the frames, or the video or folder of them; for coco, cvat and yolo, which cut boxes at its edges.",
+)
+@click.option("--label", default="", help="Class of all objects; by default, the name of each is its class.")
 @with_overwrite
 @with_table(sinks=False)
-def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
+def export(log: Path, dest: Path, name: str | None, size: str | None, label: str, overwrite: bool) -> None:
     """Make another format from the log of a run.
 
-    LOG is an .ndjson or .csv file of `catstream track` or `catstream sink`. The
+    LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream sink`. The
     extension of DEST selects the format, or --format, which a folder needs. A
     folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
-    that of LOG. Processing times are in .csv only.
+    that of LOG. Processing times are in .csv only, marks of doubtful boxes and
+    which object was given a name anew not in .csv.
 
     {table}
 
@@ -112,12 +196,23 @@ def export(log: Path, dest: Path, name: str | None, overwrite: bool) -> None:
     EXAMPLES
       catstream export out/walk.ndjson walk.sqlite
       catstream export out/walk.csv results --format otb
+      catstream export out/walk.ndjson walk.xml --size walk.mp4 --label person
+      catstream export out/walk.ndjson dataset --format yolo --size 640x360
     """
     row = destinations.export_of(dest, name)
     if not is_log(log) or not log.is_file():
-        raise VideoError(f"{log} is no log of a run: give an .ndjson or .csv file")
+        raise VideoError(f"{log} is no log of a run: give one of its files, {', '.join(LOGS)}")
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:
         destinations.check_file(dest, may_exist=overwrite, source=str(log))
-    destinations.export((frame for frame, _ in read_frames(log)), dest, row, log.stem)
+    about = About(log.stem, None if size is None else _size(size), label)
+    destinations.export((frame for frame, _ in read_frames(log)), dest, row, about)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Return the width and height that a text states, or those of the source that it names."""
+    if stated := re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text):
+        return int(stated[1]), int(stated[2])
+    with open_source(text) as source:
+        return source.size

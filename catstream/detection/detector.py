@@ -200,8 +200,10 @@ class Detector:
         box = state.window.box(self.settings.search.context) if reported else None
         present: State = "present" if version else "bootstrapping"
         shown: State = present if reported else "absent"
-        began = state.first_frame
-        track = Track(seq, seq - 1, time, shown, box, float(score), version, object=self.name, began=began)
+        began, doubtful = state.first_frame, state.level in ("weak", "redetected")
+        track = Track(
+            *(seq, seq - 1, time, shown, box, float(score), version), object=self.name, began=began, doubtful=doubtful
+        )
         return track, ObjectFeatures(box, training, state, begins=began == seq - 1)
 
 

@@ -281,6 +281,7 @@ class Track:
     object         name of the object; "" if it has none
     began          number of the object's first frame. If it differs from that of the track before, another object was
                    given this name, by a box or a saved model
+    doubtful       whether the box should be looked at: the level of belief is "weak" or "redetected"
 
     >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
@@ -296,6 +297,7 @@ class Track:
     pts: Number | None = None
     object: ObjectName = ""
     began: Integer = 0
+    doubtful: bool = False
 
     def __repr__(self) -> str:
         name = f"object={self.object!r}, " if self.object else ""
@@ -322,6 +324,7 @@ class Track:
             "pts": None if self.pts is None else float(self.pts),
             "object": self.object,
             "began": int(self.began),
+            "doubtful": bool(self.doubtful),
         }
 
 

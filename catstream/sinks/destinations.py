@@ -14,9 +14,10 @@ from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
-from catstream.errors import VideoError, require_extra
+from catstream.errors import VideoError, require_extra, without_password
 from catstream.messages.kinds import Track
 from catstream.messages.storage import why_not_writable, writing
+from catstream.run.job import SinkOptions
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 
@@ -49,6 +50,7 @@ class Origin:
     endpoint    of the running pipeline, for a sink that receives other messages, too
     keys        folder of the keys for this endpoint
     last        number of the last frame in the log of a run that is resumed; -1 for a new run
+    options     of the destinations, beside their addresses
     """
 
     source: str | None = None
@@ -57,13 +59,29 @@ class Origin:
     endpoint: str = ""
     keys: str = ""
     last: int = -1
+    options: SinkOptions = field(default_factory=SinkOptions)
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What an export has to know beside the tracks.
+
+    name   that of the log, for the files in a folder
+    size   width and height of a frame in pixels; None if it is not known
+    label  the class of all objects; empty if the name of each is its class
+    """
+
+    name: str
+    size: tuple[int, int] | None = None
+    label: str = ""
 
 
 class Sink(Protocol):
     """Takes the frames in their order; made as `Class(place, origin)`.
 
     A sink may have the attribute `last`, the number of the last frame that it holds, -1 for none: when a run is
-    resumed, it gets all later frames of the log first.
+    resumed, it gets all later frames of the log first. Its class may have a function `check(place, options)`, which
+    raises VideoError before the run if the address or an option is not valid.
     """
 
     def write(self, frame: TrackedFrame) -> None:
@@ -77,9 +95,10 @@ class Sink(Protocol):
 class Row:
     """A row of the table.
 
-    home     the class of a sink, or the function `export(frames, path, name)`
+    home     the class of a sink, or the function `export(frames, path, about)`
     meaning  a line of the help
     suffix   of the file of an export; empty for a folder
+    sized    whether an export needs the size of a frame
     extra    the extra that it needs
     repeats  whether a sink can be continued, or made again from the log, when a run is resumed
     """
@@ -87,6 +106,7 @@ class Row:
     home: str
     meaning: str
     suffix: str = ""
+    sized: bool = False
     extra: str = ""
     repeats: bool = True
 
@@ -103,17 +123,28 @@ SINKS = {
     ".ndjson": Row("track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
     STDOUT: Row("track_log.StdoutSink", "the same, on standard output", repeats=False),
     ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
     ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    "rtsp://": Row("restream.StreamSink", "the pictures with their boxes, live, to an RTSP server, as H.264"),
+    "rtmp://": Row("restream.StreamSink", "the same to an RTMP server"),
     ".mcap": Row(
         "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
     ),
+    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker", extra="mqtt"),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt"),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
+    "https://": Row("webhook.Webhook", "the same with TLS"),
 }
 
 #: Name of a format -> the export.
 EXPORTS = {
     "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
-    "sqlite": Row("exports.write_sqlite", "the table tracks of a database", ".sqlite"),
+    "sqlite": Row("database.write_sqlite", "the table tracks of a database", ".sqlite"),
     "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
+    "coco": Row("annotations.write_coco", "COCO, with the tracks and the video as in TAO", ".json", sized=True),
+    "cvat": Row("annotations.write_cvat", "CVAT for video 1.1", ".xml", sized=True),
+    "yolo": Row("annotations.write_yolo", "a folder: a file of labels for each frame, and data.yaml", sized=True),
+    "via": Row("annotations.write_via", "VIA tracks, which movement and napari open", ".via.csv"),
     "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB"),
     "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k"),
     "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment"),
@@ -126,15 +157,15 @@ def sink_of(place: str) -> Row:
     row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
     if row is None:
         raise VideoError(
-            f"{place} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where - is "
-            "standard output; for other formats use catstream export"
+            f"{shown(place)} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where "
+            "- is standard output; for other formats use catstream export"
         )
     return row
 
 
 def export_of(path: Path, name: str | None) -> Row:
     """Return the row of an export, by its name, or else by the suffix; raises VideoError if that selects not one."""
-    rows = [row for row in EXPORTS.values() if row.suffix and row.suffix == path.suffix]
+    rows = [row for row in EXPORTS.values() if row.suffix and path.name.endswith(row.suffix)]
     if name is None and len(rows) != 1:
         raise VideoError(f"the format of {path} is not known: give --format, one of {', '.join(EXPORTS)}")
     return rows[0] if name is None else EXPORTS[name]
@@ -158,21 +189,46 @@ def check_file(path: Path, *, may_exist: bool, source: str = "", made: Path | No
         raise VideoError(reason)
 
 
+def check_sink(place: str, options: SinkOptions) -> None:
+    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid."""
+    home = sink_of(place).load()
+    if hasattr(home, "check"):
+        home.check(place, options)
+
+
+def shown(place: str) -> str:
+    """Return a destination as messages name it: an address without its password, of a webhook its host alone.
+
+    >>> shown("mqtt://me:secret@10.0.0.7/yard"), shown("https://example.com/hooks/T0/B0/secret"), shown("a@b:c.csv")
+    ('mqtt://10.0.0.7/yard', 'https://example.com/...', 'a@b:c.csv')
+    """
+    if is_file(place):
+        return place
+    address = without_password(place)
+    scheme, _, rest = address.partition("://")
+    return f"{scheme}://{rest.partition('/')[0]}/..." if scheme in ("http", "https") else address
+
+
 def open_sink(place: str, origin: Origin) -> Sink:
     """Open the sink of a destination; raises VideoError or MissingExtraError if that is not possible."""
     return cast(Sink, sink_of(place).load()(place, origin))
 
 
-def export(frames: Iterable[TrackedFrame], path: Path, row: Row, name: str) -> None:
+def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -> None:
     """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
 
-    They are named after `name`, that of the log. Raises VideoError if they cannot be written.
+    Raises VideoError if they cannot be written, or if the size of a frame is needed and not known.
     """
-    make: Callable[[Iterable[TrackedFrame], Path, str], None] = row.load()
+    make: Callable[[Iterable[TrackedFrame], Path, About], None] = row.load()
+    if row.sized and about.size is None:
+        raise VideoError(
+            f"this format needs the size of a frame, for {path}: give --size WIDTHxHEIGHT, or --size SOURCE with the "
+            "video or folder that was tracked"
+        )
     part = path.with_name(f"{path.name}.part")
     with writing(path, VideoError):
         try:
-            make(frames, part if row.suffix else path, name)
+            make(frames, part if row.suffix else path, about)
             if row.suffix:
                 part.replace(path)
         finally:

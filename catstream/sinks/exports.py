@@ -1,20 +1,17 @@
-"""Formats that are made from a log: text files of the benchmarks' toolkits, and the tables of a database."""
+"""Formats that are made from a log: text files of the benchmarks' toolkits, and a column store."""
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Iterable, Iterator
-from contextlib import closing
+from collections.abc import Iterable
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from catstream.errors import VideoError
 from catstream.numerics.arrays import Float64
-from catstream.sinks.destinations import TrackedFrame
+from catstream.sinks.database import COLUMNS, rows
+from catstream.sinks.destinations import About, TrackedFrame
 
 #: Layout -> the files of boxes, scores and times of an object, in the folder of the results; NAME is that of the log,
 #: or NAME-OBJECT. The toolkits of got10k (which has OTB, too) and VOT read them.
@@ -24,13 +21,6 @@ LAYOUTS = {
     "vot": ("{0}/{0}_001.txt", "{0}/{0}_001_confidence.value", "{0}/{0}_001_time.value"),
 }
 
-#: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
-#: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.
-_COLUMNS = {
-    **{"frame": "INTEGER NOT NULL", "seq": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
-    **{"x": "REAL", "y": "REAL", "w": "REAL", "h": "REAL", "score": "REAL NOT NULL"},
-    **{"model_version": "INTEGER NOT NULL", "pts": "REAL", "object": "TEXT NOT NULL"},
-}
 _BATCH = 65536  # rows in memory at once
 
 
@@ -50,7 +40,7 @@ def write_layout(
             np.savetxt(file, column, fmt=form, delimiter=",")
 
 
-def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
+def write_mot(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
     """Write boxes as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
 
     Frames, ids and pixels count from 1 there. The first object that appears has the id 1, and a name keeps its id. A
@@ -66,44 +56,21 @@ def write_mot(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
                 file.write(f"{track.frame + 1},{number},{box},{track.score:.4f},-1,-1,-1\n")
 
 
-def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
-    """Write the table `tracks` of a database."""
-    columns = ", ".join(f"{name} {kind}" for name, kind in _COLUMNS.items())
-    path.unlink(missing_ok=True)  # left by a process that was killed
-    try:
-        with closing(sqlite3.connect(path)) as database, database:
-            database.execute(f"CREATE TABLE tracks ({columns}, PRIMARY KEY (frame, object)) STRICT")
-            marks = ", ".join("?" for _ in _COLUMNS)
-            database.executemany(f"INSERT INTO tracks VALUES ({marks})", _rows(frames))  # nosec B608
-    except sqlite3.Error as error:
-        raise VideoError(f"cannot write {path}: {error}") from None
-
-
-def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: str) -> None:
-    """Write the columns of the same table, which pyarrow, pandas, DuckDB and Spark read."""
+def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
+    """Write the columns of the table `tracks` of a database, which pyarrow, pandas, DuckDB and Spark read."""
     import pyarrow as arrow
     import pyarrow.parquet
 
     kinds = {"INTEGER": arrow.int64(), "REAL": arrow.float64(), "TEXT": arrow.string()}
-    schema = arrow.schema([(name, kinds[kind.split()[0]]) for name, kind in _COLUMNS.items()])
-    rows = _rows(frames)
+    schema = arrow.schema([(name, kinds[kind.split()[0]]) for name, kind in COLUMNS.items()])
+    found = rows(frames)
     with arrow.parquet.ParquetWriter(path, schema) as writer:
-        while batch := [*islice(rows, _BATCH)]:
+        while batch := [*islice(found, _BATCH)]:
             columns = zip(zip(*batch, strict=True), schema.types, strict=True)
             writer.write_batch(arrow.record_batch([arrow.array(*column) for column in columns], schema=schema))
 
 
-def _rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of the table, in the order of the log."""
-    for track in (track for frame in frames for track in frame.tracks):
-        box = track.box or [None] * 4
-        yield (
-            *(track.frame, track.seq, track.time, track.state, *box, track.score),
-            *(track.model_version, track.pts, track.object),
-        )
-
-
-def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, name: str) -> None:
+def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
     """Write the files of each object; those of times only if the log has them, as a CSV file has."""
     rows: dict[str, dict[int, tuple[float, ...]]] = {}
     times: dict[int, float] = {}
@@ -116,7 +83,7 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, na
         table[list(found), :5] = list(found.values())
         table[list(times), 5] = list(times.values())
         seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
-        whole = f"{name}-{thing}" if thing else name
+        whole = f"{about.name}-{thing}" if thing else about.name
         write_layout(layout, folder, whole, table[:, :4], table[:, 4], seconds)
 
 

@@ -25,7 +25,8 @@ from catstream.messages.kinds import State, Track
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing
 from catstream.run.job import Results
-from catstream.sinks.destinations import Origin, TrackedFrame, check_file, is_file, open_sink, sink_of
+from catstream.sinks.database import read_database
+from catstream.sinks.destinations import Origin, TrackedFrame, check_file, check_sink, is_file, open_sink, sink_of
 from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
@@ -141,14 +142,20 @@ class CsvSink(LineSink):
 
 _LOGS: dict[str, type[LineSink]] = {".ndjson": NdjsonSink, ".csv": CsvSink}
 
+#: The suffixes of all logs; of several, a run is continued after the first one that exists.
+LOGS = (".ndjson", ".sqlite", ".csv")
+
 
 def is_log(path: Path) -> bool:
     """Return whether a file of this name has all tracks of a run, and can be read and continued."""
-    return path.suffix in _LOGS
+    return path.suffix in LOGS
 
 
 def read_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
     """Yield each frame of a log, and the byte at which it ends, up to the first line that is incomplete."""
+    if path.suffix == ".sqlite":
+        yield from ((frame, 0) for frame in read_database(path))
+        return
     kind = _LOGS[path.suffix]
     tracks: list[Track] = []
     seconds = nan
@@ -194,9 +201,9 @@ def places_of(name: str, results: Results) -> list[str]:
 class RunFiles:
     """All destinations of a run.
 
-    A resumed run continues after the last frame that its log holds whole: an NDJSON file, which has all digits, or else
-    a CSV file. All its logs are cut after that frame; one that is shorter or new gets the frames that it lacks from the
-    first one, and a video is drawn again.
+    A resumed run continues after the last frame that its log holds whole: an NDJSON file or a database, which have all
+    digits, or else a CSV file. All its logs are cut after that frame; one that is shorter or new gets the frames that
+    it lacks from the first one, and a video is drawn again.
 
     origin  the source of the run, and the frames that are tracked
     output  folder of the results, which is made; None for none
@@ -215,8 +222,8 @@ class RunFiles:
         source = self.origin.source or ""
         for place in self.places:
             row = sink_of(place)
-            row.load()
-            if place.endswith(".mp4") and is_live(source):
+            check_sink(place, self.origin.options)
+            if is_file(place) and place.endswith(".mp4") and is_live(source):
                 raise VideoError(
                     f"a video needs its frames once more, but {without_password(source)} is live: omit the video"
                 )
@@ -264,4 +271,4 @@ class RunFiles:
     def _log(self) -> Path | None:
         """Return the log that is continued, None if there is to be none."""
         logs = (Path(place) for place in self.places if is_log(Path(place)))
-        return min(logs, key=lambda log: (not log.exists(), log.suffix == ".csv"), default=None)
+        return min(logs, key=lambda log: (not log.exists(), LOGS.index(log.suffix)), default=None)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 
+import numpy as np
+
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
@@ -53,43 +55,57 @@ class SourceVideo:
         self._video.close()
 
 
-class PictureVideo:
-    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
+class DrawnPictures:
+    """The small pictures that a running pipeline sends, with their tracks drawn in."""
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self._place = place
+    def __init__(self, origin: Origin) -> None:
         self._previews = subscribe(origin.endpoint, "previews", timeout=0, keys=origin.keys)
         self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
         self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
-        self._video: VideoWriter | None = None
         self._colours = Colours()
 
-    def write(self, frame: TrackedFrame) -> None:
-        """Keep the tracks, and draw a picture whose frame is over."""
+    def take(self, frame: TrackedFrame) -> tuple[np.ndarray, float] | None:
+        """Keep the tracks; return a picture whose frame is over, uint8 (h, w, 3) BGR, and its time, if there is one."""
         self._tracks.setdefault(frame.number, []).extend(frame.tracks)
         if len(self._tracks) > _KEPT_FRAMES:
             del self._tracks[next(iter(self._tracks))]
         if self._picture is None:
             with suppress(SilenceError):
                 self._picture = next(self._previews, None)
-        if self._picture is not None and self._picture.frame < frame.number:
-            self._draw(self._picture)
-            self._picture = None
+        if self._picture is None or self._picture.frame >= frame.number:
+            return None
+        picture, self._picture = self._picture, None
+        tracks = self._tracks.get(picture.frame, [])
+        image = preview_image(picture, tracks, self._colours) if tracks else None
+        if image is None:
+            return None
+        self._colours.keep(track.object for track in tracks)
+        return image, tracks[0].time
+
+    def close(self) -> None:
+        """Receive no more pictures: the pipeline makes none if nobody does."""
+        self._previews.close()
+
+
+class PictureVideo:
+    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._place, self._pictures = place, DrawnPictures(origin)
+        self._video: VideoWriter | None = None
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Write a picture whose frame is over."""
+        if (drawn := self._pictures.take(frame)) is not None:
+            image, time = drawn
+            self._video = self._video or VideoWriter(self._place, RATE, (image.shape[1], image.shape[0]))
+            self._video.write(image, time)
 
     def close(self) -> None:
         """Finish the video."""
-        self._previews.close()
+        self._pictures.close()
         if self._video is None:
             raise VideoError(
                 f"{self._place} was not written: the pipeline sent no picture of a frame that was received"
             )
         self._video.close()
-
-    def _draw(self, picture: Preview) -> None:
-        tracks = self._tracks.get(picture.frame, [])
-        image = preview_image(picture, tracks, self._colours) if tracks else None
-        if image is not None:
-            self._colours.keep(track.object for track in tracks)
-            if self._video is None:
-                self._video = VideoWriter(self._place, RATE, (image.shape[1], image.shape[0]))
-            self._video.write(image, tracks[0].time)

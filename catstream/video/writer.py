@@ -1,4 +1,4 @@
-"""Writes videos frame by frame."""
+"""Writes videos frame by frame, to a file or to a server."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from time import monotonic
 from typing import Any, Self
 
 import cv2
@@ -67,16 +68,11 @@ class VideoWriter:
 
         The first time stamp, in seconds of the source, is the start of the video. Without them, the rate is constant.
         """
-        import av
-
         time = self.frames / float(self._rate) if time is None else time
         self._first_time = self._first_time if self.frames else time
         # Time stamps must increase, even if those of the source do not.
         self._last_tick = max(self._last_tick + 1, round((time - self._first_time) * self._rate * _TICKS_PER_FRAME))
-        down, across = self._stream.height - image.shape[0], self._stream.width - image.shape[1]
-        even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
-        frame = av.VideoFrame.from_ndarray(even, format="bgr24")
-        frame.pts, frame.time_base = self._last_tick, self._stream.codec_context.time_base
+        frame = _frame(image, self._stream, self._last_tick)
         with self._reporting_errors():
             self._container.mux(self._stream.encode(frame))
         self.frames += 1
@@ -111,3 +107,56 @@ class VideoWriter:
         if kind is not None:
             self.frames = 0
         self.close()
+
+
+class LiveWriter:
+    """Pushes pictures to an RTSP or RTMP server as H.264, each at the time at which it is written; close it.
+
+    FFmpeg blocks all threads of the process while it connects to a server, and `write` blocks while the server is slow.
+    VideoError from the constructor if this FFmpeg has no encoder, from `write` if the server does not take a picture.
+    """
+
+    def __init__(self, address: str, size: tuple[int, int]) -> None:
+        import av
+
+        if "libx264" not in av.codecs_available:
+            raise VideoError("this FFmpeg has no encoder for H.264: install the package av from PyPI")
+        rtsp = address.startswith("rtsp")
+        # TCP, which passes firewalls and loses nothing; the time-out is in microseconds.
+        options = {"rtsp_transport": "tcp", "timeout": "3000000"} if rtsp else {}
+        self._container = av.open(address, "w", format="rtsp" if rtsp else "flv", container_options=options)
+        # A key frame in every 20 pictures: a viewer who joins waits for one.
+        encoding = {"preset": "veryfast", "tune": "zerolatency", "crf": "23", "g": "20"}
+        self._stream: Any = self._container.add_stream("libx264", rate=10, options=encoding)
+        self._stream.codec_context.time_base = Fraction(1, 1000)
+        self._stream.thread_count, self._stream.pix_fmt = 1, "yuv420p"
+        self._stream.width, self._stream.height = (side + side % 2 for side in size)
+        self._started, self._last_tick = monotonic(), -1
+
+    def write(self, image: np.ndarray) -> None:
+        """Push a picture, uint8 (h, w, 3), blue green red, of the size given to the constructor."""
+        import av
+
+        self._last_tick = max(self._last_tick + 1, round(1000 * (monotonic() - self._started)))
+        try:
+            self._container.mux(self._stream.encode(_frame(image, self._stream, self._last_tick)))
+        except (OSError, av.FFmpegError) as error:
+            raise VideoError((error.strerror or str(error)).lower()) from None
+
+    def close(self) -> None:
+        """Disconnect."""
+        import av
+
+        with contextlib.suppress(OSError, av.FFmpegError):
+            self._container.close()
+
+
+def _frame(image: np.ndarray, stream: Any, tick: int) -> Any:
+    """Return an image as a frame of a stream, at this tick of its time base. An odd side is padded by one pixel."""
+    import av
+
+    down, across = stream.height - image.shape[0], stream.width - image.shape[1]
+    even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
+    frame = av.VideoFrame.from_ndarray(even, format="bgr24")
+    frame.pts, frame.time_base = tick, stream.codec_context.time_base
+    return frame

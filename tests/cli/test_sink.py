@@ -103,6 +103,13 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, 
         succeed("export", log, tmp_path / "otb", "--format", "otb")
     for name in ("demo.txt", "demo_confidence.value", "times/demo_time.txt"):
         assert len((tmp_path / "otb" / name).read_text().splitlines()) == 32
+    for size in ("320x240", whole_run / "out" / "demo.mp4"):  # the second one has a line of text below
+        succeed("export", log, tmp_path / "t.json", "--size", size, "--label", "person", "--overwrite")
+        coco = json.loads((tmp_path / "t.json").read_text())
+        assert [each["name"] for each in coco["categories"]] == ["person"]
+        assert (len(coco["images"]), coco["images"][0]["width"]) == (32, 320)
+    assert "give --size" in fail("export", log, tmp_path / "t.xml")
+    assert "there is no video or folder" in fail("export", log, tmp_path / "t.xml", "--size", tmp_path / "none.mp4")
     assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
 
 

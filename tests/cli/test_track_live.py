@@ -15,6 +15,7 @@ from catstream.box import Box
 from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
 from catstream.video.rendered import render
+from catstream.video.source import open_source
 
 PYTHON = Path("/usr/bin/python3")  # the one that Debian's packages are for
 SERVER = Path(__file__).with_name("rtsp_server.py")
@@ -40,10 +41,10 @@ def rtsp(story, tmp_path):
         cv2.imwrite(str(folder / f"{number:05d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
     with ExitStack() as stack:
 
-        def start(port=0):
+        def start(port=0, *record):
             if not PYTHON.exists():
                 pytest.skip(HOW_TO_GET_IT)
-            process = subprocess.Popen([PYTHON, SERVER, folder, str(port)], stdout=subprocess.PIPE, text=True)
+            process = subprocess.Popen([PYTHON, SERVER, folder, str(port), *record], stdout=subprocess.PIPE, text=True)
             stack.callback(process.communicate)
             stack.callback(process.kill)
             if said := process.stdout.readline():
@@ -82,11 +83,11 @@ def following(catstream, story, tmp_path):
     """Follows the object of the story in a stream."""
 
     @contextmanager
-    def start(url):
+    def start(url, *more):
         output, place = tmp_path / "out", tmp_path / "run"
         with subscribe(str(place), "health", timeout=60) as health:
             box = ",".join(map(str, story[0][1]))
-            command = ("track", url, "--box", box, "--output", output, "--set", f"run.endpoint={place}")
+            command = ("track", url, "--box", box, "--output", output, "--set", f"run.endpoint={place}", *more)
             yield Run(catstream(*command), output, health)
 
     return start
@@ -120,6 +121,44 @@ def test_tracking_resumes_with_the_learned_model_after_a_server_freezes_and_dies
     versions = [int(row["model_version"]) for row in rows]
     assert versions == sorted(versions), "what was learned is kept"
     assert sum(found(row, story) for row in rows[-20:]) > 15
+
+
+@pytest.mark.system
+def test_a_run_goes_on_while_the_server_for_its_pictures_is_away_slow_and_back(
+    rtsp, camera, following, story, catstream, tmp_path
+):
+    def taken(name):
+        file = tmp_path / "story" / name
+        return lambda _: file.exists() and file.stat().st_size > 20000
+
+    cam = camera(lambda number: story[number % len(story)][0])
+    server, port = rtsp(0, "none")
+    server.kill()  # its port is free
+    server.wait()
+    place = f"rtsp://127.0.0.1:{port}/one"
+    with following(cam.url, "--write", place) as run:
+        run.until(lambda counters: counters["sent"] > 60)
+        server, _ = rtsp(port, "first")
+        sent = run.until(taken("first"))["sent"]
+        server.send_signal(signal.SIGSTOP)
+        run.until(lambda counters: counters["sent"] > sent + 200)
+        server.kill()
+        server.wait()
+        rtsp(port, "second")
+        run.until(taken("second"))
+        _, other = rtsp(0, "third")
+        beside = catstream("sink", f"rtsp://127.0.0.1:{other}/one", "--endpoint", tmp_path / "run")
+        run.until(taken("third"))
+        beside.send_signal(signal.SIGINT)
+        assert "frames passed while it was away or slow" in beside.communicate(timeout=60)[1]
+        rows, errors = run.stopped()
+    for name in ("first", "second", "third"):
+        with open_source(tmp_path / "story" / name) as frames:
+            assert next(iter(frames)).image.shape == (260, 320, 3), "the picture, and a line of text"
+    assert f"{place}: not connected (Connection refused), it is tried again" in errors
+    assert f"{place}: is back" in errors
+    assert re.search(rf"{place}: \d+ frames passed while it was away or slow", errors)
+    assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
 
 
 def test_a_restarted_detector_follows_a_stream_over_http_also_if_its_frames_have_another_size(camera, following, story):

@@ -123,12 +123,14 @@ def test_each_frame_that_scm_follows_is_learned_from_whatever_its_score(scene):
 
 @pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
-def test_a_redetected_object_is_learned_from_only_if_it_is_trusted(scene, trust, teaches, detection):
+def test_a_redetected_object_is_learned_from_only_if_it_is_trusted_and_is_doubtful_otherwise(
+    scene, trust, teaches, detection
+):
     detector = started(scene, {"belief.trusted_score": trust, "search.mode": detection})
     detector.step(scene())
-    _, features = detector.step(scene((250, 180)))
+    track, features = detector.step(scene((250, 180)))
     assert features.box.overlap(Box(250, 180, 48, 40)) > 0.6
-    assert bool(features.training) == teaches
+    assert (bool(features.training), track.doubtful) == (teaches, not teaches)
 
 
 def test_older_models_are_ignored(scene):

@@ -14,15 +14,18 @@ from hypothesis import strategies as st
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError
 from catstream.messages import storage
-from catstream.run.job import Job, Results
+from catstream.run.job import Job, Results, SinkOptions
 from catstream.run.state import files, locked, restore
 from catstream.settings import Settings
 
-JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240))
+JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240),
+          results=Results(write=("mqtt://me:secret@10.0.0.7/yard",)))  # fmt: skip
 
 numbers = st.none() | st.integers(0, 10**6) | st.integers(0, 10**6).map(np.int64)
 paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
 model_files = st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path))
+zones = st.dictionaries(st.sampled_from(["door", "yard"]), st.just(((0.0, 1.5), (2.0, 3.0), (4.0, 5.0))))
+options = st.builds(SinkOptions, zones, events=st.just(("lost",)), key=paths)
 jobs = st.builds(
     Job,
     source=st.text(),
@@ -31,7 +34,7 @@ jobs = st.builds(
     part=st.builds(slice, numbers, numbers, numbers),
     settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
-    results=st.builds(Results, paths, st.booleans(), st.lists(st.text(min_size=1)).map(tuple), model_files),
+    results=st.builds(Results, paths, st.booleans(), st.lists(st.text(min_size=1)).map(tuple), model_files, options),
     state=paths,
     since=st.none() | st.floats(0, 1e9),
     resume=st.booleans(),
@@ -137,3 +140,9 @@ def test_the_files_of_a_state_are_restored_with_the_models_that_are_searched_for
     assert sorted(content) == names
     restore(tmp_path / "new", content)
     assert all((tmp_path / "new" / name).read_text() == name for name in names)
+
+
+def test_a_resumed_run_keeps_the_options_of_its_destinations_unless_some_are_given():
+    earlier = Results(write=("mqtt://host/yard",), options=SinkOptions(rate=5.0))
+    assert Results().after(earlier) == earlier
+    assert Results(options=SinkOptions(events=("lost",))).after(earlier).options == SinkOptions(events=("lost",))

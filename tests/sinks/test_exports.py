@@ -1,23 +1,29 @@
 """Formats that are made from a log."""
 
+import csv
 import sqlite3
+from ast import literal_eval
 from contextlib import closing
 from math import nan
+from pathlib import Path
+from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 import pytest
+from pycocotools.coco import COCO
 
 from catstream.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Origin, TrackedFrame, export, export_of, open_sink
+from catstream.sinks.destinations import About, Origin, TrackedFrame, export, export_of, open_sink
 
 BOX = Box(10.0, 20.0, 30.5, 40.0)
 
 
-def present(frame, name, box=BOX):
+def present(frame, name, box=BOX, **fields):
     state = "present" if box else "absent"
-    return Track(frame + 1, frame, frame / 25, state, box, 0.75, 4, 17.5 if frame else None, object=name)
+    return Track(frame + 1, frame, frame / 25, state, box, 0.75, 4, 17.5 if frame else None, name, **fields)
 
 
 LOG = [
@@ -27,8 +33,18 @@ LOG = [
 ]
 
 
-def made(path, name=None, log=LOG):
-    export(iter(log), path, export_of(path, name), "walk")
+#: The object without a name is doubtful, then leaves and is back; anna is half outside, then another one has her name.
+ANNOTATED = [
+    TrackedFrame([present(0, ""), present(0, "anna", Box(-10.0, 20.0, 30.0, 40.0))]),
+    TrackedFrame([present(1, "", doubtful=True), present(1, "anna", Box(-30.0, 20.0, 30.0, 40.0))]),
+    TrackedFrame([present(2, "", None), present(2, "anna", began=2)]),
+    TrackedFrame([present(3, ""), present(3, "anna", None, began=2)]),
+]
+CUT = [0.0, 20.0, 20.0, 40.0]
+
+
+def made(path, name=None, log=LOG, **about):
+    export(iter(log), path, export_of(path, name), About("walk", **about))
     return path
 
 
@@ -72,13 +88,101 @@ def test_a_database_and_a_parquet_file_have_a_row_for_each_track(tmp_path):
         assert [tuple(row.values()) for row in table.to_pylist()] == everything.fetchall()
 
 
+def test_coco_has_tracks_and_cuts_boxes_at_the_edges_of_the_frame(tmp_path):
+    coco = COCO(made(tmp_path / "t.json", log=ANNOTATED, size=(100, 80)))
+    assert [(each["id"], each["file_name"], each["width"]) for each in coco.loadImgs(coco.getImgIds())] == [
+        (number + 1, f"walk_{number:06d}.jpg", 100) for number in range(4)
+    ]
+    assert coco.loadCats(coco.getCatIds()) == [{"id": 1, "name": "object"}, {"id": 2, "name": "anna"}]
+    boxes = coco.loadAnns(coco.getAnnIds())
+    assert [(each["image_id"], each["category_id"], each["track_id"], each["bbox"]) for each in boxes] == [
+        (1, 1, 1, [*BOX]), (1, 2, 2, CUT), (2, 1, 1, [*BOX]), (3, 2, 3, [*BOX]), (4, 1, 1, [*BOX]),
+    ]  # fmt: skip
+    assert [each["attributes"]["doubtful"] for each in boxes] == [False, False, True, False, False]
+    assert (boxes[1]["area"], boxes[1]["score"], boxes[1]["iscrowd"]) == (800.0, 0.75, 0)
+    (video,) = coco.dataset["videos"]
+    assert {each["video_id"] for name in ("images", "tracks", "annotations") for each in coco.dataset[name]} == {1}
+    assert (video["id"], [each["id"] for each in coco.dataset["tracks"]]) == (1, [1, 2, 3])
+
+
+def test_cvat_has_a_key_frame_for_each_box_and_one_outside_where_the_object_disappears(tmp_path):
+    root = ElementTree.parse(made(tmp_path / "t.xml", log=ANNOTATED, size=(100, 80))).getroot()
+    assert (root.tag, root.findtext("version"), root.findtext("meta/task/mode")) == (
+        "annotations",
+        "1.1",
+        "interpolation",
+    )
+    assert [label.text for label in root.iterfind("meta/task/labels/label/name")] == ["object", "anna"]
+    found = {
+        (track.get("id"), track.get("label")): [
+            (int(box.get("frame")), box.get("outside"), box.findtext("attribute[@name='doubtful']")) for box in track
+        ]
+        for track in root.iterfind("track")
+    }
+    assert found == {
+        ("0", "object"): [(0, "0", "false"), (1, "0", "true"), (2, "1", "true"), (3, "0", "false")],
+        ("1", "anna"): [(0, "0", "false"), (1, "1", "false")],
+        ("2", "anna"): [(2, "0", "false"), (3, "1", "false")],
+    }
+    assert [root.findtext(f"meta/task/original_size/{side}") for side in ("width", "height")] == ["100", "80"]
+    box = root.find("track/box")
+    assert [float(box.get(side)) for side in ("xtl", "ytl", "xbr", "ybr")] == [10.0, 20.0, 40.5, 60.0]
+    assert (box.get("keyframe"), box.get("occluded"), box.get("z_order")) == ("1", "0", "0")
+
+
+def test_yolo_has_a_file_for_each_frame_with_centres_in_parts_of_it(tmp_path):
+    folder = made(tmp_path / "set", "yolo", [*ANNOTATED[:2], TrackedFrame([present(2, "", None)])], size=(100, 80))
+    object_line, half = "0 0.252500 0.500000 0.305000 0.500000\n", "1 0.100000 0.500000 0.200000 0.500000\n"
+    assert {file.name: file.read_text() for file in (folder / "labels").iterdir()} == {
+        "walk_000000.txt": object_line + half,
+        "walk_000001.txt": object_line,
+        "walk_000002.txt": "",
+    }
+    assert (folder / "data.yaml").read_text().endswith('names:\n  0: "object"\n  1: "anna"\n')
+
+
+def test_the_reader_of_supervision_finds_the_boxes_of_yolo(tmp_path):
+    supervision = pytest.importorskip("supervision", reason="no supervision: pip install supervision")
+    folder = made(tmp_path / "set", "yolo", ANNOTATED, size=(100, 80), label="person")
+    (folder / "images").mkdir()
+    for number in range(4):
+        cv2.imwrite(str(folder / "images" / f"walk_{number:06d}.jpg"), np.zeros((80, 100, 3), np.uint8))
+    images, labels, names = (str(folder / name) for name in ("images", "labels", "data.yaml"))
+    read = supervision.DetectionDataset.from_yolo(images, labels, names)
+    assert read.classes == ["person"]
+    boxes = {Path(path).stem[-1]: found.xyxy.round(2).tolist() for path, _, found in read}
+    assert boxes["0"] == [[10.0, 20.0, 40.5, 60.0], [0.0, 20.0, 20.0, 60.0]]
+    assert [len(boxes[number]) for number in "0123"] == [2, 1, 1, 1]
+
+
+def test_via_has_a_row_for_each_box_as_movement_reads_it(tmp_path):
+    with made(tmp_path / "t.via.csv", log=ANNOTATED).open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header == [
+        *("filename", "file_size", "file_attributes", "region_count"),
+        *("region_id", "region_shape_attributes", "region_attributes"),
+    ]
+    assert rows[1][:2] + rows[1][3:5] == ["walk_000000.jpg", "-1", "2", "1"]
+    file, shape, region = (literal_eval(rows[2][column]) for column in (2, 5, 6))  # movement reads Python's literals
+    assert (file, shape) == ({"frame": 1}, {"name": "rect", "x": 10.0, "y": 20.0, "width": 30.5, "height": 40.0})
+    assert region == {"track": 1, "confidence": 0.75, "class": "object", "doubtful": 1}
+    assert [literal_eval(row[6])["track"] for row in rows] == [1, 2, 1, 2, 3, 1]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("t.json", None), ("t.xml", None), ("folder", "yolo")])
+def test_a_format_that_needs_the_size_of_a_frame_asks_for_it(tmp_path, name, kind):
+    with pytest.raises(VideoError, match="give --size WIDTHxHEIGHT"):
+        made(tmp_path / name, kind)
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.parametrize("disk", [1 << 16], indirect=True)
-@pytest.mark.parametrize("suffix", [".txt", ".sqlite", ".parquet"])
+@pytest.mark.parametrize("suffix", [".txt", ".sqlite", ".parquet", ".json", ".xml", ".via.csv"])
 def test_a_file_for_which_the_disk_has_no_room_is_an_error_and_the_one_before_is_kept(disk, suffix):
     (disk / f"t{suffix}").write_text("dear to somebody")
     (disk / "ballast").write_bytes(bytes((1 << 16) - 4096))
     with pytest.raises(VideoError, match="cannot write"):
-        made(disk / f"t{suffix}", log=[TrackedFrame([present(frame, "")]) for frame in range(999)])
+        made(disk / f"t{suffix}", log=[TrackedFrame([present(frame, "")]) for frame in range(999)], size=(100, 80))
     assert {file.name for file in disk.iterdir()} == {"ballast", f"t{suffix}"}
     assert (disk / f"t{suffix}").read_text() == "dear to somebody"
 
@@ -89,6 +193,6 @@ def test_a_name_that_does_not_say_the_format_needs_the_option(tmp_path, name):
         export_of(tmp_path / name, None)
 
 
-def test_a_log_is_continued_by_no_export_and_an_export_is_no_sink(tmp_path):
+def test_an_export_is_no_sink(tmp_path):
     with pytest.raises(VideoError, match="use catstream export"):
-        open_sink(str(tmp_path / "t.sqlite"), Origin())
+        open_sink(str(tmp_path / "t.json"), Origin())

@@ -1,0 +1,180 @@
+"""An MQTT broker: events, the state of each object, and its discovery by Home Assistant.
+
+    TOPIC/availability     "online"; "offline" at the end, and as last will if the connection breaks; retained
+    TOPIC/events           each event, as `Reports` makes it
+    TOPIC/objects/NAME     the newest track of an object, with `present`, `zones` and `sent`, as often as the option
+                           `rate` says, and as soon as `present` or `zones` changes; retained, and removed if the object
+                           ends. NAME is "-" for the object without a name
+    homeassistant/binary_sensor/catstream/ID/config     a sensor for each object, and for each object in each zone
+
+All have QoS 1. While the broker is away, events wait for it, and states are left out, as the next one replaces them.
+"""
+
+from __future__ import annotations
+
+import json
+import ssl
+import sys
+import time
+from hashlib import blake2b
+from typing import Any
+from urllib.parse import SplitResult, unquote
+
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+
+from catstream.errors import VideoError
+from catstream.messages.names import counted
+from catstream.run.job import SinkOptions
+from catstream.sinks.destinations import Origin, TrackedFrame, shown
+from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split
+
+_LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
+_KEEPALIVE = 30  # seconds without a message after which client and broker test whether the other one is there
+_EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a sensor as unavailable, at least
+
+
+class MqttSink:
+    """Publishes from the thread of paho-mqtt; if `QUEUED` messages wait there, further ones are missed.
+
+    missed  messages that the broker has not acknowledged, once it is closed
+    """
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        url = _checked(place)
+        self._topic, self._options, self._reports = unquote(url.path)[1:], origin.options, Reports(place, origin)
+        self._availability = f"{self._topic}/availability"
+        self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
+        self._published = self._acknowledged = self.missed = 0
+        self._is_away = self._is_back = False  # a broker that is back may have lost what was retained
+        self._client = client = Client(CallbackAPIVersion.VERSION2)
+        client.max_queued_messages_set(QUEUED)
+        client.reconnect_delay_set(1, _LONGEST_PAUSE)
+        client.will_set(self._availability, "offline", qos=1, retain=True)
+        if url.scheme == "mqtts":
+            client.tls_set_context(ssl.create_default_context())
+        if url.username is not None:
+            client.username_pw_set(unquote(url.username), unquote(url.password or ""))
+        client.on_connect, client.on_connect_fail = self._connected, self._not_connected
+        client.on_disconnect, client.on_publish = self._disconnected, self._was_published
+        client.connect_async(url.hostname or "", url.port or (8883 if url.scheme == "mqtts" else 1883), _KEEPALIVE)
+        client.loop_start()
+        self._publish(self._availability, "online", retain=True)
+
+    @staticmethod
+    def check(place: str, _: SinkOptions) -> None:
+        """Raise VideoError if this is no address of a broker with a topic."""
+        _checked(place)
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Publish the events of a frame, and the states that have changed or are due."""
+        if self._is_back:
+            self._is_back = False
+            self._publish(self._availability, "online", retain=True)
+            for name in self._sent:
+                self._announce(name)
+                self._sent[name] = None, 0.0
+        for body in self._reports.update(frame.tracks):
+            self._publish(f"{self._topic}/events", body)
+        now, status_of = time.monotonic(), self._reports.events.status
+        for track in frame.tracks:
+            if track.object not in self._sent:
+                self._announce(track.object)
+            status = status_of(track.object)
+            last, due = self._sent.get(track.object, (None, now))
+            if status and (status != last or now >= due):
+                self._sent[track.object] = status, now + 1 / self._options.rate
+                state = {**track.to_dict(), **status, "sent": time.time()}
+                if self._is_away:
+                    self.missed += 1
+                else:
+                    self._publish(self._state_topic(track.object), json.dumps(state), retain=True)
+        for name in [name for name in self._sent if status_of(name) is None]:
+            self._announce(name, ended=True)
+            self._remove(name)
+
+    def close(self) -> None:
+        """Publish the last events; wait some seconds until the broker has everything, and warn about what it missed."""
+        for body in self._reports.close():
+            self._publish(f"{self._topic}/events", body)
+        for name in [*self._sent]:
+            self._remove(name)
+        self._publish(self._availability, "offline", retain=True)
+        deadline = time.monotonic() + CLOSE_SECONDS
+        while self._acknowledged < self._published and time.monotonic() < deadline:
+            time.sleep(0.02)
+        self._client.disconnect()
+        if self._acknowledged == self._published:  # else it would wait for the broker; the thread ends by itself
+            self._client.loop_stop()
+        self.missed += self._published - self._acknowledged
+        if self.missed:
+            self._reports.tell(f"the broker has not received {counted(self.missed, 'message')}")
+
+    def _publish(self, topic: str, payload: bytes | str, *, retain: bool = False) -> None:
+        if self._client.publish(topic, payload, 1, retain).rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:
+            self.missed += 1
+        else:
+            self._published += 1
+
+    def _state_topic(self, name: str) -> str:
+        return f"{self._topic}/objects/{name or '-'}"
+
+    def _remove(self, name: str) -> None:
+        """Remove what is retained of an object."""
+        del self._sent[name]
+        self._publish(self._state_topic(name), b"", retain=True)
+
+    def _announce(self, name: str, *, ended: bool = False) -> None:
+        """Have Home Assistant make the sensors of an object, or remove them if it has ended."""
+        state, label = self._state_topic(name), name or "object"
+        sensors = {label: "value_json.present"}
+        sensors |= {f"{label} in {zone}": f"'{zone}' in value_json.zones" for zone in self._options.zones}
+        for sensor, condition in sensors.items():
+            number = _id(state + condition)
+            config = {
+                **{"name": sensor, "unique_id": f"catstream_{number}", "device_class": "occupancy"},
+                **{"state_topic": state, "json_attributes_topic": state},
+                "value_template": f"{{{{ 'ON' if value_json is defined and {condition} else 'OFF' }}}}",
+                "availability_topic": self._availability,
+                "expire_after": max(_EXPIRE_SECONDS, round(3 / self._options.rate)),
+                "device": {"identifiers": [f"catstream_{_id(self._topic)}"], "name": self._topic},
+                "origin": {"name": "catstream"},
+            }
+            topic = f"homeassistant/binary_sensor/catstream/{number}/config"
+            self._publish(topic, b"" if ended else json.dumps(config), retain=True)
+
+    # Called by paho, in its thread.
+
+    def _connected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
+        if reason.is_failure:
+            self._leave(f"the broker refuses the connection ({reason})")
+        else:
+            self._is_back, self._is_away = self._is_away, False
+            self._reports.warn("")
+
+    def _not_connected(self, _: Client, __: object) -> None:
+        self._leave(f"no connection ({sys.exception()})")
+
+    def _disconnected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
+        if reason.is_failure:
+            self._leave(f"the connection was lost ({reason})")
+
+    def _leave(self, why: str) -> None:
+        self._is_away = True
+        self._reports.warn(f"{why}, it is tried again")
+
+    def _was_published(self, *_: object) -> None:
+        self._acknowledged += 1
+
+
+def _id(text: str) -> str:
+    """Letters and digits that stand for a text, the same in every run."""
+    return blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def _checked(place: str) -> SplitResult:
+    """The parts of the address; VideoError if it is not valid."""
+    url = split(place, "mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC")
+    if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or set("?#") & set(place):
+        raise VideoError(f"{shown(place)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")
+    return url

@@ -1,0 +1,169 @@
+"""The pictures of a running pipeline with their boxes, live, as H.264 on an RTSP or RTMP server of the user's.
+
+They are pushed by a process of its own, because FFmpeg blocks all threads of a process while a server does not answer.
+It is this module, run with `-m`: it reads the address, the endpoint and the folder of the keys from standard input,
+and writes a byte for each picture that the server took. The pipeline makes pictures for it only while it is connected.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, suppress
+from threading import Thread
+from time import monotonic, sleep
+from typing import IO, cast
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from catstream.client.subscription import Subscription
+from catstream.errors import CatstreamError, SilenceError, VideoError
+from catstream.messages.kinds import Track
+from catstream.messages.names import counted
+from catstream.run.job import SinkOptions
+from catstream.sinks.destinations import Origin, TrackedFrame, shown
+from catstream.sinks.reports import split
+from catstream.sinks.video_sink import DrawnPictures
+from catstream.video.writer import LiveWriter
+
+_LATE_SECONDS = 2.0  # without a picture, after which the frames that pass are missed
+_STUCK_SECONDS = 15  # in which a server has to take a picture
+_PAUSE_SECONDS = 2.0  # between two attempts to connect
+_REPEAT_SECONDS = 1.0  # without a track, after which the last picture is sent again: servers drop a silent stream
+
+_log = logging.getLogger(__name__)
+
+
+class StreamSink:
+    """Starts the process, starts it again if it dies, and counts.
+
+    missed  frames that passed while the server took no picture, because it was away or slow
+    """
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._place, self._origin, self.missed = place, origin, 0
+        self._frame = -1  # the last one
+        self._taken = 0.0  # when the server took the last picture, as far as it is known
+        self._start()
+
+    @staticmethod
+    def check(place: str, _: SinkOptions) -> None:
+        """Raise VideoError if this is no address of a stream."""
+        form = f"{place.partition('://')[0]}://[USER:PASSWORD@]HOST[:PORT]/PATH"
+        if split(place, form).path in ("", "/"):
+            raise VideoError(f"{shown(place)} does not name a stream: expected {form}")
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Count the frame if it is missed; the process receives the tracks from the pipeline itself."""
+        if self._process.poll() and monotonic() - self._started > _PAUSE_SECONDS:
+            self._stop()
+            self._start()
+        with suppress(BlockingIOError):
+            if os.read(self._output, 4096):
+                self._taken = monotonic()
+        if frame.number != self._frame and monotonic() - self._taken > _LATE_SECONDS:
+            self.missed += 1
+        self._frame = frame.number
+
+    def close(self) -> None:
+        """End the process, and warn about what the server missed."""
+        self._stop()
+        if self.missed:
+            _log.warning("%s: %s passed while it was away or slow", shown(self._place), counted(self.missed, "frame"))
+
+    def _start(self) -> None:
+        self._started = monotonic()
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for this process
+        )
+        told, taken = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
+        told.write(json.dumps([self._place, self._origin.endpoint, self._origin.keys]).encode() + b"\n")
+        told.flush()
+        self._output = taken.fileno()
+        os.set_blocking(self._output, False)
+
+    def _stop(self) -> None:
+        with self._process:
+            self._process.kill()
+
+
+class _Pusher:
+    """Pushes to one place, and warns once of each problem."""
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._place, self._origin, self._problem = place, origin, ""
+
+    def run(self) -> None:
+        """Push until the pipeline ends; connect again and again."""
+        url = urlsplit(self._place)
+        address = url.hostname or "", url.port or (554 if url.scheme == "rtsp" else 1935)
+        while True:
+            try:
+                socket.create_connection(address, _STUCK_SECONDS).close()  # no picture is made for one that is away
+                return self._push()
+            except (OSError, CatstreamError) as error:
+                self._warn(f"not connected ({getattr(error, 'strerror', None) or error}), it is tried again")
+            sleep(_PAUSE_SECONDS)
+
+    def _push(self) -> None:
+        """Connect with the first picture, and push until the pipeline ends; VideoError if the server takes no more."""
+        origin = self._origin
+        with (
+            Subscription[Track](origin.endpoint, "tracks", timeout=_REPEAT_SECONDS, keys=origin.keys) as tracks,
+            closing(DrawnPictures(origin)) as pictures,
+            ExitStack() as stack,
+        ):
+            stream: LiveWriter | None = None
+            for image in _images(tracks, pictures):
+                signal.alarm(_STUCK_SECONDS)  # which kills this process
+                if stream is None:
+                    stream = stack.enter_context(closing(LiveWriter(self._place, (image.shape[1], image.shape[0]))))
+                stream.write(image)
+                signal.alarm(0)
+                self._warn("")
+                with suppress(BlockingIOError):  # nobody reads while no track arrives
+                    os.write(1, b".")
+
+    def _warn(self, problem: str) -> None:
+        if problem != self._problem:
+            self._problem = problem
+            _log.warning("%s: %s", shown(self._place), problem or "is back")
+
+
+def _images(tracks: Subscription[Track], pictures: DrawnPictures) -> Iterator[np.ndarray]:
+    """Yield each picture, and the last one again while no tracks arrive, until the pipeline ends."""
+    image = None
+    while True:
+        try:
+            track = next(tracks, None)
+        except SilenceError:
+            if image is not None:
+                yield image
+            continue
+        if track is None:
+            return
+        if (drawn := pictures.take(TrackedFrame([track]))) is not None:
+            image = drawn[0]
+            yield image
+
+
+def _end_with_parent() -> None:
+    sys.stdin.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    address, endpoint, keys = json.loads(sys.stdin.readline())
+    Thread(target=_end_with_parent, daemon=True).start()
+    os.set_blocking(1, False)
+    _Pusher(address, Origin(endpoint=endpoint, keys=keys)).run()

@@ -1,0 +1,116 @@
+"""A webhook: each event as JSON, by POST to an address of the user's.
+
+The body is that of `Reports`. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256 of the
+body in hexadecimal digits. After an answer 408, 425, 429 or 5xx, or none, an event is sent again with the same `id`,
+and the events behind it wait. Any other answer but 2xx refuses it.
+"""
+
+from __future__ import annotations
+
+import hmac
+from base64 import b64encode
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from queue import SimpleQueue
+from threading import Event, Thread
+from urllib.parse import unquote, urlunsplit
+
+from catstream.errors import VideoError
+from catstream.messages.names import counted
+from catstream.run.job import SinkOptions
+from catstream.sinks.destinations import Origin, TrackedFrame
+from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split
+
+_FORM = "https://[USER:PASSWORD@]HOST[:PORT]/PATH"
+_TIMEOUT = 10.0  # seconds for a connection, and for an answer
+_PAUSE, _LONGEST_PAUSE = 1.0, 60.0  # seconds before an event is sent again, doubled each time
+_AGAIN = {0, 408, 425, 429, *range(500, 600)}  # answers after which it is; 0 for none
+
+
+class Webhook:
+    """Posts the events from a thread of its own; if `QUEUED` of them wait, further ones are missed.
+
+    missed  events that were not delivered, once it is closed
+    """
+
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._url, self._key = split(place, _FORM), _key(origin.options)
+        self._reports = Reports(place, origin)
+        self._bodies: SimpleQueue[bytes | None] = SimpleQueue()
+        self._events = self._delivered = self.missed = 0
+        self._hurry, self._closed = Event(), False  # the event ends a pause
+        self._thread = Thread(target=self._deliver_all, name="webhook", daemon=True)
+        self._thread.start()
+
+    @staticmethod
+    def check(place: str, options: SinkOptions) -> None:
+        """Raise VideoError if this is no address, or the key cannot be read."""
+        split(place, _FORM)
+        _key(options)
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Queue the events of a frame."""
+        self._queue(self._reports.update(frame.tracks))
+
+    def close(self) -> None:
+        """Queue the last events, and deliver for some seconds what waits; warn about what was missed."""
+        self._queue(self._reports.close())
+        self._bodies.put(None)
+        self._hurry.set()
+        self._thread.join(CLOSE_SECONDS)
+        self._closed = True
+        self._hurry.set()
+        self.missed = self._events - self._delivered
+        if self.missed:
+            self._reports.tell(f"{counted(self.missed, 'event')} of {self._events} were not delivered")
+
+    def _queue(self, bodies: list[bytes]) -> None:
+        for body in bodies:
+            self._events += 1
+            if self._bodies.qsize() < QUEUED:
+                self._bodies.put(body)
+
+    def _deliver_all(self) -> None:
+        """Deliver in order, until all has arrived or the sink is closed."""
+        for body in iter(self._bodies.get, None):
+            pause = _PAUSE
+            while (status := self._post(body)) in _AGAIN:
+                if self._closed:
+                    return
+                pause = _PAUSE if self._hurry.wait(pause) else min(2 * pause, _LONGEST_PAUSE)
+                self._hurry.clear()
+            self._delivered += status // 100 == 2
+
+    def _post(self, body: bytes) -> int:
+        """Post an event; return the status of the answer, 0 for none."""
+        url, headers = self._url, {"Content-Type": "application/json", "User-Agent": "catstream"}
+        if url.username is not None:
+            user = f"{unquote(url.username)}:{unquote(url.password or '')}"
+            headers["Authorization"] = f"Basic {b64encode(user.encode()).decode()}"
+        if self._key:
+            headers["X-Catstream-Signature"] = f"sha256={hmac.digest(self._key, body, 'sha256').hex()}"
+        kind = HTTPSConnection if url.scheme == "https" else HTTPConnection
+        connection = kind(url.hostname or "", url.port, timeout=_TIMEOUT)
+        try:
+            connection.request("POST", urlunsplit(("", "", url.path or "/", url.query, "")), body, headers)
+            answer = connection.getresponse()
+        except (OSError, HTTPException) as error:
+            self._reports.warn(f"no answer ({error}), events wait and are sent again")
+            return 0
+        finally:
+            connection.close()
+        again = "events wait and are sent again" if answer.status in _AGAIN else "the event is not sent again"
+        self._reports.warn("" if answer.status // 100 == 2 else f"answered {answer.status} {answer.reason}, {again}")
+        return answer.status
+
+
+def _key(options: SinkOptions) -> bytes:
+    """The key; empty to sign nothing."""
+    if options.key is None:
+        return b""
+    try:
+        key = options.key.read_bytes().strip()
+    except OSError as error:
+        raise VideoError(f"cannot read the key {options.key}: {error.strerror}") from None
+    if not key:
+        raise VideoError(f"{options.key} is empty: write the key that the receiver has, too")
+    return key

@@ -1,0 +1,96 @@
+"""The database of a run: each frame is in it at once, others read it meanwhile, and a resumed run continues it."""
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages.kinds import Track
+from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
+from catstream.sinks.track_log import RunFiles, read_frames
+
+TRACKS = [
+    Track(1, 0, 0.0, "bootstrapping", Box(1 / 3, 20.0, 30.5, 40.0), 1.0, 0),
+    Track(2, 1, 0.04, "absent", None, 0.125, 3, 17.5, "anna", 1),
+    Track(4, 3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.43, 4, 18.5, "anna", 1, doubtful=True),
+]
+
+KILLED = """
+import json, os, signal, sys
+from pathlib import Path
+from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
+from catstream.sinks.track_log import NdjsonSink
+sink = open_sink(sys.argv[1], Origin())
+for fields in json.loads(Path(sys.argv[2]).read_text()):
+    sink.write(TrackedFrame([NdjsonSink.parse(json.dumps(fields))[0]]))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def read(path):
+    return [frame.tracks for frame, _ in read_frames(path)]
+
+
+def test_each_frame_is_in_the_database_at_once_for_others_who_do_not_block_it(tmp_path):
+    path = tmp_path / "t.sqlite"
+    with closing(open_sink(str(path), Origin())) as sink, closing(sqlite3.connect(path)) as other:
+        sink.write(TrackedFrame(TRACKS[:1]))
+        other.execute("BEGIN")
+        assert other.execute("SELECT frame, x, object FROM tracks").fetchall() == [(0, 1 / 3, "")]
+        sink.write(TrackedFrame(TRACKS[1:2]))  # while that transaction goes on
+        assert other.execute("SELECT count(*) FROM tracks").fetchone() == (1,)
+        other.execute("END")
+        assert read(path) == [[each] for each in TRACKS[:2]]
+    assert read(path) == [[each] for each in TRACKS[:2]]
+    assert [file.name for file in tmp_path.iterdir()] == ["t.sqlite"]
+
+
+def test_a_database_alone_is_continued_after_the_last_frame_of_a_run_that_was_killed(tmp_path):
+    path = tmp_path / "t.sqlite"
+    with (tmp_path / "tracks.json").open("w") as file:
+        json.dump([each.to_dict() for each in (*TRACKS[:2], replace(TRACKS[2], object="ben"))], file)
+    killed = subprocess.run([sys.executable, "-P", "-c", KILLED, path, file.name], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert len(read(path)) == 3
+    run = RunFiles(Origin(), None, [str(path)])
+    run.check(overwrite=False, earlier=run.places)
+    assert run.position() == 2, "the last frame lacks anna, and is tracked again"
+    more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
+    with more.opened("", resume=True) as write:
+        assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS[:2]]
+        write(TrackedFrame(TRACKS[2:]))
+    assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS]
+
+
+def test_a_new_run_replaces_a_database_with_all_its_files(tmp_path):
+    for name in ("t.sqlite", "t.sqlite-wal", "t.sqlite-shm"):
+        (tmp_path / name).write_text("of another program")
+    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin())) as sink:
+        sink.write(TrackedFrame(TRACKS[:1]))
+    assert read(tmp_path / "t.sqlite") == [TRACKS[:1]]
+
+
+@pytest.mark.parametrize("disk", [1 << 17], indirect=True)
+def test_a_full_disk_is_an_error_of_one_line_and_the_frames_before_it_remain(disk):
+    sink = open_sink(str(disk / "t.sqlite"), Origin())
+    sink.write(TrackedFrame(TRACKS[:1]))
+    (disk / "ballast").write_bytes(bytes((1 << 17) - sum(file.stat().st_size for file in disk.iterdir()) - 8192))
+    many = TrackedFrame([replace(TRACKS[0], frame=1, object=f"object-{number}") for number in range(999)])
+    with pytest.raises(VideoError, match=r"cannot write .*t\.sqlite: .*full"):
+        sink.write(many)
+    (disk / "ballast").unlink()
+    sink.close()
+    assert read(disk / "t.sqlite") == [TRACKS[:1]]
+
+
+def test_another_database_is_no_log(tmp_path):
+    (tmp_path / "t.sqlite").write_text("no database, but long enough" * 9)
+    with pytest.raises(VideoError, match=r"cannot read .*: file is not a database"):
+        read(tmp_path / "t.sqlite")

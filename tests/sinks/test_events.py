@@ -1,0 +1,107 @@
+"""Events, by histories: what came of tracks, in the order in which they came."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.box import Box
+from catstream.messages.kinds import Track
+from catstream.run.job import SinkOptions
+from catstream.sinks.events import Events
+
+#: A square of x and y from 40 to 60.
+DOOR = {"door": ((40, 40), (60, 40), (60, 60), (40, 60))}
+
+
+def tracks(history, name="", began=0, first=0):
+    """A track a second: a digit is the box whose centre is at x = ten times the digit and y = 50, "." none."""
+    for frame, x in enumerate(history, first):
+        box = None if x == "." else Box(10 * int(x) - 5, 45, 10, 10)
+        yield Track(frame + 1, frame, frame, "present" if box else "absent", box, 0.9, 1, object=name, began=began)
+
+
+def told(events):
+    return [f"{event.track.time:g} {event.kind} {event.zone}".strip() for event in events]
+
+
+@pytest.mark.parametrize(
+    ("history", "expected"),
+    [
+        ("", []),
+        ("...", ["2 ended"]),
+        ("..1", ["2 found", "2 ended"]),
+        ("1..1", ["0 found", "3 ended"]),  # shorter than three seconds
+        ("1...1", ["0 found", "3 lost", "4 returned", "4 ended"]),
+        ("1....", ["0 found", "3 lost", "4 ended"]),
+        ("1....1...", ["0 found", "3 lost", "5 returned", "8 lost", "8 ended"]),
+        ("1345", ["0 found", "2 entered door", "3 left door", "3 ended"]),  # it ended there
+        ("4371", ["0 found", "0 entered door", "3 left door", "3 ended"]),  # 3 and 7 are within the margin
+        ("3737", ["0 found", "3 ended"]),  # it never was in the zone
+        ("5...5", ["0 found", "0 entered door", "3 lost", "4 returned", "4 left door", "4 ended"]),
+        ("5...1", ["0 found", "0 entered door", "3 lost", "4 returned", "4 left door", "4 ended"]),
+    ],
+)
+def test_a_history_of_an_object(history, expected):
+    events = Events(SinkOptions(DOOR, margin=10, lost_seconds=3))
+    assert told([*events.update([*tracks(history)]), *events.close()]) == expected
+
+
+def test_only_the_events_that_are_wanted_are_told():
+    events = Events(SinkOptions(DOOR, events=("lost", "entered"), lost_seconds=1))
+    assert told([*events.update([*tracks("5.1")]), *events.close()]) == ["0 entered door", "1 lost"]
+
+
+def test_another_object_of_the_same_name_ends_the_one_before():
+    events = Events(SinkOptions(DOOR))
+    assert told(events.update([*tracks("5"), *tracks("1", began=1, first=1)])) == [
+        "0 found", "0 entered door", "0 left door", "0 ended", "1 found",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_an_object_that_was_forgotten_ends_once_the_others_have_four_frames_more(together):
+    events = Events(SinkOptions())
+    ben = [[track] for track in tracks("1111", "ben")]
+    anna = [[track] for track in tracks("11111111", "anna")]
+    frames = [each + more for each, more in zip(anna, ben + [[]] * 4, strict=True)]
+    found = [
+        told(events.update(each)) for frame in frames for each in ([frame] if together else [[it] for it in frame])
+    ]
+    assert [each for each in found if each][-1] == ["3 ended"]
+    assert found[-1] == ["3 ended"]
+    assert told(events.close()) == ["7 ended"]
+
+
+def test_an_object_of_which_a_subscriber_loses_messages_has_not_ended():
+    """From the rest of one frame up to the beginning of a later one."""
+    names = ("anna", "ben", "carl")
+    frames = [*zip(*(tracks("1111111", name) for name in names), strict=True)]
+    came = [*frames[0], frames[1][0], frames[4][2], *frames[5], *frames[6]]
+    events = Events(SinkOptions())
+    assert [event.kind for track in came for event in events.update([track])] == ["found"] * 3
+
+
+def test_status_is_what_the_events_have_told():
+    events = Events(SinkOptions(DOOR, lost_seconds=2))
+    seen = [(events.update([track]), events.status(""))[1] for track in tracks(".5..5")]
+    assert [status["present"] for status in seen] == [False, True, True, False, True]
+    assert [status["zones"] for status in seen[1:]] == [["door"]] * 4
+    events.close()
+    assert events.status("") is None
+
+
+def test_an_event_has_its_track():
+    (event,) = Events(SinkOptions()).update([*tracks("1", "anna")])
+    fields = event.to_dict()
+    assert fields.pop("track") == event.track.to_dict()
+    assert fields == {"event": "found", "object": "anna", "time": 0.0, "zone": None}
+
+
+@given(st.text(".0123456789", max_size=60))
+def test_whatever_begins_ends(history):
+    events = Events(SinkOptions(DOOR, lost_seconds=2))
+    kinds = [event.kind for event in (*events.update([*tracks(history)]), *events.close())]
+    assert kinds.count("entered") == kinds.count("left")
+    assert kinds.count("ended") == bool(history)
+    assert kinds.count("lost") - kinds.count("returned") in (0, 1)
+    assert kinds[-1:] == ["ended"] * bool(history)

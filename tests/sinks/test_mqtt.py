@@ -1,0 +1,279 @@
+"""MQTT, with a real broker: what a subscriber gets, while the broker is there, away, back, silent, or asks for more."""
+
+import gc
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import ExitStack, closing
+from dataclasses import replace
+
+import paho.mqtt.client as mqtt
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages.kinds import Track
+from catstream.run.job import SinkOptions
+from catstream.sinks import mqtt_sink
+from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
+
+MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
+needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
+DOOR = {"door": ((0, 0), (100, 0), (100, 100), (0, 100))}
+ANNA = Track(1, 0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
+
+
+class Broker:
+    """A broker with the user me, whose password is s/1; `start` and `stop` may be called again and again."""
+
+    def __init__(self, folder, until, *, tls=False):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self._folder, self._until, self._process, self._stack = folder, until, None, ExitStack()
+        self.scheme = "mqtts" if tls else "mqtt"
+        self.url = f"{self.scheme}://me:s%2F1@localhost:{self.port}/yard/cam"
+        (folder / "passwords").write_text("me:s/1\n")
+        (folder / "passwords").chmod(0o600)
+        subprocess.run(["mosquitto_passwd", "-U", folder / "passwords"], check=True)
+        lines = [f"listener {self.port} localhost", "allow_anonymous false", f"password_file {folder / 'passwords'}"]
+        if tls:
+            self._make_certificate()
+            lines += [f"certfile {folder / 'crt'}", f"keyfile {folder / 'key'}"]
+        user = "user root" if os.getuid() == 0 else ""
+        (folder / "conf").write_text("\n".join([*lines, user, "persistence false", ""]))
+
+    def _make_certificate(self):
+        words = "req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -addext subjectAltName=DNS:localhost"
+        subprocess.run(["openssl", *words.split(), "-keyout", "key", "-out", "crt"], cwd=self._folder, check=True,
+                       capture_output=True)  # fmt: skip
+
+    def start(self):
+        self._process = subprocess.Popen([MOSQUITTO, "-c", self._folder / "conf"], stderr=subprocess.DEVNULL)
+        self._until(self._listens)
+
+    def _listens(self):
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
+
+    def stop(self):
+        self._stack.pop_all().close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def subscriber(self):
+        """What a subscriber gets from now on, each topic with its payloads; what was retained comes at once."""
+        got, subscribed = {}, []
+        client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        client.username_pw_set("me", "s/1")
+        if self.scheme == "mqtts":
+            client.tls_set(self._folder / "crt")
+        client.on_message = lambda _, __, it: got.setdefault(it.topic, []).append(it.payload.decode())
+        client.on_subscribe = lambda *_: subscribed.append(True)
+        client.connect("localhost", self.port)
+        client.loop_start()
+        self._stack.callback(client.loop_stop)
+        self._stack.callback(client.disconnect)
+        client.subscribe("#", 1)
+        self._until(lambda: subscribed)
+        return got
+
+
+@pytest.fixture
+def broker(tmp_path, until):
+    found = Broker(tmp_path, until)
+    yield found
+    found.stop()
+
+
+def quick(monkeypatch):
+    """Do not wait at the end for a broker that stays away."""
+    monkeypatch.setattr(mqtt_sink, "CLOSE_SECONDS", 0.1)
+
+
+def opened(url, **options):
+    return closing(open_sink(url, Origin(options=SinkOptions(**options))))
+
+
+def online(sink, until):
+    """Write a track once there is a connection, and wait until all has arrived."""
+    until(lambda: sink._client.is_connected() and not sink._is_away)
+    sink.write(TrackedFrame([ANNA]))
+    until(lambda: sink._acknowledged == sink._published)
+
+
+def events(got):
+    return [(each["event"], each["time"]) for each in map(json.loads, got.get("yard/cam/events", []))]
+
+
+def lost(time):
+    return TrackedFrame([replace(ANNA, seq=time, frame=time, time=float(time), state="absent", box=None)])
+
+
+@needs_broker
+def test_a_subscriber_gets_events_states_and_availability(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    with opened(broker.url, zones=DOOR, rate=1e-3) as sink:
+        online(sink, until)
+        late = broker.subscriber()  # who gets what is retained
+        until(lambda: len(late) == 4)
+        sink.write(lost(9))
+    assert sink.missed == 0
+    until(lambda: got["yard/cam/availability"][-1] == "offline")
+    assert got["yard/cam/availability"] == ["online", "offline"]
+    assert events(got) == [("found", 0.0), ("entered", 0.0), ("lost", 9.0), ("left", 9.0), ("ended", 9.0)]
+    *states, removed = got["yard/cam/objects/anna"]  # only at the changes, with this rate
+    assert removed == ""
+    assert [(state["present"], state["zones"], state["frame"]) for state in map(json.loads, states)] == [
+        (True, ["door"], 0), (False, ["door"], 9),
+    ]  # fmt: skip
+    assert json.loads(late["yard/cam/objects/anna"][0]) == json.loads(states[0])
+    configs = [json.loads(each[0]) for topic, each in late.items() if topic.startswith("homeassistant/")]
+    assert {config["name"]: config["value_template"] for config in configs} == {
+        "anna": "{{ 'ON' if value_json is defined and value_json.present else 'OFF' }}",
+        "anna in door": "{{ 'ON' if value_json is defined and 'door' in value_json.zones else 'OFF' }}",
+    }
+    for config in configs:
+        assert config["state_topic"] in late
+        assert config["availability_topic"] in late
+
+
+@needs_broker
+def test_states_come_at_the_chosen_rate(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    with opened(broker.url, rate=1e6) as sink:
+        online(sink, until)
+        for frame in range(1, 21):
+            sink.write(TrackedFrame([replace(ANNA, seq=frame + 1, frame=frame, time=frame / 30)]))
+    until(lambda: got.get("yard/cam/objects/anna", [None])[-1] == "")
+    assert [json.loads(state)["frame"] for state in got["yard/cam/objects/anna"][-21:-1]] == [*range(1, 21)]
+
+
+@needs_broker
+def test_the_sensors_of_an_object_that_was_forgotten_are_removed(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    with opened(broker.url, events=("lost",)) as sink:
+        online(sink, until)
+        for frame in range(1, 5):
+            sink.write(TrackedFrame([replace(ANNA, seq=frame + 1, frame=frame, object="ben")]))
+        until(lambda: got.get("yard/cam/objects/anna", [None])[-1] == "")
+        empty = [topic for topic, each in got.items() if each[-1] == "" and topic.startswith("homeassistant/")]
+        assert [json.loads(got[topic][0])["name"] for topic in empty] == ["anna"]
+
+
+@needs_broker
+def test_a_process_that_is_killed_is_offline_by_its_last_will(broker, until):
+    broker.start()
+    got = broker.subscriber()
+    killed = (
+        "import os, sys, time; from catstream.sinks.destinations import *; from catstream.messages.kinds import *\n"
+        "sink = open_sink(sys.argv[1], Origin())\n"
+        "while sink._acknowledged < 4:\n"
+        "    sink.write(TrackedFrame([Track(1, 0, 0.0, 'absent', None, 0.0, 0)])); time.sleep(0.01)\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    subprocess.run([sys.executable, "-P", "-c", killed, broker.url], check=False)
+    until(lambda: got["yard/cam/availability"] == ["online", "offline"])
+    assert "yard/cam/objects/-" in got
+
+
+@needs_broker
+def test_a_broker_that_is_away_gets_the_events_when_it_is_back_and_misses_states(broker, until, caplog):
+    with opened(broker.url, rate=1e6) as sink:
+        sink.write(TrackedFrame([ANNA]))
+        until(lambda: "no connection ([Errno 111] Connection refused)" in caplog.text)
+        sink.write(TrackedFrame([ANNA]))
+        broker.start()
+        got = broker.subscriber()
+        online(sink, until)
+        until(lambda: events(got) == [("found", 0.0)])
+        assert sink.missed > 0
+        until(lambda: sink._acknowledged == sink._published)
+        broker.stop()  # it forgets what was retained
+        until(lambda: "the connection was lost" in caplog.text)
+        sink.write(lost(9))
+        broker.start()
+        got = broker.subscriber()
+        online(sink, until)
+    until(lambda: events(got)[-1] == ("ended", 0.0))
+    assert ("lost", 9.0) in events(got)
+    assert got["yard/cam/availability"] == ["online", "offline"]
+    assert any(topic.startswith("homeassistant/") for topic in got)
+    assert f"the broker has not received {sink.missed} message" in caplog.text
+    assert "s/1" not in caplog.text
+    assert "s%2F1" not in caplog.text
+
+
+def test_a_broker_that_never_answers_holds_nothing_up_and_what_it_misses_is_counted(monkeypatch, caplog):
+    monkeypatch.setattr(mqtt_sink, "QUEUED", 5)
+    quick(monkeypatch)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        opened(f"mqtt://127.0.0.1:{silent.getsockname()[1]}/yard", rate=1e-3) as sink,
+    ):
+        sink.write(TrackedFrame([ANNA]))
+        for time in range(1, 21):
+            sink.write(lost(10 * time))
+            sink.write(TrackedFrame([replace(ANNA, frame=10 * time + 1, time=10.0 * time + 1)]))
+    # 42 events: found, 20 lost, 20 returned, ended; a state after all but the last; online, sensor, removal, offline
+    assert sink.missed == 42 + 41 + 4
+    assert "the broker has not received 87 messages" in caplog.text
+
+
+@needs_broker
+def test_a_wrong_password_is_told_once_and_not_shown(broker, until, caplog, monkeypatch):
+    quick(monkeypatch)
+    broker.start()
+    with opened(broker.url.replace("s%2F1", "wrong")) as sink:
+        sink.write(TrackedFrame([ANNA]))
+        until(lambda: "the broker refuses the connection (Not authorized)" in caplog.text)
+    assert sink.missed > 0
+    assert "wrong" not in caplog.text
+
+
+@needs_broker
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no certificate without it: apt-get install openssl")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho does not close it
+def test_tls_needs_a_certificate_that_this_machine_trusts(tmp_path, until, monkeypatch, caplog):
+    broker = Broker(tmp_path, until, tls=True)
+    broker.start()
+    try:
+        with monkeypatch.context() as patch, opened(broker.url):
+            until(lambda: "certificate verify failed" in caplog.text)
+            quick(patch)
+        until(lambda: not any(thread.name.startswith("paho") for thread in threading.enumerate()))
+        gc.collect()
+        got = broker.subscriber()
+        monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "crt"))
+        with opened(broker.url) as sink:
+            online(sink, until)
+        until(lambda: events(got)[-1:] == [("ended", 0.0)])
+    finally:
+        broker.stop()
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("mqtt://host", "has no valid topic"),
+        ("mqtt://host/", "has no valid topic"),
+        ("mqtt://host/a/#", "has no valid topic"),
+        ("mqtt://host/a/+", "has no valid topic"),
+        ("mqtt://me:1/secret@host/a", "has no valid topic"),
+        ("mqtt:///a", "expected mqtt://"),
+        ("mqtt://me:secret@host:0/a", "expected mqtt://"),
+        ("mqtts://me:sec/secret@host/a", "expected mqtt://"),
+    ],
+)
+def test_an_address_that_is_none_is_an_error_before_the_run_that_tells_no_password(place, words):
+    with pytest.raises(VideoError, match=words) as error:
+        check_sink(place, SinkOptions())
+    assert "secret" not in str(error.value)

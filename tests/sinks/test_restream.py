@@ -1,0 +1,103 @@
+"""The pictures of a pipeline on a server: drawn only while it is connected, and what it misses is counted."""
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from contextlib import ExitStack, closing, contextmanager
+
+import numpy as np
+import psutil
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages.kinds import Preview, Track
+from catstream.run.job import SinkOptions
+from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
+from catstream.video.frames import jpeg
+from catstream.video.source import open_source
+from catstream.wire.channels import PREVIEWS, TRACKS
+from catstream.wire.newest import Publisher
+
+pytestmark = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="no RTMP server: apt-get install ffmpeg")
+
+BOX = Box(200.0, 100.0, 120.0, 160.0)
+
+
+class Pipeline:
+    """What a detector sends: a track and a picture for each frame, twenty a second."""
+
+    def __init__(self, endpoint, stack):
+        self.frame, self.looked_at = 0, False
+        self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
+        self._previews = stack.enter_context(Publisher(PREVIEWS, endpoint))
+        self._noise = np.random.default_rng(5).integers(90, 110, (9, 240, 320, 3), np.uint8)
+
+    def next(self):
+        for each in (self._tracks, self._previews):
+            each.serve_late_joiners()
+        track = Track(self.frame + 1, self.frame, self.frame / 20, "present", BOX, 0.9, 1)
+        self._previews.send(Preview(self.frame, 640, 480, {"": BOX}, jpeg(self._noise[self.frame % 9])))
+        self._tracks.send(track)
+        self.looked_at = self._previews.has_subscribers
+        self.frame += 1
+        time.sleep(0.05)
+        return TrackedFrame([track])
+
+
+@contextmanager
+def rtmp_server(path, port):
+    """FFmpeg as a server, which takes one connection after the other."""
+    words = f"ffmpeg -loglevel error -listen 1 -i rtmp://127.0.0.1:{port}/live/one -c copy -flush_packets 1 -y {path}"
+    loop = subprocess.Popen(
+        ["sh", "-c", f"while :; do {words}; done"], start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield
+    finally:
+        os.killpg(loop.pid, signal.SIGKILL)
+        loop.wait()
+
+
+def test_pictures_are_made_and_sent_only_while_the_server_is_there(endpoint, tcp, tmp_path, until, caplog):
+    port = int(tcp.rpartition(":")[2])
+    path = tmp_path / "got.flv"
+    with ExitStack() as stack:
+        pipeline = Pipeline(endpoint, stack)
+        sink = stack.enter_context(
+            closing(open_sink(f"rtmp://127.0.0.1:{port}/live/one", Origin(endpoint=str(endpoint))))
+        )
+        for _ in range(80):  # the server is away
+            sink.write(pipeline.next())
+            assert not pipeline.looked_at
+        assert sink.missed == 80
+        with rtmp_server(path, port):
+            until(lambda: path.exists() and path.stat().st_size > 9000, lambda: sink.write(pipeline.next()))
+            assert pipeline.looked_at
+            missed = sink.missed
+            with open_source(path) as frames:
+                image = next(iter(frames)).image
+            (pushing,) = psutil.Process().children()[:-1]  # the other one is the server
+            pushing.kill()
+            until(lambda: not pipeline.looked_at, lambda: sink.write(pipeline.next()))
+            until(lambda: pipeline.looked_at, lambda: sink.write(pipeline.next()))
+        assert image.shape[:2] == (260, 320), "the picture, and a line of text"
+        green = (image[:240].astype(int) @ [-1, 2, -1]) > 200
+        assert (np.ptp(np.argwhere(green), axis=0) - [80, 60]).max() < 6, "the box is drawn"
+    assert sink.missed >= missed
+    assert f"rtmp://127.0.0.1:{port}/live/one: {sink.missed} frames passed while it was away or slow" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("rtsp://me:secret@127.0.0.1:0/one", r"rtsp://127.0.0.1:0/one is not valid: expected rtsp://\[USER"),
+        ("rtmp://127.0.0.1/", r"rtmp://127.0.0.1/ does not name a stream: expected rtmp://\["),
+    ],
+)
+def test_an_address_that_names_no_stream_is_rejected_before_the_run(place, words):
+    with pytest.raises(VideoError, match=words) as caught:
+        check_sink(place, SinkOptions())
+    assert "secret" not in str(caught.value)

@@ -1,0 +1,257 @@
+"""A webhook: each event arrives once and in order, however long the receiver is away; what is missed is counted."""
+
+import hmac
+import json
+import re
+from base64 import b64encode
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Event, Thread
+
+import pytest
+
+from catstream.box import Box
+from catstream.errors import VideoError
+from catstream.messages.kinds import Preview, Track
+from catstream.run.job import SinkOptions
+from catstream.sinks import webhook
+from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
+from catstream.wire.channels import PREVIEWS
+from catstream.wire.newest import Publisher
+
+FOUND = Track(1, 0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
+JPEG = b"\xff\xd8\xff a picture"
+
+
+class Receiver:
+    """What a user writes: it keeps each request, and answers with the next one of `answers`, then with 204."""
+
+    def __init__(self, port=0):
+        self.requests, self.answers, self.holds = [], [], Event()
+        self.holds.set()
+        receiver = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self):
+                body = self.rfile.read(int(self.headers["Content-Length"]))
+                receiver.holds.wait(60)
+                receiver.requests.append((self.path, self.headers, body))
+                self.send_response(receiver.answers.pop(0) if receiver.answers else 204)
+                self.end_headers()
+
+            def log_message(self, *_):
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        self.port = self._server.server_port
+        Thread(target=self._server.serve_forever, args=(0.02,)).start()
+
+    def close(self):
+        self.holds.set()
+        self._server.shutdown()
+        self._server.server_close()
+
+    @property
+    def bodies(self):
+        return [json.loads(body) for _, _, body in self.requests]
+
+
+@pytest.fixture
+def receiver():
+    with closing(Receiver()) as server:
+        yield server
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    monkeypatch.setattr(webhook, "_PAUSE", 0.02)
+    monkeypatch.setattr(webhook, "_LONGEST_PAUSE", 0.05)
+
+
+@contextmanager
+def sending(port, path="hook", user="", **options):
+    """A webhook that was told of an object."""
+    with closing(open_sink(f"http://{user}127.0.0.1:{port}/{path}", Origin(options=SinkOptions(**options)))) as sink:
+        sink.write(TrackedFrame([FOUND]))
+        yield sink
+
+
+def lose(sink, *times):
+    """Write tracks without a box, and with one again: the events lost and returned, at each of these times."""
+    for time in times:
+        lost = replace(FOUND, seq=10 * time, frame=10 * time, time=10.0 * time, state="absent", box=None)
+        sink.write(TrackedFrame([lost]))
+        sink.write(TrackedFrame([replace(FOUND, seq=10 * time + 1, frame=10 * time + 1, time=10.0 * time + 1)]))
+
+
+def told(receiver):
+    return [(body["event"], body["time"]) for body in receiver.bodies]
+
+
+ALL = [("found", 0.0), ("lost", 10.0), ("returned", 11.0), ("ended", 11.0)]
+
+
+def test_each_event_is_posted_as_json_that_is_signed(receiver, tmp_path):
+    (tmp_path / "key").write_text("a secret\n")
+    with sending(receiver.port, "a/b?c=d", "me:p%40ss@", key=tmp_path / "key") as sink:
+        lose(sink, 1)
+    assert told(receiver) == ALL
+    for path, headers, body in receiver.requests:
+        assert path == "/a/b?c=d"
+        assert headers["Content-Type"] == "application/json"
+        assert headers["Authorization"] == f"Basic {b64encode(b'me:p@ss').decode()}"
+        assert headers["X-Catstream-Signature"] == f"sha256={hmac.new(b'a secret', body, 'sha256').hexdigest()}"
+    first = receiver.bodies[0]
+    assert first["track"] == FOUND.to_dict()
+    assert (first["object"], first["zone"]) == ("anna", None)
+    assert "picture" not in first
+    assert len({body["id"] for body in receiver.bodies}) == len(ALL)
+    assert sink.missed == 0
+
+
+def test_an_event_has_the_newest_picture_if_that_is_wanted(receiver, endpoint, until):
+    options = SinkOptions(picture=True, events=("found", "ended"))
+    with Publisher(PREVIEWS, endpoint) as previews:
+        url = f"http://127.0.0.1:{receiver.port}"
+        with closing(open_sink(url, Origin(endpoint=str(endpoint), options=options))) as sink:
+            sink.write(TrackedFrame([FOUND]))
+            until(lambda: previews.has_subscribers, previews.serve_late_joiners)
+            previews.send(Preview(7, 640, 480, {}, JPEG))
+            until(lambda: sink.write(TrackedFrame([FOUND])) or sink._reports._picture)
+    pictures = [body["picture"] for body in receiver.bodies]
+    assert pictures == [None, {"frame": 7, "width": 640, "height": 480, "jpeg": b64encode(JPEG).decode()}]
+
+
+def test_a_receiver_that_was_away_gets_all_events_in_order(caplog, until):
+    with closing(Receiver()) as gone:
+        port = gone.port
+    with sending(port, "T0/secret") as sink:
+        until(lambda: "no answer" in caplog.text)
+        lose(sink, 1)
+        back = Receiver(port)
+        until(lambda: len(back.requests) == 3)
+    back.close()
+    assert told(back) == ALL
+    assert sink.missed == 0
+    warned = [record.getMessage() for record in caplog.records]
+    assert [line.partition(" (")[0] for line in warned] == [
+        f"http://127.0.0.1:{port}/...: no answer", f"http://127.0.0.1:{port}/...: is back",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("answers", "expected", "missed"),
+    [
+        ([503, 429, 200], [ALL[0]] * 3 + ALL[1:], 0),
+        ([404, 301], ALL, 2),
+        ([200, 500, 410], [ALL[0], ALL[1], *ALL[1:]], 1),
+    ],
+)
+def test_an_event_is_sent_again_after_some_answers_and_not_after_others(receiver, caplog, answers, expected, missed):
+    receiver.answers += answers
+    with sending(receiver.port) as sink:
+        lose(sink, 1)
+    assert told(receiver) == expected
+    assert sink.missed == missed
+    assert (f"{missed} event" in caplog.text) == bool(missed)
+    ids = [body["id"] for body in receiver.bodies]
+    assert len(set(ids)) == len(ALL)
+
+
+def test_a_slow_receiver_never_holds_the_run_up_and_what_does_not_fit_into_the_queue_is_counted(
+    receiver, monkeypatch, caplog, until
+):
+    monkeypatch.setattr(webhook, "QUEUED", 2)
+    receiver.holds.clear()
+    with sending(receiver.port) as sink:
+        until(lambda: sink._bodies.empty())  # the first one is on its way
+        lose(sink, 1, 2, 3)
+        assert not receiver.requests
+        receiver.holds.set()
+        until(lambda: len(receiver.requests) == 3)
+    assert told(receiver) == [*ALL[:3], ("ended", 31.0)]
+    assert sink.missed == 4
+    assert "4 events of 8 were not delivered" in caplog.text
+
+
+def test_events_for_a_receiver_that_stays_away_are_counted_at_the_end(monkeypatch, caplog):
+    monkeypatch.setattr(webhook, "CLOSE_SECONDS", 0.2)
+    with closing(Receiver()) as gone:
+        port = gone.port
+    with sending(port) as sink:
+        lose(sink, 1)
+    assert sink.missed == 4
+    assert "4 events of 4 were not delivered" in caplog.text
+    sink._thread.join(60)
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("http://", "expected https://"),
+        ("https://me:secret@/hook", "expected https://"),
+        ("https://me:secret@host:port/hook", "expected https://"),
+        ("http://host:0/secret", "expected https://"),
+        ("http://host/secret hook", "escaped as in %20"),
+        ("http://hóst/secret", "escaped as in %20"),
+        ("ftp://me:secret@host/one", "is no destination"),
+    ],
+)
+def test_an_address_that_is_none_is_an_error_before_the_run_that_tells_no_password(place, words):
+    with pytest.raises(VideoError, match=words) as error:
+        check_sink(place, SinkOptions())
+    assert "secret" not in str(error.value)
+
+
+@pytest.mark.parametrize(("text", "words"), [(None, "No such file"), (" \n", "is empty: write the key")])
+def test_a_key_that_cannot_be_used_is_an_error_before_the_run(tmp_path, text, words):
+    if text is not None:
+        (tmp_path / "key").write_text(text)
+    with pytest.raises(VideoError, match=re.escape(str(tmp_path / "key")) + f".*{words}"):
+        check_sink("http://host/hook", SinkOptions(key=tmp_path / "key"))
+
+
+def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_video, succeed):
+    video, boxes = demo_video(32)
+    url = f"http://me:secret@127.0.0.1:{receiver.port}/T0/secret"
+    frame = "all=0,0 320,0 320,240 0,240"
+    _, errors = succeed(
+        "track", video, "--box", f"flower={boxes[0]}", "--write", url, "--zone", frame, "--when", "entered,left"
+    )
+    assert [(body["event"], body["zone"], body["track"]["frame"]) for body in receiver.bodies] == [
+        ("entered", "all", 0), ("left", "all", 31),
+    ]  # fmt: skip
+    assert f"results: http://127.0.0.1:{receiver.port}/..." in errors
+    assert "secret" not in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["--zone", "door=1,2 3,4"], "three corners or more"),
+        (["--zone", "1,2 3,4 5,6"], "three corners or more"),
+        (["--zone", "door=1,2 3,4 5,nan"], "three corners or more"),
+        (["--zone", "a=1,2 3,4 5,6", "--zone", "a=1,2 3,4 5,6"], "expected a new NAME="),
+        (["--when", "gone"], "expected some of found, lost, returned"),
+        (["--when", "found=3"], "expected some of found, lost, returned"),
+        (["--when", ""], "expected some of found, lost, returned"),
+        (["--when", "lost=soon"], "'soon' is not a valid float"),
+        (["--rate", "0"], "is not in the range x>0"),
+        (["--write", "mqtt://me:secret@host/#"], "has no valid topic"),
+        (["--write", "ftp://me:secret@host/a"], "ftp://host/a is no destination"),
+    ],
+)
+def test_an_option_that_is_not_valid_is_an_error_of_one_line_before_the_run(demo_video, fail, words, error):
+    video, boxes = demo_video(32)
+    said = fail("track", video, "--box", boxes[0], "--write", "http://127.0.0.1:9/hook", *words)
+    assert error in said
+    assert "secret" not in said
+
+
+def test_options_that_no_destination_has_are_an_error(demo_video, fail, tmp_path):
+    video, boxes = demo_video(32)
+    assert "are for mqtt:// and http://: add one" in fail(
+        "track", video, "--box", boxes[0], "--output", tmp_path / "out", "--when", "lost=10"
+    )
+    assert "are for mqtt:// and http://: add one" in fail("sink", tmp_path / "t.csv", "--picture")
