@@ -12,7 +12,7 @@ TOOLS := $(VENV)/.tools
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-system test-slow lint format docs pythons picture life protocol bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-system test-slow lint format docs wheel picture life protocol bench results lock clean fuzz audit
 
 help:  ## list all commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -63,8 +63,8 @@ format: $(TOOLS)  ## fix the style automatically
 docs: $(TOOLS)  ## the documentation, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-pythons:  ## run the demo on each supported Python of this machine
-	@.ci/pythons
+wheel:  ## build sdist and wheel in dist/, and try them on each supported Python of this machine: some minutes
+	@PYTHON=$(PYTHON) .ci/wheel
 
 picture: $(READY)  ## render the animated picture of README.md
 	@$(BIN)/python .ci/picture

@@ -296,7 +296,7 @@ class DetectorLoop:
         """Show a frame with the boxes of the objects that are tracked, if somebody looks."""
         present = ((name, each.box) for name, each in tracks.items() if name in self.desired.objects)
         boxes = {name: box for name, box in present if box is not None}
-        self._outputs.previews.show(number, frame.image, boxes)
+        self._outputs.previews.show(number, frame, boxes)
 
     # Commands
 
@@ -354,14 +354,23 @@ class DetectorLoop:
         if command.box is None:
             raise BoxError("no box was given")
         detectors, box, at = self.detectors, command.box, f"at {command.box} in frame {self.detectors.seq}"
+        frames = [frame]
+        if command.time is not None and (kept := self._outputs.previews.since(command.time)):
+            frames = [*kept, frame]
+            at = f"at {box} in the picture {frame.time - command.time:.1f} s before frame {detectors.seq}"
+        elif command.time is not None:
+            at += ", as the picture in which it was drawn is not kept any more"
+        later = (detectors.pyramid(each.image) for each in frames)
+        first = next(later)
         check_room(name, self.desired, self._process.settings.run.objects_most)
         self._process.watchdog.allow()
         of_name = f" {name}" if name else ""
         if is_kept(command, name, self.desired, detectors):
-            given[name] = detectors.correct(name, detectors.pyramid(frame.image), box, frame.time)
+            given[name] = detectors.correct(name, first, box, frame.time, later)
             effect = f"the same object{of_name} continues {at}"
         else:
-            given[name] = detectors.begin(name, detectors.pyramid(frame.image), box, frame.time)
+            given[name] = detectors.begin(name, first, box, frame.time, later)
+            box = (detectors.detectors[name].box or box) if len(frames) > 1 else box
             effect = f"{'another' if name in self.desired.objects else 'the'} object{of_name} begins {at}"
             self.desired = self.desired.begun(name, DesiredObject(box, detectors.seq + 1))
         return answer(command, detectors, True, effect, name, detectors.seq)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from contextlib import ExitStack, suppress
 from hashlib import blake2b
 from pathlib import Path
 from time import monotonic
 from typing import Self
-
-import numpy as np
 
 from catstream.box import Box
 from catstream.errors import CatstreamError
@@ -18,7 +17,8 @@ from catstream.messages.kinds import End, Features, Preview, Tracks
 from catstream.run.learned import Learned
 from catstream.services.decisions import DesiredObject
 from catstream.services.process import Process
-from catstream.video.frames import jpeg
+from catstream.video.frames import Frame, jpeg
+from catstream.video.source import is_live
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES, PREVIEWS, TRACKS, TRAINING
 from catstream.wire.endpoint import Endpoint
@@ -27,6 +27,8 @@ from catstream.wire.results import ResultsSender
 
 _PREVIEW_SECONDS = 0.1  # shortest time between two pictures for subscribers
 _SIDE = 640  # longest side of a picture, in pixels
+_KEPT_SECONDS = 5.0  # for which the frame of a picture is kept, as somebody may draw a box in it
+_KEPT_BYTES = 256 << 20  # of these frames at most
 
 _log = logging.getLogger(__name__)
 
@@ -41,7 +43,7 @@ class Outputs:
             self.results = stack.enter_context(ResultsSender(endpoint, window + 1)) if process.job.owned else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
             self._training = stack.enter_context(Publisher(TRAINING, endpoint))
-            self.previews = stack.enter_context(Previews(endpoint))
+            self.previews = stack.enter_context(Previews(endpoint, keeps=is_live(process.job.source)))
             self._stack = stack.pop_all()
 
     def serve_late_joiners(self) -> None:
@@ -64,26 +66,42 @@ class Outputs:
 
 
 class Previews(Publisher[Preview]):
-    """Sends the newest frame as a small picture, at most ten a second; none is made if there are no subscribers."""
+    """Sends the newest frame as a small picture, at most ten a second; none is made if there are no subscribers.
 
-    def __init__(self, endpoint: Endpoint) -> None:
+    If it `keeps` them, the frames of the last pictures are kept, too, while there are subscribers.
+    """
+
+    def __init__(self, endpoint: Endpoint, *, keeps: bool = False) -> None:
         super().__init__(PREVIEWS, endpoint)
-        self._waiting: tuple[int, np.ndarray, dict[str, Box]] | None = None
+        self._waiting: tuple[int, Frame, dict[str, Box]] | None = None
         self._shown = 0.0
+        self._keeps, self._kept = keeps, deque[Frame]()
 
-    def show(self, frame: int, image: np.ndarray, boxes: dict[str, Box]) -> None:
-        """Send a frame, uint8 (h, w, 3) BGR that stays unchanged, unless a newer one arrives before it is due."""
-        self._waiting = frame, image, boxes
+    def show(self, number: int, frame: Frame, boxes: dict[str, Box]) -> None:
+        """Send a frame, whose image stays unchanged, unless a newer one arrives before it is due."""
+        self._waiting = number, frame, boxes
         self.turn()
+
+    def since(self, time: float) -> list[Frame]:
+        """The kept frames, from that of the picture at a time on; none if that is not kept any more."""
+        frames = [frame for frame in self._kept if frame.time >= time]
+        return frames if frames and frames[0].time == time else []
 
     def turn(self) -> None:
         """Send a preview if one is due; call it in every turn, even if no frame arrives, as subscribers may join."""
         self.serve_late_joiners()
+        if not self.has_subscribers:
+            self._kept.clear()
         if self._waiting is None or not self.has_subscribers or monotonic() - self._shown < _PREVIEW_SECONDS:
             return
-        (frame, image, boxes), self._waiting, self._shown = self._waiting, None, monotonic()
-        height, width = image.shape[:2]
-        self.send(Preview(frame, width, height, boxes, jpeg(image, _SIDE)))
+        (number, frame, boxes), self._waiting, self._shown = self._waiting, None, monotonic()
+        height, width = frame.image.shape[:2]
+        self.send(Preview(number, frame.time, width, height, boxes, jpeg(frame.image, _SIDE)))
+        if self._keeps:
+            most = max(1, _KEPT_BYTES // frame.image.nbytes)
+            self._kept.append(frame)
+            while self._kept[0].time < frame.time - _KEPT_SECONDS or len(self._kept) > most:
+                self._kept.popleft()
 
 
 class ModelFiles:

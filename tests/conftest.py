@@ -432,3 +432,25 @@ def camera():
     yield start
     for one in cameras:
         one.leave()
+
+
+@pytest.fixture
+def walker():
+    """A camera before which a patch goes to and fro, and a function that finds its box in a JPEG of it."""
+    rng = np.random.default_rng(4)
+    field = np.kron(rng.integers(60, 200, (24, 32, 3), np.uint8), np.ones((10, 10, 1), np.uint8))
+    patch = np.kron(rng.integers(0, 256, (5, 5, 3), np.uint8), np.ones((8, 8, 1), np.uint8))
+
+    def image(number: int) -> np.ndarray:
+        frame, x = field.copy(), 20 + abs(2 * number % 480 - 240)
+        frame[100:140, x : x + 40] = patch
+        return frame
+
+    def find(jpeg: bytes) -> Box:
+        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        _, _, _, place = cv2.minMaxLoc(cv2.matchTemplate(picture, patch, cv2.TM_CCOEFF_NORMED))
+        return Box(*map(float, place), 40.0, 40.0)
+
+    one = Camera(image)
+    yield one.url, find
+    one.leave()

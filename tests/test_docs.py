@@ -227,7 +227,11 @@ def test_a_type_checker_accepts_the_python_examples(tmp_path):
                 file = tmp_path / f"{page.stem}_{number}.py"
             with file.open("a") as program:
                 program.write(block)
-    programs = [*sorted(tmp_path.glob("*.py")), *(ROOT / "examples").glob("*.py")]
+    programs = [
+        *sorted(tmp_path.glob("*.py")),
+        *(ROOT / "examples").glob("*.py"),
+        *(ROOT / "examples").glob("*/main.py"),
+    ]
     said, errors, _ = mypy.run(["--no-error-summary", *map(str, programs)])  # as `make lint`, whose cache it has
     assert (said, errors) == ("", "")
 

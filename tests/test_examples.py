@@ -1,21 +1,27 @@
 """Each example runs beside a real pipeline, and prints what that found."""
 
+import base64
+import json
 import re
 import runpy
 import select
 import shutil
+import sqlite3
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 import catstream
+from catstream.box import Box
 from catstream.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
@@ -25,6 +31,7 @@ from catstream.wire.keys import create
 pytestmark = pytest.mark.system
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+DOOR = ((50, 0), (90, 0), (90, 90), (50, 90))
 MODULES = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
 
 
@@ -179,3 +186,157 @@ def test_tracks_become_detections_of_supervision():
     np.testing.assert_array_equal(found.xyxy, [[1, 2, 4, 6]])
     assert found.confidence.tolist() == [1.0]
     assert len(detections([])) == 0
+
+
+def test_a_ground_station_finds_the_camera_selects_an_object_and_is_told_where_it_is(demo_video, monkeypatch):
+    pytest.importorskip("pymavlink", reason="pymavlink is missing: pip install pymavlink")
+    monkeypatch.setenv("MAVLINK20", "1")
+    mavlink, mavutil = import_module("pymavlink.dialects.v20.common"), import_module("pymavlink.mavutil")
+    source, boxes = demo_video(60)
+    with ExitStack() as stack:
+        link = mavutil.mavlink_connection("udpin:127.0.0.1:0", source_system=255, dialect="common")
+        stack.callback(link.close)
+        pipeline = stack.enter_context(Pipeline(str(source), settings={"run.unstored_frames": 1}))
+        words = [pipeline.endpoint, "--link", f"udpout:127.0.0.1:{link.port.getsockname()[1]}"]
+        camera = stack.enter_context(subprocess.Popen([*command("mavlink_gimbal.py"), *words], stdout=subprocess.PIPE))
+        stack.callback(camera.kill)
+
+        told = {}  # kind -> the last message before an answer
+
+        def result_of(name, *values):
+            number = getattr(mavlink, f"MAV_CMD_{name}")
+            link.mav.command_long_send(1, 100, number, 0, *values, *[0] * (7 - len(values)))
+            while (message := link.recv_match(blocking=True, timeout=60)).get_type() != "COMMAND_ACK":
+                told[message.get_type()] = message
+            assert message.command == number
+            return message.result
+
+        heartbeat = link.recv_match(type="HEARTBEAT", blocking=True, timeout=60)
+        assert (heartbeat.type, heartbeat.get_srcComponent()) == (mavlink.MAV_TYPE_CAMERA, 100)
+        assert result_of("REQUEST_MESSAGE", mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION) == mavlink.MAV_RESULT_ACCEPTED
+        camera_information = told["CAMERA_INFORMATION"]
+        assert (camera_information.resolution_h, camera_information.resolution_v) == (320, 240)
+        assert camera_information.flags == mavlink.CAMERA_CAP_FLAGS_HAS_TRACKING_RECTANGLE
+        status = mavlink.MAVLINK_MSG_ID_CAMERA_TRACKING_IMAGE_STATUS
+        assert result_of("SET_MESSAGE_INTERVAL", status, 1) == mavlink.MAV_RESULT_ACCEPTED  # microsecond
+        assert result_of("CAMERA_TRACK_POINT", 0.5, 0.5) == mavlink.MAV_RESULT_UNSUPPORTED
+        assert result_of("CAMERA_TRACK_RECTANGLE", 2, 2, 3, 3) == mavlink.MAV_RESULT_DENIED
+        x, y, w, h = boxes[0]
+        corners = x / 320, y / 240, (x + w) / 320, (y + h) / 240
+        assert result_of("CAMERA_TRACK_RECTANGLE", *corners) == mavlink.MAV_RESULT_ACCEPTED
+        expected, statuses = [], []
+        for track in pipeline:
+            if track.box is not None:
+                x, y, w, h = track.box
+                expected.append(pytest.approx([x / 320, y / 240, (x + w) / 320, (y + h) / 240], abs=1e-6))
+            if (each := link.recv_match(type="CAMERA_TRACKING_IMAGE_STATUS", blocking=True, timeout=0.1)) is not None:
+                statuses.append(each)
+            if len(statuses) == 5:
+                break
+        assert len(statuses) == 5
+        for each in statuses:
+            assert each.tracking_status == mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
+            assert [each.rec_top_x, each.rec_top_y, each.rec_bottom_x, each.rec_bottom_y] in expected
+        assert result_of("CAMERA_STOP_TRACKING") == mavlink.MAV_RESULT_ACCEPTED
+        assert told["CAMERA_TRACKING_IMAGE_STATUS"].tracking_status == 0
+        pipeline.close()
+        assert camera.wait(60) == 0
+        *_, begun, forgotten = camera.stdout.read().decode().splitlines()
+        assert "begins" in begun
+        assert "no longer tracked" in forgotten
+
+
+def test_the_zone_counter_counts_the_visits_of_an_object_and_their_time(capsys):
+    example = runpy.run_path(str(EXAMPLES / "zone_counter.py"))
+    events, counter = example["Events"](example["SinkOptions"](zones={"door": DOOR})), example["Counter"]()
+    for frame, x in enumerate([0, 60, 70, 0, 60, 0]):
+        track = Track(frame + 1, frame, frame / 2, "present", catstream.Box(x, 40, 20, 20), 0.9, 1, object="anna")
+        for event in events.update([track]):
+            counter.take(event)
+    assert dict(counter.visits)["door"] == [1.0, 0.5]
+    assert capsys.readouterr().out.splitlines()[:2] == [
+        "0.5 s: anna entered door, 1 inside",
+        "1.5 s: anna left door, 0 inside",
+    ]
+
+
+def test_the_zone_counter_counts_beside_a_run(demo_video):
+    source, boxes = demo_video(60)
+    with ExitStack() as stack:
+        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], {"run.unstored_frames": 1}))
+        words = [*command("zone_counter.py"), pipeline.endpoint, "all=0,0 320,0 320,240 0,240", "none=0,0 1,0 1,1"]
+        counter = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        stack.callback(counter.kill)
+        counts = []
+        for _ in pipeline:
+            counts = counts or select.select([counter.stdout], [], [], 0.3)[0]  # while it starts, few pass
+        printed, _ = counter.communicate(timeout=60)
+    assert counter.returncode == 0
+    entered, left, everywhere, nowhere = printed.splitlines()
+    assert entered.endswith("the object entered all, 1 inside")
+    assert left.endswith("the object left all, 0 inside")
+    assert re.fullmatch(r"all: 1 visits, [0-2]\.\d s in all", everywhere)
+    assert nowhere == "none: 0 visits, 0.0 s in all"
+
+
+def test_the_collector_stores_the_tracks_of_two_pipelines_and_survives_one_that_does_not_run(demo_video, tmp_path):
+    source, boxes = demo_video(60)
+    with ExitStack() as stack:
+        settings = {"run.unstored_frames": 1}
+        runs = [stack.enter_context(Pipeline(str(source), boxes[0], settings)) for _ in range(2)]
+        words = [tmp_path / "tracks.sqlite", *(run.endpoint for run in runs), "tcp://127.0.0.1"]
+        collector = stack.enter_context(
+            subprocess.Popen([*command("asyncio_collector.py"), *words], stdout=subprocess.PIPE, text=True)
+        )
+        stack.callback(collector.kill)
+        assert "got 'tcp://127.0.0.1'" in collector.stdout.readline()  # it has subscribed to the others before
+        found = [list(run) for run in runs]
+        printed, _ = collector.communicate(timeout=60)
+    assert collector.returncode == 0
+    with closing(sqlite3.connect(tmp_path / "tracks.sqlite")) as database:
+        for run, tracks in zip(runs, found, strict=True):
+            rows = database.execute("SELECT frame, state, x, score FROM tracks WHERE pipeline = ?", [run.endpoint])
+            expected = {track.frame: (track.state, track.box and track.box.x, track.score) for track in tracks}
+            stored = {frame: tuple(rest) for frame, *rest in rows}
+            assert stored == {frame: expected[frame] for frame in stored}
+            assert f"{run.endpoint}: {len(stored)} tracks, " in printed
+            assert max(stored) == 59
+
+
+def test_the_function_for_cvat_follows_shapes_by_their_states_and_begins_again_if_a_tracker_is_gone(demo_video):
+    function = runpy.run_path(str(EXAMPLES / "cvat_function" / "main.py"))
+    context = SimpleNamespace(user_data=SimpleNamespace(), Response=lambda **fields: SimpleNamespace(**fields))
+    function["init_context"](context)
+    source, boxes = demo_video(60)
+    with open_source(source) as frames:
+        pictures = [base64.b64encode(cv2.imencode(".png", frame.image)[1]).decode() for frame in frames]
+    truth = [[box.x, box.y, box.x + box.w, box.y + box.h] for box in boxes]
+
+    def box_of(shape):
+        left, top, right, bottom = shape
+        return Box(left, top, right - left, bottom - top)
+
+    def asked(frame, shapes, states):
+        body = {"image": pictures[frame], "shapes": shapes, "states": json.loads(json.dumps(states))}
+        answer = function["handler"](context, SimpleNamespace(body=body))
+        return answer.status_code, answer.body
+
+    def followed(frame, states):
+        code, body = asked(frame, [None] * len(states), states)
+        assert code == 200
+        return json.loads(body)
+
+    code, body = asked(0, [truth[0], [10, 10, 50, 50]], [])
+    answer = first = json.loads(body)
+    assert (code, answer["shapes"][0]) == (200, truth[0])
+    for frame in range(1, 30):
+        answer = followed(frame, answer["states"])
+        assert box_of(answer["shapes"][0]).overlap(boxes[frame]) > 0.6
+    again = followed(1, first["states"])  # the annotator went back: those trackers are in another frame
+    assert again["shapes"] == first["shapes"]
+    context.user_data.trackers.clear()  # the function was started again
+    answer = followed(30, answer["states"])
+    assert box_of(followed(31, answer["states"])["shapes"][0]).overlap(boxes[31]) > 0.6
+    assert asked(0, [[5, 5, 5, 5]], [])[0] == 400
+    pictures[0] = base64.b64encode(b"no picture").decode()
+    assert asked(0, truth[:1], []) == (400, "expected a picture as PNG or JPEG, in base64")

@@ -3,7 +3,9 @@
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -49,13 +51,27 @@ def test_the_newest_python_that_is_named_and_the_oldest_are_those_that_are_allow
     assert f"{sys.version_info[0]}.{sys.version_info[1]}" in versions
 
 
-def test_building_the_package_warns_of_nothing_and_packs_the_page(tmp_path):
-    for name in ("pyproject.toml", "README.md", "LICENSE", "catstream", "services"):
+def test_sdist_and_wheel_are_built_without_a_warning_with_the_page_and_each_process_once(tmp_path):
+    for name in ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "catstream", "services", "tests"):
         (tmp_path / name).symlink_to(ROOT / name)
-    build = "import setuptools.build_meta as build; build.build_wheel('wheel')"
+    build = "import setuptools.build_meta as build; build.build_sdist('dist'); build.build_wheel('dist')"
     done = subprocess.run([sys.executable, "-c", build], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert not re.findall(r".*(?:Warning|absent from|deprecated).*", done.stdout + done.stderr)
-    (wheel,) = (tmp_path / "wheel").iterdir()
-    listed = subprocess.run([sys.executable, "-m", "zipfile", "-l", wheel], capture_output=True, text=True, check=True)
+    (wheel,), (sdist,) = (tmp_path / "dist").glob("*-py3-none-any.whl"), (tmp_path / "dist").glob("*.tar.gz")
     page = {f"catstream/web/page/{path.name}" for path in (ROOT / "catstream" / "web" / "page").iterdir()}
-    assert {*page, "catstream/services/__main__.py", "catstream/py.typed"} <= set(listed.stdout.split())
+    processes = {path.name for path in (ROOT / "services").glob("*.py")}
+    packed = set(zipfile.ZipFile(wheel).namelist())
+    assert {*page, "catstream/py.typed", *(f"catstream/services/{name}" for name in processes)} <= packed
+    with tarfile.open(sdist) as archive:
+        files = {name.partition("/")[2] for name in archive.getnames()}
+    assert {*page, "catstream/py.typed", *(f"services/{name}" for name in processes)} <= files
+    assert not [name for name in files if name.startswith(("catstream/services", "tests"))]
+
+
+def test_nothing_of_ours_is_for_one_kind_of_processor():
+    """Each package has wheels for x86-64 and aarch64: `.ci/lock check` asks PyPI, in `.ci/run`."""
+    files = [path for folder in ("catstream", "services", "deploy", "examples") for path in ROOT.glob(f"{folder}/**/*")]
+    kinds = re.compile(r"x86|amd64|aarch64|arm64|\bavx|\bsse\d|\bneon\b|-march|\bmkl\b", re.IGNORECASE)
+    for path in [*files, *ROOT.glob("docker-compose*.yml")]:
+        if path.suffix in {".py", ".yml", ".yaml", ""} and path.is_file() and "node_modules" not in path.parts:
+            assert not kinds.search(path.read_text()), f"{path} names a kind of processor"

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from catstream.messages.kinds import Track
 from catstream.messages.names import UNNAMED, counted, doubtful, listed
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results, SinkOptions
+from catstream.run.state import contains_run
 from catstream.services.options import (
     FOLDER,
     PATH,
@@ -63,6 +64,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @click.option("--paused", is_flag=True, help="Start paused, until `catstream resume`.")
 @click.option("--state", type=PATH, help="Folder for checkpoints, to resume the run from.")
 @click.option("--resume", type=FOLDER, help="Resume the run of such a folder.")
+@click.option("--continue", "continues", is_flag=True, help="Resume the run in --state if there is one, or start it.")
 @with_object
 @with_part
 @with_given
@@ -93,6 +95,8 @@ def track(**options: Any) -> None:
     With --state, a checkpoint is written every two seconds. After a power failure,
     a crash or Ctrl-C, --resume continues the run with the objects that it had,
     and with the same source, settings and results unless they are given again.
+    --state with --continue resumes the run if there is one in the folder, and
+    starts it otherwise: the same line for a service at each of its starts.
 
     \b
     Writes
@@ -128,6 +132,7 @@ def track(**options: Any) -> None:
                         --zone "door=300,80 420,80 420,400 300,400" --when lost=10,entered
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
+      catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out --state checkpoints --continue
     """
     _Run(**options).execute()
 
@@ -160,13 +165,18 @@ class _Run:
     paused: bool
     state: Path | None
     resume: Path | None
+    continues: bool
 
     def execute(self) -> None:
         """Check everything that can be checked, then run to the end; after Ctrl-C, the exit code is 130."""
         self._check_options()
+        console = messages()
+        if self.continues and self.state is not None and contains_run(self.state):
+            console.print(f"the run in {self.state} continues with the objects that it had")
+            replace(self, state=None, resume=self.state, continues=False, boxes={}, models={}).execute()
+            return
         pipeline = self._pipeline()
         files = self._files(pipeline)
-        console = messages()
         for line in self._doubts(pipeline):
             console.print(line)
         if self.resume is not None:
@@ -197,11 +207,14 @@ class _Run:
         """Raise UsageError if the options contradict each other."""
         if self.state and self.resume:
             raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
+        if self.continues and not self.state:
+            raise click.UsageError("--continue needs the folder of the run, which may not exist yet: --state DIR")
         if not self.resume and not self.source:
             raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
-        if self.resume and self.overwrite:
+        if (self.resume or self.continues) and self.overwrite:
+            option = "--continue" if self.continues else "--resume"
             raise click.UsageError(
-                "--resume continues the existing results, and --overwrite replaces them: give one of them"
+                f"{option} continues the existing results, and --overwrite replaces them: give one of them"
             )
         if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
             raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")

@@ -71,7 +71,9 @@ class Control:
         """Source that the pipeline tracks; empty if it is unknown here."""
         return source_at(self._place)
 
-    def set_box(self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False) -> Answer:
+    def set_box(
+        self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False, time: float | None = None
+    ) -> Answer:
         """Set the box of an object in the next frame that is tracked: x, y, w, h in pixels.
 
         During a pause it is the frame that is held, or the next one of a live source; the pipeline tracks it and stays
@@ -80,8 +82,12 @@ class Control:
         If no object has this name, it is tracked from that frame on, beside the others. Otherwise another object takes
         the name, and everything that was learned of the previous one is dropped; with `keep`, the box corrects the
         position of the same object.
+
+        The box may have been drawn in a picture of a live source: `time` is that of the `Preview`, of the last five
+        seconds. The object is searched for from there to the next frame. The frames are kept for this while anybody
+        receives previews, at most 256 MiB of them; if that of the box is not kept, it applies to the next frame.
         """
-        return self.execute("set-box", object, box=Box.parse(box), keep=keep)
+        return self.execute("set-box", object, box=Box.parse(box), keep=keep, time=time)
 
     def search(self, model: Learned | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Search for the object of a saved model from the next frame on, beside the others.
@@ -143,17 +149,20 @@ class Control:
         keep: bool = False,
         model: bytes | None = None,
         seconds: float | None = None,
+        time: float | None = None,
     ) -> Answer:
         """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol."""
-        command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds)
+        command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds, time)
         self._follow()
         first = min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
         answer = self._commands.ask(command, first)
         if answer is None and first and is_deserted(self._place):
-            raise SilenceError(
-                f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
-                "or give the endpoint of one that runs (--endpoint)"
-            )
+            answer = self._commands.receive(command.id, 0)  # of a pipeline that has just ended
+            if answer is None:
+                raise SilenceError(
+                    f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
+                    "or give the endpoint of one that runs (--endpoint)"
+                )
         answer = answer or self._commands.ask(command, self.timeout - first)
         if answer is None:
             raise SilenceError(

@@ -6,8 +6,9 @@
         for track in tracks:
             print(track.frame, track.state, track.box)
 
-The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them. With
-`object="anna"`, only the messages about this object are transmitted.
+The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them; `behind` is the
+age of the last one, and with `newest=True` older ones are passed over. With `object="anna"`, only the messages about
+this object are transmitted.
 
 `catstream.subscribe("fleet://cam-7", "tracks")` subscribes to a stream of a fleet, wherever it runs: the subscription
 continues if the stream moves to another node.
@@ -49,7 +50,7 @@ class Subscription(Generic[Message]):
     There is one features message for each frame, and one track for each object and frame; after a restart of the
     detector some are repeated. Of models, samples, previews and health reports, the last ones arrive at once; then each
     iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for each
-    object, and the object that has waited longest comes first.
+    object, and the object that has waited longest comes first. With `newest`, the same holds for tracks and features.
 
     The subscription to a stream of a fleet continues if the stream moves or is started again, and while the registry of
     the fleet cannot be reached. A frame that the stream repeats is not returned a second time.
@@ -77,7 +78,14 @@ class Subscription(Generic[Message]):
     """
 
     def __init__(
-        self, endpoint: Place, channel: str, *, object: str | None = None, timeout: float | None = None, keys: str = ""
+        self,
+        endpoint: Place,
+        channel: str,
+        *,
+        object: str | None = None,
+        timeout: float | None = None,
+        keys: str = "",
+        newest: bool = False,
     ) -> None:
         if channel not in PUBLIC:
             raise ServiceError(
@@ -91,7 +99,7 @@ class Subscription(Generic[Message]):
                 "without an object"
             )
         self._about = None if object is None else check_name(object)
-        self.endpoint, self.keys, self.timeout = str(endpoint), keys, timeout
+        self.endpoint, self.keys, self.timeout, self._newest_only = str(endpoint), keys, timeout, newest
         self.end: End | None = None
         self.place: Endpoint | None = None
         self._close_time = float("inf")  # until which messages may still arrive after the end
@@ -117,7 +125,10 @@ class Subscription(Generic[Message]):
 
     @property
     def missed(self) -> int:
-        """Number of frames whose tracks or features were not received; of one object, between its first and last."""
+        """Number of frames whose tracks or features were not received, or were passed over.
+
+        Those of one object count between its first and its last frame.
+        """
         return self._gaps.missed + self._gaps.before
 
     @property
@@ -303,7 +314,8 @@ class Subscription(Generic[Message]):
     def _connect(self, place: Endpoint) -> None:
         only = None if self._about is None else self._channel.messages[0]
         with ExitStack() as stack:
-            self._messages = stack.enter_context(Subscriber(self._channel, place, only, about=self._about))
+            messages = Subscriber[Any](self._channel, place, only, about=self._about, newest=self._newest_only)
+            self._messages = stack.enter_context(messages)
             self._ends, self.place = Subscriber(TRACKS, place, only=End), place
             stack.pop_all()
 
@@ -319,7 +331,13 @@ class Subscription(Generic[Message]):
 
 
 def subscribe(
-    endpoint: Place, channel: str, *, object: str | None = None, timeout: float | None = None, keys: str = ""
+    endpoint: Place,
+    channel: str,
+    *,
+    object: str | None = None,
+    timeout: float | None = None,
+    keys: str = "",
+    newest: bool = False,
 ) -> Subscription[Any]:
     """Subscribe to a channel of a running pipeline.
 
@@ -339,6 +357,9 @@ def subscribe(
         Seconds without a message after which iteration raises `SilenceError`; None to wait without limit.
     keys : str
         Folder of the keys of this client, if the pipeline requires keys.
+    newest : bool
+        Whether each iteration returns the newest track of an object that was not read yet, or the newest features, and
+        passes over older ones: for a program that reacts, and is slower than the pipeline.
 
     Raises
     ------
@@ -350,7 +371,7 @@ def subscribe(
     SilenceError
         If the registry of the fleet does not answer.
     """
-    return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys)
+    return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys, newest=newest)
 
 
 def wait_until_running(endpoint: str, keys: str = "", seconds: float = REPORT_SECONDS) -> Endpoint:

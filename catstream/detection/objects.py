@@ -5,7 +5,7 @@ No two objects of a frame claim the same place: `assigned`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import replace
 
@@ -67,17 +67,26 @@ class Detectors:
         """A frame, uint8 (h, w, 3) BGR, for the calls that take one."""
         return Pyramid(image, self.descriptor)
 
-    def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
+    def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0, later: Iterable[Pyramid] = ()) -> Result:
         """Start an object with its box in the next frame; another one of this name is forgotten.
 
-        Nothing changes after a BoxError, as of `Detector.init`, or an ObjectError, as of `add`.
+        The box may be of a frame in the past: then it is searched for in the `later` ones, of which the last is the
+        next frame. Nothing changes after a BoxError, as of `Detector.init`, or an ObjectError, as of `add`.
         """
         detector = self.detectors.get(name) or self._made(name)
         with errors_about(name):
             result = detector.init(frame, self.seq + 1, time, box)
         self.detectors.pop(name, None)
         self.detectors[name] = detector  # the last one, also if another object had the name
-        return result
+        return self._caught_up(detector, result, time, later)
+
+    def _caught_up(self, detector: Detector, result: Result, time: float, later: Iterable[Pyramid]) -> Result:
+        """The result in the last of some frames, by a search of each; training rows are those of the box."""
+        track, features = result
+        for frame in later:
+            track, found = detector.settle(detector.look(frame, self.seq + 1), frame, self.seq + 1, time)
+            features = replace(found, training=features.training)
+        return track, features
 
     def seek(self, name: str, model: Model, box: Box, likeness: Likeness) -> None:
         """Search for the object of a saved model from the next frame on; another one of this name is forgotten.
@@ -97,9 +106,10 @@ class Detectors:
         self.detectors = trial.detectors
         return results
 
-    def correct(self, name: str, frame: Pyramid, box: Box, time: float = 0.0) -> Result:
-        """Continue an object at another box in the next frame: see `Detector.correct`."""
-        return self.detectors[name].correct(frame, self.seq + 1, time, box)
+    def correct(self, name: str, frame: Pyramid, box: Box, time: float = 0.0, later: Iterable[Pyramid] = ()) -> Result:
+        """Continue an object at another box: see `Detector.correct`; the frames are as in `begin`."""
+        detector = self.detectors[name]
+        return self._caught_up(detector, detector.correct(frame, self.seq + 1, time, box), time, later)
 
     def step(
         self, frame: Pyramid, time: float = 0.0, given: Mapping[str, Result] | None = None

@@ -353,6 +353,7 @@ class Preview:
     """A small picture of a frame, detector -> anyone.
 
     frame   number of the frame
+    time    of the frame, as in its track
     width   width of the frame in pixels; the picture may be smaller
     height  height of the frame in pixels
     boxes   box of each object that is present, in pixels of the frame, by name
@@ -360,6 +361,7 @@ class Preview:
     """
 
     frame: Integer
+    time: Number
     width: Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
     height: Annotated[int, Meta(ge=1, le=LARGEST_INTEGER)]
     boxes: ByObject[Box]
@@ -457,6 +459,8 @@ class Command:
     model    for "search" only: the saved model of the object, which is searched for from the next frame on
     seconds  for "pause" only: time after which the pause ends by itself, unless the command is repeated; 0 ends it now.
              A pause without it lasts until "resume"
+    time     for "set-box" on a live source only: time of the preview in which the box was drawn. If its frame is still
+             kept, the object is searched for from there to the next frame that is tracked
     """
 
     id: Text
@@ -466,6 +470,7 @@ class Command:
     object: ObjectName = ""
     model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] | None = None
     seconds: Number | None = None
+    time: Number | None = None
 
     def __post_init__(self) -> None:
         for name, verb in (("box", "set-box"), ("model", "search")):

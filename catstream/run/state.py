@@ -42,6 +42,11 @@ _ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 _log = logging.getLogger(__name__)
 
 
+def contains_run(folder: Path) -> bool:
+    """Whether a folder contains a run that can be resumed, whether or not that is complete."""
+    return (folder / _SMALL[0]).exists()
+
+
 def last_seq(folder: Path) -> int:
     """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
     return CheckpointStore(folder / TREES).position()[0]

@@ -5,9 +5,9 @@
 /metrics          metrics for Prometheus
 /healthz          200 while this server runs
 /readyz           200 while the pipeline tracks, or the fleet answers; 503 with the reason otherwise
-/pictures/N.jpg   the picture of frame N of a pipeline
+/pictures/T.jpg   the picture of a pipeline of the frame at time T
 /live.mjpeg       the newest pictures of a pipeline with their tracks drawn in, as an MJPEG stream
-/control          POST {"verb": ..., "object": ..., "box": [x, y, w, h], "keep": ..., "seconds": ...} to a pipeline
+/control          POST a command to a pipeline: the fields of `Command`
 /streams/NAME/    all of the above for the pipeline of a stream of a fleet
 """
 
@@ -75,7 +75,7 @@ class Site:
         ]
         routes = [
             *common,
-            Route("/pictures/{frame:int}.jpg", self._picture),
+            Route("/pictures/{time:float}.jpg", self._picture),
             Route("/live.mjpeg", self._live),
             Route("/control", self._control, methods=["POST"]),
         ]
@@ -113,7 +113,7 @@ class Site:
         return PlainTextResponse(f"{problem or 'running'}\n", 503 if problem else 200)
 
     async def _picture(self, request: Request) -> Response:
-        preview = self._pipeline(request).dashboard.picture(request.path_params["frame"])
+        preview = self._pipeline(request).dashboard.picture(request.path_params["time"])
         if preview is None:
             return PlainTextResponse("this picture is no longer available\n", 404)
         return Response(preview.jpeg, media_type="image/jpeg")
@@ -135,7 +135,7 @@ class Site:
         if command.object:
             check_name(command.object)
         try:
-            fields = command.verb, command.object, command.box, command.keep, command.seconds
+            fields = command.verb, command.object, command.box, command.keep, command.seconds, command.time
             answer = await run_in_threadpool(feed.execute, *fields)
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
             raise HTTPException(503, "the server of this page has ended\n") from None
@@ -200,6 +200,7 @@ class Command:
     box: Box | None = None
     keep: bool = False
     seconds: float | None = None
+    time: float | None = None
 
     def __post_init__(self) -> None:
         if (self.box is not None) != (self.verb == "set-box"):

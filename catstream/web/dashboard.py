@@ -35,7 +35,7 @@ _POINTS = 480  # two minutes
 _FRAMES = 4096  # number of frames whose arrival times are kept, for the latency of models
 _TRACKS = 256  # number of frames whose tracks are kept until their picture arrives
 _PICTURES = 64  # number of pictures that a page with a slow connection may still request
-_SHOWN_OF_A_PICTURE = ("frame", "width", "height", "boxes")
+_SHOWN_OF_A_PICTURE = ("frame", "time", "width", "height", "boxes")
 
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
@@ -127,7 +127,7 @@ class Dashboard(Parts):
         self.colours = Colours()
         self.health: dict[str, Health] = {}  #: the last report of each process
         self.last_reports: dict[str, float] = {}  #: times of their arrivals
-        self._pictures: dict[int, Preview] = {}
+        self._pictures: dict[float, Preview] = {}  # by time: skipped frames of a live source have the same number
         self._points: deque[_Point] = deque(maxlen=_POINTS)
         self._last_point = float("-inf")  # time of the last chart point
         self._arrivals: dict[int, float] = {}  # of the first track of each frame
@@ -166,7 +166,7 @@ class Dashboard(Parts):
             case Health():
                 self._add_health(message, now)
             case Preview():
-                _remember(self._pictures, message.frame, message, _PICTURES)
+                _remember(self._pictures, message.time, message, _PICTURES)
                 self._mark_changed("picture")
             case End() if self.phase != "ended":
                 self.phase, self.reason = "ended", message.reason
@@ -196,9 +196,9 @@ class Dashboard(Parts):
         recent = takewhile(lambda moment: now - moment <= RATE_SECONDS, reversed(self._arrivals.values()))
         return len(list(recent)) / RATE_SECONDS
 
-    def picture(self, frame: int) -> Preview | None:
-        """Return the picture of a recent frame, None if it is not kept."""
-        return self._pictures.get(frame)
+    def picture(self, time: float) -> Preview | None:
+        """Return the picture of the recent frame at a time, None if it is not kept."""
+        return self._pictures.get(time)
 
     @property
     def newest(self) -> tuple[Preview, list[Track]] | None:

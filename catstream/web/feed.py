@@ -135,10 +135,12 @@ class PipelineFeed(Feed):
     def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
         return self
 
-    def execute(self, verb: Verb, object: str, box: Box | None, keep: bool, seconds: float | None) -> Answer:
+    def execute(
+        self, verb: Verb, object: str, box: Box | None, keep: bool, seconds: float | None, time: float | None
+    ) -> Answer:
         """Send a command to the pipeline, and wait for its answer."""
         with Control(self._place or self._endpoint, keys=self._keys) as pipeline:
-            return pipeline.execute(verb, object, box=box, keep=keep, seconds=seconds)
+            return pipeline.execute(verb, object, box=box, keep=keep, seconds=seconds, time=time)
 
     def _feed(self) -> None:
         self._place = locate(self._endpoint, self._keys)

@@ -45,8 +45,10 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=_MAX_QUESTIONS)
         self._answer_kind = cast(type[Answer], channel.messages[1])
         self._in_transit = False  # whether a question was sent, and the connection did not break since
+        # With ZMQ_IMMEDIATE, which queues nothing before there is a connection, libzmq would also drop an answer that
+        # was not read yet if the connection ends, as after "stop".
+        self._is_connected = False
         self._socket.set(zmq.LINGER, 0)  # a question that nobody received is given up
-        self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the responder is connected
         self._connect()
 
     def ask(self, question: Question, seconds: float) -> Answer | None:
@@ -78,13 +80,17 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
     def _send(self, data: bytes) -> None:
         self._read_events()  # those from before do not concern this question
         self._in_transit = False
-        with contextlib.suppress(zmq.Again):  # nobody is connected yet
-            self._socket.send(data, zmq.NOBLOCK)
-            self._in_transit = True
+        with contextlib.suppress(zmq.Again):  # the responder does not read
+            if self._is_connected:
+                self._socket.send(data, zmq.NOBLOCK)
+                self._in_transit = True
+
+    def _connected(self) -> None:
+        self._is_connected = True
 
     def _disconnected(self) -> None:
         super()._disconnected()
-        self._in_transit = False
+        self._is_connected = self._in_transit = False
 
 
 class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):

@@ -117,14 +117,20 @@ class Subscriber(ChannelSocket[Message]):
 
     If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
     message of the object that has waited longest is received first. `only` limits it to one kind of message, and
-    `about` to those of this kind about one object.
+    `about` to those of this kind about one object. With `newest`, this holds for any channel.
     """
 
     def __init__(
-        self, channel: Channel[Message], endpoint: Endpoint, only: type | None = None, *, about: str | None = None
+        self,
+        channel: Channel[Message],
+        endpoint: Endpoint,
+        only: type | None = None,
+        *,
+        about: str | None = None,
+        newest: bool = False,
     ) -> None:
         self._newest = channel.keeps == "newest"
-        self._passes_over = self._newest and len(channel.senders) == 1
+        self._passes_over = (newest or self._newest) and len(channel.senders) == 1
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
         self._arrived: dict[Topic, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first

@@ -110,6 +110,7 @@ class Event(Enum):
     """What ZeroMQ reports of a connection."""
 
     STOPPED = "the socket is closed: nothing is reported after it"
+    CONNECTED = "the handshake succeeded"
     DISCONNECTED = "a connection ended"
     DENIED = "the handshake failed: the key was denied (ZAP status 400)"
     OTHER_MECHANISM = "the handshake failed: one side has keys, the other has none"
@@ -118,6 +119,7 @@ class Event(Enum):
 
 _EVENTS = {
     zmq.EVENT_MONITOR_STOPPED: Event.STOPPED,
+    zmq.EVENT_HANDSHAKE_SUCCEEDED: Event.CONNECTED,
     zmq.EVENT_DISCONNECTED: Event.DISCONNECTED,
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: Event.DENIED,
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Event.FAILED,
@@ -419,12 +421,17 @@ class ChannelSocket(Generic[Message]):
         """
         check_owner(self._pid)
         for event in self._monitor.events(seconds) if self._monitor is not None else ():
-            if event is Event.DISCONNECTED:
+            if event is Event.CONNECTED:
+                self._connected()
+            elif event is Event.DISCONNECTED:
                 self._disconnected()
             elif event is not Event.STOPPED:
                 self._handshake_failed(event)
             if event is until:
                 break
+
+    def _connected(self) -> None:
+        """A connection began."""
 
     def _disconnected(self) -> None:
         """A connection ended."""

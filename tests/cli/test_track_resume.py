@@ -2,8 +2,10 @@
 
 import csv
 import json
+import shlex
 import shutil
 import subprocess
+from pathlib import Path
 
 import psutil
 import pytest
@@ -17,6 +19,7 @@ from catstream.run.state import TREES
 from catstream.settings import Settings
 from catstream.video.source import open_source
 
+UNIT = Path(__file__).parents[2] / "deploy" / "catstream@.service"
 OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]
 
 
@@ -129,6 +132,8 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "give one of them": ["track", "--resume", kept, "--state", kept],
         "with the objects that it had": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
         "needs SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
+        "--continue needs the folder": ["track", source, "--continue"],
+        "--continue continues the existing results": ["track", source, "--state", kept, "--continue", "--overwrite"],
     }
     for word, command in refusals.items():
         assert word in fail(*command)
@@ -164,6 +169,39 @@ def test_a_complete_run_gets_no_further_rows_but_files_that_it_lacks_and_that_is
     succeed("track", "--resume", kept, "--start", 0, "--end", 6)  # the same frames
     assert frames(out) == list(range(6))
     assert (out / "demo.ndjson").read_bytes() == before
+
+
+def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_it(
+    video, whole_run, program, until, tmp_path
+):
+    (source, box), kept, out = video, tmp_path / "state", tmp_path / "tracks"
+    (line,) = (
+        line.removeprefix("ExecStart=") for line in UNIT.read_text().splitlines() if line.startswith("ExecStart=")
+    )
+    options = shlex.join(["--box", box, "--write", "-", *OFTEN])
+    for name, value in {"%t": tmp_path, "%i": "gate", "$OPTIONS": options, "${SOURCE}": source}.items():
+        line = line.replace(name, str(value))
+    command = [*program, *shlex.split(line)[1:]]
+    # Nobody reads the standard output, as above.
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, cwd=tmp_path, pipesize=4096, **pipes) as process:
+        until(lambda: process.poll() is not None or (checkpoints(kept) and len(frames(out)) >= 3))
+        assert process.poll() is None, process.stderr.read()
+        kill_everything(process)
+    before = len(frames(out))
+    for says in ("present in", "is complete: to track the source again"):
+        ended = subprocess.run(command, cwd=tmp_path, check=True, **pipes)
+        assert "the run in state continues with the objects that it had" in ended.stderr
+        assert says in ended.stderr
+        assert_goes_on(out / "demo.ndjson", before, whole_run / "out" / "demo.ndjson")
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd-analyze: apt-get install systemd")
+def test_systemd_finds_nothing_wrong_in_the_unit(tmp_path):
+    unit = tmp_path / "catstream@gate.service"
+    unit.write_text(UNIT.read_text().replace("/opt/catstream/bin/catstream", shutil.which("true")))
+    checked = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False)
+    assert (checked.returncode, checked.stderr) == (0, "")
 
 
 def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed, succeed):

@@ -9,6 +9,7 @@ import pytest
 from catstream.box import Box
 from catstream.detection.detector import Detector
 from catstream.detection.likeness import Likeness
+from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
@@ -323,6 +324,22 @@ def test_a_resumed_search_continues_bit_for_bit(scene, learned, likeness):
 def test_a_model_of_other_features_is_rejected(likeness):
     with pytest.raises(ProtocolError, match="learn it again"):
         Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, likeness)
+
+
+def test_a_box_of_a_past_frame_is_searched_for_in_those_since_and_only_its_own_rows_are_learned(scene):
+    places = [(60 + 6 * i, 50 + 4 * i) for i in range(10)]
+    now = Box(*places[-1], 48, 40)
+    detectors = Detectors(Settings())
+    first, *later = (Pyramid(scene(place)) for place in places)
+    track, features = detectors.begin("", first, START, 0.4, later)
+    assert (track.seq, track.time, track.began, features.begins) == (1, 0.4, 0, True)
+    assert track.box.overlap(now) > 0.8
+    _, alone = Detectors(Settings()).begin("", first, START)
+    assert all((features.training[group].rows == alone.training[group].rows).all() for group in GROUPS)
+    detectors.step(later[-1], given={"": (track, features)})
+    track, _ = detectors.correct("", first, START, later=later)
+    assert (track.seq, track.began) == (2, 0)
+    assert track.box.overlap(now) > 0.8
 
 
 def test_tracking_continues_from_a_corrected_box_which_is_learned_from(scene):

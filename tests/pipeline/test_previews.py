@@ -10,6 +10,7 @@ from catstream.box import Box
 from catstream.client.subscription import subscribe
 from catstream.errors import SilenceError
 from catstream.services.outputs import Previews
+from catstream.video.frames import Frame
 from catstream.video.rendered import render
 
 
@@ -34,9 +35,9 @@ def looks(endpoint, previews, until):
 def test_a_preview_shows_the_frame_small_and_contains_its_size(previews, looks):
     ((image, _),) = render(1, (1280, 720))
     with looks() as reader:
-        previews.show(7, image, {"anna": Box(5.0, 6.0, 70.0, 80.0)})
+        previews.show(7, Frame(9, 0.4, image), {"anna": Box(5.0, 6.0, 70.0, 80.0)})
         preview = next(reader)
-    assert (preview.frame, preview.width, preview.height) == (7, 1280, 720)
+    assert (preview.frame, preview.time, preview.width, preview.height) == (7, 0.4, 1280, 720)
     assert preview.boxes == {"anna": Box(5.0, 6.0, 70.0, 80.0)}
     shown = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert cv2.PSNR(shown, cv2.resize(image, (640, 360), interpolation=cv2.INTER_AREA)) > 28
@@ -45,12 +46,12 @@ def test_a_preview_shows_the_frame_small_and_contains_its_size(previews, looks):
 def test_none_is_made_while_nobody_looks(previews, monkeypatch):
     monkeypatch.setattr("catstream.services.outputs.jpeg", None)  # to call it is an error
     for frame in range(5):
-        previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
+        previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
 
 
 def test_a_new_viewer_receives_the_newest_frame_if_none_arrives(previews, looks):
     for frame in range(5):
-        previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
+        previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
     with looks() as reader:
         previews.turn()
         assert next(reader).frame == 4
@@ -61,7 +62,7 @@ def test_frames_that_pass_by_while_none_is_followed_are_seen_though_they_have_on
     with looks() as reader:
         reader.timeout = 0
         for grey in (0, 255):
-            previews.show(3, np.full((48, 64, 3), grey, np.uint8), {})
+            previews.show(3, Frame(grey, 0.4, np.full((48, 64, 3), grey, np.uint8)), {})
             until(lambda: seen.extend(_here(reader)) or any(_grey(preview) == grey for preview in seen), previews.turn)  # noqa: B023
     assert [_grey(preview) for preview in seen] == [0, 255]
 
@@ -71,7 +72,7 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
     with looks() as reader:
         reader.timeout = 0
         for frame in range(200):
-            previews.show(frame, np.zeros((48, 64, 3), np.uint8), {})
+            previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
 
         def look():
             previews.turn()
@@ -80,6 +81,21 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
         until(lambda: 199 in seen, look)
     assert seen == sorted(set(seen))
     assert len(seen) < 200
+
+
+def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_looks(endpoint, until, monkeypatch):
+    monkeypatch.setattr("catstream.services.outputs._PREVIEW_SECONDS", 0.0)
+    with Previews(endpoint, keeps=True) as previews:
+        with subscribe(str(endpoint), "previews", timeout=60):
+            until(lambda: previews.has_subscribers, previews.turn)
+            for number in range(80):
+                previews.show(3, Frame(number, number / 10, np.zeros((48, 64, 3), np.uint8)), {})
+            assert [frame.number for frame in previews.since(3.0)] == list(range(30, 80))
+            assert [previews.since(time) for time in (2.8, 3.05, 9.0)] == [[]] * 3
+            monkeypatch.setattr("catstream.services.outputs._KEPT_BYTES", 3 * 48 * 64 * 3)
+            previews.show(3, Frame(80, 8.0, np.zeros((48, 64, 3), np.uint8)), {})
+            assert [frame.number for frame in previews.since(7.8)] == [78, 79, 80]
+        until(lambda: not previews.since(7.8), previews.turn)
 
 
 def _grey(preview):

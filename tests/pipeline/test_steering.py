@@ -257,6 +257,23 @@ def test_a_pause_with_a_limit_ends_by_itself_and_whoever_attaches_meanwhile_is_t
         assert report.objects[""].keys() == {"model_version", "score", "present"}
 
 
+def test_an_object_begins_where_it_is_by_now_if_its_box_was_drawn_in_a_past_picture_of_a_camera(walker):
+    url, find = walker
+    with (
+        steered(url) as (pipeline, steering, _),
+        subscribe(pipeline.endpoint, "previews", timeout=SECONDS) as pictures,
+    ):
+        drawn = next(pictures)
+        box = find(drawn.jpeg)
+        next(each for each in pictures if not find(each.jpeg).overlap(box))  # it is elsewhere by now
+        answer = steering.set_box(box, time=drawn.time)
+        assert answer.reason.endswith("s before frame 0")
+        shown = next(each for each in pictures if each.boxes)
+        assert shown.boxes[""].overlap(find(shown.jpeg)) > 0.5
+        answer = steering.set_box(find(shown.jpeg), "ben", time=shown.time - 100)
+        assert answer.reason.endswith("as the picture in which it was drawn is not kept any more")
+
+
 def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera):
     path, boxes = video
     with open_source(path) as source:

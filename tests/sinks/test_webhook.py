@@ -117,7 +117,7 @@ def test_an_event_has_the_newest_picture_if_that_is_wanted(receiver, endpoint, u
         with closing(open_sink(url, Origin(endpoint=str(endpoint), options=options))) as sink:
             sink.write(TrackedFrame([FOUND]))
             until(lambda: previews.has_subscribers, previews.serve_late_joiners)
-            previews.send(Preview(7, 640, 480, {}, JPEG))
+            previews.send(Preview(7, 0.28, 640, 480, {}, JPEG))
             until(lambda: sink.write(TrackedFrame([FOUND])) or sink._reports._picture)
     pictures = [body["picture"] for body in receiver.bodies]
     assert pictures == [None, {"frame": 7, "width": 640, "height": 480, "jpeg": b64encode(JPEG).decode()}]

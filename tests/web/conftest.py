@@ -36,7 +36,7 @@ class Facts:
     @staticmethod
     def preview(frame, *names):
         box = Box(4.0, 3.0, 20.0, 10.0)
-        return Preview(frame, 64, 48, dict.fromkeys(names or ("",), box), JPEG + str(frame).encode())
+        return Preview(frame, frame / 25, 64, 48, dict.fromkeys(names or ("",), box), JPEG + str(frame).encode())
 
     @staticmethod
     def tracking(sent, *names):
@@ -128,7 +128,7 @@ def camera_at(rng):
 
             def turn():
                 number = next(frame)
-                pictures.send(Preview(number, 1280, 720, boxes, image))
+                pictures.send(Preview(number, number / 25, 1280, 720, boxes, image))
                 health.send(Health("detector", 1.0, {"sent": float(number)}, source=source))
                 for publisher in (pictures, health):
                     publisher.serve_late_joiners()

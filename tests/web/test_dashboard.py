@@ -169,7 +169,7 @@ def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, en
     assert parts["picture"] is None
     assert not any(leaves for trees in parts["trees"]["objects"].values() for leaves in trees["leaves"])
     assert len(parts.get("points", [])) <= 1
-    assert dashboard.picture(51) is None
+    assert dashboard.picture(51 / 25) is None
 
 
 def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
@@ -177,12 +177,13 @@ def test_recent_pictures_are_kept_and_older_ones_are_not(dashboard, facts):
         dashboard.take(facts.preview(frame), 0.1 * frame)
     assert dashboard.updates({})["picture"] == {
         "frame": 129,
+        "time": 129 / 25,
         "width": 64,
         "height": 48,
         "boxes": {"": (4.0, 3.0, 20.0, 10.0)},
     }
-    assert dashboard.picture(100).jpeg.endswith(b"100")
-    assert dashboard.picture(50) is None
+    assert dashboard.picture(100 / 25).jpeg.endswith(b"100")
+    assert dashboard.picture(50 / 25) is None
 
 
 def names(dashboard):

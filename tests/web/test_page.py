@@ -1,10 +1,13 @@
 """The page in a real browser: objects are drawn with the mouse, one is forgotten, one is tracked after a restart."""
 
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from time import sleep
 
+import httpx
 import pytest
 
+from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
 from catstream.settings import Settings
 from catstream.video.rendered import RATE, Demo
@@ -69,3 +72,29 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
     assert "forgotten object-2 is no longer tracked after frame N" in lines
     assert lines.count("state present") == 2, "before and after the restart"
     assert "overflow 0" in lines
+
+
+def test_an_object_of_a_camera_is_followed_from_the_still_picture_in_which_it_was_drawn(
+    script_of_browser, folder, walker
+):
+    url, find = walker
+    server = Server(pipeline_site(str(folder)), port=0, token=None)
+    words = script_of_browser("live.mjs", server.url, "1")
+    with (
+        server.in_background(),
+        ThreadPoolExecutor(1) as pool,
+        Pipeline(url, settings={"run.endpoint": str(folder)}) as pipeline,
+        subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as browser,
+    ):
+        pool.submit(list, pipeline)  # until it is closed
+        said, time = browser.stdout.readline().split()
+        assert said == "picture"
+        box = find(httpx.get(f"{server.url}pictures/{time}.jpg").content)
+        browser.stdin.write(",".join(map(str, box)) + "\n")
+        browser.stdin.flush()
+        assert browser.stdout.readline() == "still true\n"
+        assert " s before frame 0" in browser.stdout.readline()
+        assert browser.stdout.readline() == "errors []\n"
+        with subscribe(str(folder), "previews", timeout=60) as pictures:
+            shown = next(pictures)
+        assert shown.boxes[""].overlap(find(shown.jpeg)) > 0.5

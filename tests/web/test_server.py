@@ -149,8 +149,8 @@ def test_pictures_are_subscribed_only_while_a_page_is_open(page, updates, pipeli
 
     until(lambda: turn() and page.get("/metrics").text.count('\ncatstream_up{source=""} 1.0\n'))
     assert not pipeline["previews"].has_subscribers
-    frame = updates("picture", turn)["frame"]
-    assert page.get(f"/pictures/{frame}.jpg").content == facts.preview(frame).jpeg
+    picture = updates("picture", turn)
+    assert page.get(f"/pictures/{picture['time']}.jpg").content == facts.preview(picture["frame"]).jpeg
     until(lambda: turn() and not pipeline["previews"].has_subscribers)
 
 

@@ -77,6 +77,15 @@ def test_a_question_whose_connection_broke_is_sent_again_as_soon_as_there_is_ano
     assert heard == [PAUSE]
 
 
+def test_an_answer_is_received_also_if_its_sender_has_ended_before_it_was_read(endpoint, until):
+    with Requester(CONTROL, endpoint) as requester:
+        with Responder(CONTROL, endpoint) as ends:
+            until(lambda: requester.send(PAUSE) or ends.receive_all(0.1))
+            ends.answer(done(PAUSE))
+        assert requester._monitor._events.poll(60_000)  # the end of the connection
+        assert requester.receive(PAUSE.id, 0) == done(PAUSE)
+
+
 def test_a_repeated_command_is_answered_again_and_executed_once(endpoint, raw, until):
     with Responder(CONTROL, endpoint) as responder:
         heard = []

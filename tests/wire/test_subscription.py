@@ -277,6 +277,20 @@ def test_a_reader_that_is_slow_knows_how_old_its_tracks_are(endpoint, tracks, un
         assert subscription.behind == 0
 
 
+def test_who_asks_for_the_newest_gets_that_of_each_object_and_then_the_end(endpoint, tracks):
+    with attached(endpoint, tracks, newest=True) as subscription:
+        for seq in range(2, 50):
+            for name in ("anna", "ben"):
+                tracks.send(track(seq, name))
+        tracks.send(End(50, "the source has ended"))
+        time.sleep(0.2)  # many of them are here
+        heard = [(message.object, message.seq) for message in subscription]
+    assert dict(heard) == {"anna": 49, "ben": 49}
+    assert len(heard) < 2 * 48
+    assert subscription.missed > 0
+    assert subscription.end.reason == "the source has ended"
+
+
 def test_a_reader_that_always_finds_a_track_learns_the_end_of_a_pipeline_that_was_started_again(endpoint, until):
     with Publisher(TRACKS, endpoint) as first:
         subscription = attached(endpoint, first)

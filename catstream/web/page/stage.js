@@ -9,8 +9,8 @@ const TEXT = 13; // height of a name in pixels of the screen
 
 export class Stage {
   /**
-   * objects: the list of the objects. actions: pause() pauses the pipeline and returns {frame, leave}; follow(box, leave)
-   * sends the box; changed(drawing, box) is called whenever the drawing changes.
+   * objects: the list of the objects. actions: hold() returns what the box will apply to; follow(box, still) sends the
+   * box; changed(drawing, box) is called whenever the drawing changes.
    */
   constructor(element, objects, actions) {
     Object.assign(this, { element, objects, actions });
@@ -47,7 +47,7 @@ export class Stage {
     while (this.next) {
       const [wanted, turn, image] = [this.next, this.turn, new Image()];
       this.next = null;
-      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: `pictures/${wanted.frame}.jpg?${Date.now()}` });
+      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: `pictures/${wanted.time}.jpg?${Date.now()}` });
       const loaded = await image.decode().then(() => true, () => false);
       // A picture of the previous pipeline is not shown, nor a newer one than that on which a box is drawn.
       if (!loaded || turn !== this.turn || (this.still && this.still.frame < wanted.frame)) continue;
@@ -58,12 +58,12 @@ export class Stage {
     this.loading = false;
   }
 
-  /** Pause, and begin to draw a box. */
+  /** Hold the picture, and begin to draw a box. */
   async begin() {
     if (this.drawing || !this.picture) return;
     this.drawing = true;
     this.tell();
-    const still = await this.actions.pause();
+    const still = await this.actions.hold();
     if (!still) this.cancel();
     else if (this.drawing) this.still = still;
     else still.leave?.();
@@ -74,7 +74,7 @@ export class Stage {
     if (!this.drawing || !this.box || !this.still || this.asking) return;
     this.asking = true;
     const { x, y, w, h } = this.box;
-    const done = await this.actions.follow([x, y, w, h], this.still.leave);
+    const done = await this.actions.follow([x, y, w, h], this.still);
     this.asking = false;
     if (!done) return;
     const { start } = this; // of the next box: the picture may run again before the answer is here

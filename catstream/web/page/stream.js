@@ -21,7 +21,7 @@ export class StreamPage {
     this.trees = new Trees($(".trees"), $("#tree-summary"));
     this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.askToForget(name) });
     this.form = new BoxForm(this.objects, { accept: () => this.stage.accept(), cancel: () => this.stage.cancel() });
-    this.stage = new Stage($("#stage"), this.objects, { pause: () => this.pause(), follow: (box, leave) => this.follow(box, leave),
+    this.stage = new Stage($("#stage"), this.objects, { hold: () => this.hold(), follow: (box, still) => this.follow(box, still),
       changed: (drawing, box) => this.showDrawing(drawing, box) });
     $("#stream").hidden = false;
     $("#all").hidden = !this.name;
@@ -91,10 +91,12 @@ export class StreamPage {
   }
 
   /**
-   * Pause for drawing a box; returns the frame that the box will apply to, and the function that resumes. The pause ends
-   * by itself if this page does not renew it. Another pause, which the user or another program has begun, stays.
+   * Hold the picture for drawing a box. A live source goes on: the box will apply to the frame at the time of the picture.
+   * A file is paused; returns the frame that the box will apply to, and the function that resumes. The pause ends by
+   * itself if this page does not renew it. Another pause, which the user or another program has begun, stays.
    */
-  async pause() {
+  async hold() {
+    if ((this.status.skipped ?? null) !== null) return { frame: -1, time: this.stage.picture.time, leave: null };
     await this.left; // the pause of a box that was cancelled just now
     if (this.status.state === "waiting") return { frame: Infinity, leave: null };
     const answer = await this.send("pause", { seconds: PAUSE.seconds });
@@ -119,9 +121,9 @@ export class StreamPage {
   }
 
   /** Send the box, as that of a new object or of the chosen one. */
-  async follow(box, leave) {
+  async follow(box, { time, leave }) {
     if (!this.form.check()) return false;
-    const answer = await this.send("set-box", { ...this.form.fields, box: box.map((side) => Math.round(side * 10) / 10) });
+    const answer = await this.send("set-box", { ...this.form.fields, time, box: box.map((side) => Math.round(side * 10) / 10) });
     if (!answer) return false;
     this.objects.choose(answer.object);
     if (leave) {
