@@ -227,8 +227,8 @@ class TeachingSettings(_Group):
         int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
     ] = 10
     interval: Annotated[
-        int, _about("Of the frames that the model explains, every which one is taught (1: all).", ge=1, le=1024)
-    ] = 3
+        int, _about("Of so many frames that the model explains, one is taught (1: all).", ge=1, le=1024)
+    ] = 2
 
 
 @dataclass(frozen=True, kw_only=True)

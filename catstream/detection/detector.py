@@ -124,9 +124,11 @@ class Detector:
         state = self._known()
         if not self.model.version or state.level != "confident" or seq - state.first_frame <= _YOUNG:
             return False
-        # Several objects are taught in different frames, as far as their names allow.
-        is_due = (seq + crc32(self.name.encode())) % self.settings.teaching.interval == 0
-        return found.score >= _EXPLAINED and not is_due
+        # One frame of each block is due, and in the next block the one after it, as other intervals are even. Several
+        # objects are taught in different frames, as far as their names allow.
+        interval = self.settings.teaching.interval
+        block, place = divmod(seq + crc32(self.name.encode()), interval)
+        return found.score >= _EXPLAINED and place != block % interval
 
     def _is_still(self, found: Detection, seq: int) -> bool:
         """Whether the surroundings of the object are still those of a recent frame that was taught (docs/paper.md)."""
