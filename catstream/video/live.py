@@ -45,6 +45,8 @@ _OPTIONS = {"rtsp_flags": "prefer_tcp", "analyzeduration": "500000"}
 #: To look for JPEGs: FFmpeg would wait for several of them, and invent time stamps.
 _JPEG_OPTIONS = {"probesize": "32", "analyzeduration": "1", "fflags": "nofillin"}
 
+_LATE_SECONDS, _CAUGHT_UP_SECONDS = 2.0, 0.5  # of a picture, from which frames are left out, and are not any more
+
 _log = logging.getLogger(__name__)
 
 
@@ -200,7 +202,7 @@ class LiveSource(Source):
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
-            now = monotonic()
+            now, backlog = monotonic(), Backlog()
             for packet in container.demux():
                 before, now = now, monotonic()
                 if self._closed:
@@ -208,6 +210,11 @@ class LiveSource(Source):
                 if now > due:
                     raise TimeoutError(_SILENT if now - before > 0.9 * settings.silent_seconds else _NO_FRAME)
                 if packet.stream_index != stream.index:  # sound may go on while the picture does not
+                    continue
+                sent = None if packet.pts is None or is_segmented else float(packet.pts * packet.time_base)
+                if backlog.arrives(now, sent, is_key=packet.is_keyframe):
+                    self.skipped += 1
+                    due = now + settings.silent_seconds
                     continue
                 decoded: list[VideoFrame] = []
                 with contextlib.suppress(av.FFmpegError):  # the packet is damaged; the next may be whole
@@ -217,6 +224,7 @@ class LiveSource(Source):
                         if not is_segmented or self._is_next(frame):
                             yield frame
                         due = monotonic() + settings.silent_seconds + is_segmented * _LONGEST_SEGMENT
+                backlog.is_done(monotonic())
 
     def _is_next(self, frame: VideoFrame) -> bool:
         """Wait until a frame of a segment is due; returns False if a segment was fetched again, and it was shown."""
@@ -251,6 +259,40 @@ class LiveSource(Source):
             _log.warning("the source %s is lost (%s); it is reopened until it is back", self.name, problem)
             self._logged[problem], self._is_logged = now, True
         self._problem = problem
+
+
+class Backlog:
+    """Which packets of a stream are left out, because they arrive faster than they are decoded.
+
+    The picture would be ever older. If it is late by some seconds, only key frames are decoded until it is not: nothing
+    refers to what is left out. It is not late if decoding mostly waits for packets, whatever the clock of the camera
+    says.
+    """
+
+    def __init__(self) -> None:
+        self._is_late = False
+        self._least = math.inf  # age of a packet that did not wait: its arrival less its time stamp
+        self._done: float | None = None  # when the packet before was decoded
+        self._key, self._waited = 0.0, 0.0  # arrival of the last key frame, and seconds without a packet since then
+
+    def arrives(self, now: float, time: float | None, *, is_key: bool) -> bool:
+        """Return whether a packet with this time stamp, which arrives now, is left out."""
+        if time is None:
+            return False
+        self._waited, self._done = self._waited + now - (now if self._done is None else self._done), now
+        age = now - time
+        self._least = min(self._least, age)
+        if is_key:
+            if self._waited > (now - self._key) / 2:
+                self._least = age
+            self._is_late = self._is_late and age - self._least > _CAUGHT_UP_SECONDS
+            self._key, self._waited = now, 0.0
+        self._is_late = self._is_late or age - self._least > _LATE_SECONDS
+        return self._is_late and not is_key
+
+    def is_done(self, now: float) -> None:
+        """Note that a packet is decoded."""
+        self._done = now
 
 
 def _is_http(text: str) -> bool:

@@ -189,6 +189,26 @@ def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     assert not caplog.records, "what never was there is not lost, and not opened again"
 
 
+@pytest.mark.parametrize(
+    ("seconds", "left_out", "late"),
+    [(0.03, (0, 0), 0.1), (0.08, (0.4, 0.7), 2.1), (0.5, (0.9, 0.97), 2.6)],
+)
+def test_a_stream_that_is_decoded_too_slowly_is_never_far_behind_and_goes_on_at_a_key_frame(seconds, left_out, late):
+    backlog, moment, left, ages, broken = live.Backlog(), 0.0, 0, [], False
+    for number in range(3000):  # two minutes, with a key frame every second
+        moment, is_key = max(moment, number / 25), number % 25 == 0
+        if backlog.arrives(moment, number / 25, is_key=is_key):
+            left, broken = left + 1, True
+            continue
+        assert is_key or not broken, "a frame refers to the one before"
+        broken, moment = False, moment + seconds
+        backlog.is_done(moment)
+        ages.append(moment - number / 25)
+    low, high = left_out
+    assert low <= left / 3000 <= high
+    assert max(ages) <= late
+
+
 def test_a_camera_that_does_not_exist_is_an_error():
     with pytest.raises(VideoError, match=r"no such file.*\./987$"):
         open_source("987")
