@@ -248,7 +248,7 @@ def main(descriptor: int, program: int) -> None:
                 return
             log, watchdog, answer_to = descriptors
             request = json.loads(data)
-            with suppress(Exception):  # as above
+            with suppress(Exception):  # the process reports it
                 import_module(f"catstream.services.{request['name']}_process")
             gc.freeze()  # a later collection leaves the memory alone that all processes share
             parent = os.getpid()

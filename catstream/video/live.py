@@ -279,9 +279,11 @@ class Backlog:
         """Return whether a packet with this time stamp, which arrives now, is left out."""
         if time is None:
             return False
-        self._waited, self._done = self._waited + now - (now if self._done is None else self._done), now
-        age = now - time
+        wait, self._done, age = now - (now if self._done is None else self._done), now, now - time
+        self._waited += wait
         self._least = min(self._least, age)
+        if wait > _LATE_SECONDS / 2:  # the network stood still, and what it held back arrives now
+            self._least = age
         if is_key:
             if self._waited > (now - self._key) / 2:
                 self._least = age

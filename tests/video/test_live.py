@@ -209,6 +209,15 @@ def test_a_stream_that_is_decoded_too_slowly_is_never_far_behind_and_goes_on_at_
     assert max(ages) <= late
 
 
+def test_nothing_is_left_out_after_the_network_stood_still():
+    backlog, moment = live.Backlog(), 0.0
+    for number in range(1000):
+        moment = max(moment, number / 25, 23.0 if number >= 510 else 0.0)  # 510 was due at 20.4
+        assert not backlog.arrives(moment, number / 25, is_key=number % 250 == 0)
+        moment += 0.005
+        backlog.is_done(moment)
+
+
 def test_a_camera_that_does_not_exist_is_an_error():
     with pytest.raises(VideoError, match=r"no such file.*\./987$"):
         open_source("987")
