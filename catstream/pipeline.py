@@ -24,7 +24,7 @@ from catstream.errors import ProtocolError, ServiceError, SettingsError, without
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
-from catstream.messages.storage import why_not_writable
+from catstream.messages.storage import check_file
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
 from catstream.run.state import begun, last_seq, last_time, saved
@@ -157,8 +157,7 @@ class Pipeline:
         )
         saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
         for file in saved_models.values():
-            if reason := why_not_writable(file):
-                raise ServiceError(reason)
+            check_file(file)
         if not job.source:
             raise SettingsError("a new run needs a source: give one")
         if job.settings.run.lockstep and is_live(job.source):

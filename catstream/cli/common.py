@@ -130,21 +130,13 @@ def stopped(result: str = "") -> NoReturn:
     raise SystemExit(INTERRUPTS.exit_code)
 
 
-def check_file(file: Path, *, overwrite: bool) -> None:
-    """Check before the work that a file can be written: ServiceError if it exists, or its folder is not writable."""
-    from catstream.messages.storage import why_not_writable
-
-    if file.exists() and not overwrite:
-        raise ServiceError(f"{file} exists already: replace it with --overwrite, or give another name")
-    if reason := why_not_writable(file):
-        raise ServiceError(reason)
-
-
 def _checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
+    from catstream.messages.storage import check_file
+
     if file is not None:
         if file.is_file() and file.suffix != ".json":
             raise ServiceError(f"{file} exists already, and only a file whose name ends with .json is replaced")
-        check_file(file, overwrite=True)
+        check_file(file)
     return file
 
 

@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from catstream.cli.attach import with_fleet_address
-from catstream.cli.common import check_file, screen, table
+from catstream.cli.common import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
 from catstream.errors import FleetError
@@ -253,7 +253,7 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
     if output is not None:
-        check_file(output, overwrite=overwrite)
+        storage.check_file(output, overwrite=overwrite)
     with Console(stderr=True).status("merging"):
         merged = running.merge(*names, object=object_name)
     if output is not None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from catstream.cli.common import INTERRUPTS, check_file, complain, line_of, messages, screen, stopped, table, text
+from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
 from catstream.errors import CatstreamError, VideoError
 from catstream.messages.names import counted
+from catstream.messages.storage import check_file
 from catstream.numerics.threads import one_thread
 from catstream.run.learned import Learned
 from catstream.run.learned import merge as merged

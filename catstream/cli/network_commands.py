@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from catstream.cli.common import INTERRUPTS, check_file
+from catstream.cli.common import INTERRUPTS
 from catstream.errors import require_extra
+from catstream.messages.storage import check_file
 from catstream.services.options import PATH, with_overwrite
 
 _Levels = tuple[float, float, float]

@@ -36,7 +36,7 @@ from catstream.services.options import (
     with_part,
     with_reading,
 )
-from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_file, is_file, shown
+from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_result, is_file, shown
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SHORTEST_SECONDS = 1.0  # a shorter run is reported without its frames per second
@@ -254,7 +254,7 @@ class _Run:
         files = RunFiles(origin, results.output, places)
         files.check(overwrite=self.overwrite, earlier=places_of(pipeline.name, pipeline.earlier_results))
         for file in self.saved.values():
-            check_file(file, may_exist=self.overwrite, source=pipeline.source, made=files.output)
+            check_result(file, overwrite=self.overwrite, source=pipeline.source, made=files.output)
         return files
 
     def _doubts(self, pipeline: Pipeline) -> Iterator[str]:

@@ -140,7 +140,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
     for place in places:
         destinations.check_sink(place, options)
         if destinations.is_file(place):
-            destinations.check_file(Path(place), may_exist=overwrite)
+            destinations.check_result(Path(place), overwrite=overwrite)
     written, reason, run = 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     with subscribe(endpoint, "tracks", keys=keys) as tracks:
@@ -205,7 +205,7 @@ def export(log: Path, dest: Path, name: str | None, size: str | None, label: str
     if next(read_frames(log), None) is None:
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:
-        destinations.check_file(dest, may_exist=overwrite, source=str(log))
+        destinations.check_result(dest, overwrite=overwrite, source=str(log))
     about = About(log.stem, None if size is None else _size(size), label)
     destinations.export((frame for frame, _ in read_frames(log)), dest, row, about)
 

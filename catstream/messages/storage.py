@@ -97,23 +97,25 @@ def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceEr
         raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
 
 
-def is_writable(folder: Path) -> bool:
-    """Whether a file can be created in a folder."""
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+def check_file(
+    path: Path, *, overwrite: bool = True, made: Path | None = None, kind: type[CatstreamError] = ServiceError
+) -> None:
+    """Raise an error of this kind if a file exists and may not be replaced, or cannot be written.
 
-
-def why_not_writable(path: Path, made: Path | None = None) -> str:
-    """Why a file cannot be made or replaced, and what to do; empty if it can. The folder `made` is made before it."""
+    The folder `made` is made before the file, if it does not exist.
+    """
+    if path.exists() and not overwrite:
+        raise kind(f"{path} exists already: replace it with --overwrite, or give another name")
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
         folder = next(each for each in (folder, *folder.parents) if each.exists())
-    if path.is_dir() or not is_writable(folder):
-        return f"cannot write {path}: give a file in a folder that exists and that you may write to"
-    return ""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            is_writable = not path.is_dir()
+    except OSError:
+        is_writable = False
+    if not is_writable:
+        raise kind(f"cannot write {path}: give a file in a folder that exists and that you may write to")
 
 
 @contextlib.contextmanager

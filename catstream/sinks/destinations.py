@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, cast
 
 from catstream.errors import VideoError, require_extra, without_password
 from catstream.messages.kinds import Track
-from catstream.messages.storage import why_not_writable, writing
+from catstream.messages.storage import check_file, writing
 from catstream.run.job import SinkOptions
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
@@ -176,17 +176,11 @@ def is_file(place: str) -> bool:
     return place != STDOUT and "://" not in place
 
 
-def check_file(path: Path, *, may_exist: bool, source: str = "", made: Path | None = None) -> None:
-    """Raise VideoError if a file exists and may not, is the source of the frames, or cannot be written.
-
-    The folder `made` is made before the file, if it does not exist.
-    """
+def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
+    """Raise VideoError if a file is the source of the frames, or as `storage.check_file` does."""
     if source and path.exists() and Path(source).exists() and path.samefile(source):
         raise VideoError(f"{path} is the source, which would be lost: give another name or folder")
-    if path.exists() and not may_exist:
-        raise VideoError(f"{path} exists already: replace it with --overwrite, or give another name")
-    if reason := why_not_writable(path, made):
-        raise VideoError(reason)
+    check_file(path, overwrite=overwrite, made=made, kind=VideoError)
 
 
 def check_sink(place: str, options: SinkOptions) -> None:

@@ -26,7 +26,7 @@ from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing
 from catstream.run.job import Results
 from catstream.sinks.database import read_database
-from catstream.sinks.destinations import Origin, TrackedFrame, check_file, check_sink, is_file, open_sink, sink_of
+from catstream.sinks.destinations import Origin, TrackedFrame, check_result, check_sink, is_file, open_sink, sink_of
 from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
@@ -231,7 +231,7 @@ class RunFiles:
                 continued = place in earlier and row.repeats and self._log() is not None
                 if place in earlier and not continued and Path(place).exists():
                     raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
-                check_file(Path(place), may_exist=overwrite or continued, source=source, made=self.output)
+                check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
 
     def position(self) -> int | None:
         """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log."""
