@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from catstream.detection.objects import Detectors
@@ -15,18 +14,51 @@ from catstream.services.decisions import DesiredObject, DesiredState
 #: The reason of a stream's end, if a command stopped it.
 STOPPED = "it was stopped by a command"
 
-#: A desired state, and the answer to the command that has led to it.
-Changed = tuple[DesiredState, Answer]
-
 
 def carried_out(
     command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None = None
-) -> Changed:
+) -> tuple[DesiredState, Answer]:
     """The desired state after a command that needs no frame, and the answer; `model` begins an object for `search`.
 
     ObjectError or SettingsError if it cannot be carried out. The `detectors` are not changed.
     """
-    return _VERBS[command.verb](command, desired, detectors, model)
+    name, seq, seconds = command.object, detectors.seq, command.seconds or 0.0
+    after = f"after frame {seq - 1}" if seq else "before the first frame"
+    match command.verb:
+        case "pause" if desired.paused or command.seconds is None:
+            desired, effect = replace(desired, paused=True), f"paused {after}"
+        case "pause" if seconds > 0:  # it ends by itself, and changes nothing that is kept
+            effect = f"paused for {seconds:g} s {after}"
+        case "pause" | "resume":
+            desired = replace(desired, paused=False)
+            effect = "waiting for a box" if desired.holds else f"resumed {after}"
+        case "stop":
+            desired, effect = replace(desired, stopped=True), f"the stream ends {after}"
+        case "search":
+            name = object_of(command, desired)
+            check_room(name, desired, detectors.settings.run.objects_most)
+            if model is None:
+                raise ObjectError("a search needs a saved model: give the file of one")
+            desired = desired.begun(name, replace(model, begins=seq + 1))
+            check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
+            effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
+        case "forget":
+            name = _tracked(command, desired)
+            desired = desired.without(name)
+            waits = "" if desired.objects else ": no object is left, so the run waits for a box"
+            effect = f"{listed([name])} is no longer tracked {after}{waits}"
+            return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
+        case _:  # "save": the client writes the file
+            name = _tracked(command, desired)
+            known = detectors.detectors.get(name)
+            if known is None or known.state is None or not known.model.version:
+                why = "nothing was learned of the object yet: try again once there is a model (catstream status)"
+                return desired, answer(command, detectors, False, why, name)
+            if known.state.is_sought:
+                why = "the object of the saved model was not found yet: try again once it was"
+                return desired, answer(command, detectors, False, why, name)
+            effect = f"model {known.model.version} {after}"
+    return desired, answer(command, detectors, True, effect, name)
 
 
 def answer(
@@ -62,70 +94,6 @@ def is_kept(command: Command, name: str, desired: DesiredState, detectors: Detec
     return command.keep and bool(known and known.model.version and each and each.begins <= detectors.seq)
 
 
-def _pause(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Changed:
-    """Pause until `resume`. A pause that ends by itself changes nothing that is kept, nor a pause until `resume`."""
-    desired = replace(desired, paused=desired.paused or command.seconds is None)
-    seconds = command.seconds or 0.0
-    if not desired.paused and seconds <= 0:
-        return _resume(command, desired, detectors, model)
-    limit = "" if desired.paused else f" for {seconds:g} s"
-    return desired, answer(command, detectors, True, f"paused{limit} {_after(detectors)}")
-
-
-def _resume(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
-    desired = replace(desired, paused=False)
-    effect = "waiting for a box" if desired.holds else f"resumed {_after(detectors)}"
-    return desired, answer(command, detectors, True, effect)
-
-
-def _stop(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
-    return replace(desired, stopped=True), answer(command, detectors, True, f"the stream ends {_after(detectors)}")
-
-
-def _search(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Changed:
-    """Begin an object in the next frame: it is searched for by a saved model."""
-    name, seq = object_of(command, desired), detectors.seq
-    check_room(name, desired, detectors.settings.run.objects_most)
-    if model is None:
-        raise ObjectError("a search needs a saved model: give the file of one")
-    desired = desired.begun(name, replace(model, begins=seq + 1))
-    check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
-    effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
-    return desired, answer(command, detectors, True, effect, name)
-
-
-def _forget(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
-    """Stop tracking an object from the next frame on; everything learned of it is dropped."""
-    name = _tracked(command, desired)
-    desired = desired.without(name)
-    waits = "" if desired.objects else ": no object is left, so the run waits for a box"
-    effect = f"{listed([name])} is no longer tracked {_after(detectors)}{waits}"
-    return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
-
-
-def _save(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Changed:
-    """Answer with the version of the model; the client writes the file."""
-    name = _tracked(command, desired)
-    known = detectors.detectors.get(name)
-    if known is None or known.state is None or not known.model.version:
-        why = "nothing was learned of the object yet: try again once there is a model (catstream status)"
-    elif known.state.is_sought:
-        why = "the object of the saved model was not found yet: try again once it was"
-    else:
-        return desired, answer(command, detectors, True, f"model {known.model.version} {_after(detectors)}", name)
-    return desired, answer(command, detectors, False, why, name)
-
-
-_VERBS: dict[str, Callable[[Command, DesiredState, Detectors, DesiredObject | None], Changed]] = {
-    "pause": _pause,
-    "resume": _resume,
-    "stop": _stop,
-    "search": _search,
-    "forget": _forget,
-    "save": _save,
-}
-
-
 def _tracked(command: Command, desired: DesiredState) -> str:
     """The name of the object that a command is for; ObjectError if there is no such object."""
     name, names = object_of(command, desired), desired.objects
@@ -134,7 +102,3 @@ def _tracked(command: Command, desired: DesiredState) -> str:
     if name not in names:
         raise ObjectError(f"there is no object {name!r}: the objects are {listed(names)}")
     return name
-
-
-def _after(detectors: Detectors) -> str:
-    return f"after frame {detectors.seq - 1}" if detectors.seq else "before the first frame"
