@@ -12,15 +12,13 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, suppress
-from copy import copy
+from contextlib import ExitStack
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from catstream.errors import ProtocolError, ServiceError, SettingsError, without_password
+from catstream.errors import ServiceError, SettingsError, without_password
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes
@@ -28,7 +26,6 @@ from catstream.messages.storage import check_file
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
 from catstream.run.state import begun, last_seq, last_time, saved
-from catstream.services.decisions import DESIRED, DesiredState
 from catstream.services.start_server import start_server
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
@@ -96,6 +93,8 @@ class Pipeline:
         Width and height of a frame.
     live : bool
         Whether the source is a camera or a stream.
+    after : int or None
+        As given; another value counts if it is set before the start.
     saved_models : list of Path
         At the end: the files of `save_model` that were written.
 
@@ -178,7 +177,7 @@ class Pipeline:
             self._resumed_job.check_fits(self._job, self._state)
         self._save_models = job.results.models if save_model is None else saved_models
         self.saved_models: list[Path] = []
-        self._after = after
+        self.after = after
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
         self._rows = 0
@@ -209,17 +208,6 @@ class Pipeline:
     def earlier_results(self) -> Results:
         """The files of the run that is resumed; none for a new run."""
         return self._resumed_job.results if self._resumed_job is not None else Results()
-
-    def starting_after(self, seq: int | None) -> Self:
-        """A copy of a pipeline that has not started yet, with another `after`."""
-        other = copy(self)
-        other._after = seq
-        return other
-
-    def __getstate__(self) -> object:
-        if self._stack is not None:
-            raise ServiceError("a pipeline that has started cannot be copied, as its run is one: copy it before that")
-        return super().__getstate__()
 
     def __enter__(self) -> Self:
         if self._stack is not None:
@@ -390,20 +378,10 @@ class Pipeline:
     def holding(self) -> RunState | Literal[""]:
         """Reason for which no frames are tracked: the source is "lost", or the run is "waiting" for a box or "paused".
 
-        Empty if they are tracked.
+        Empty if they are tracked, and before the detector has reported it.
         """
-        state, _ = run_state(self.health.get("detector") or self._held_at_start)
+        state, _ = run_state(self.health.get("detector", {}))
         return "" if state in ("running", "ended") else state
-
-    @cached_property
-    def _held_at_start(self) -> dict[str, float]:
-        """The reasons for which the run starts without tracking; those of a resumed run are in its folder."""
-        waiting, paused = not self._job.boxes and not self._job.models, self._job.paused
-        if self._resumed_job is not None and self._state is not None:
-            with suppress(ProtocolError):  # the detector reports it, and starts with the objects of the job
-                desired = DesiredState.load(self._state / DESIRED)
-                waiting, paused = not desired.objects, paused or desired.paused
-        return {"waiting": waiting, "paused": paused}
 
     @property
     def _start(self) -> int:
@@ -411,6 +389,6 @@ class Pipeline:
         if self._resumed_job is None or self._state is None:
             return 0
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
-        if self._after is not None and not self.live:
-            return self._after
-        return max(last_seq(self._state), self._after or 0)
+        if self.after is not None and not self.live:
+            return self.after
+        return max(last_seq(self._state), self.after or 0)

@@ -180,7 +180,7 @@ class _Run:
         for line in self._doubts(pipeline):
             console.print(line)
         if self.resume is not None:
-            pipeline = pipeline.starting_after(files.position())
+            pipeline.after = files.position()
         progress = RunProgress(pipeline)
         try:
             interrupted = self._run(pipeline, files, progress, console)
@@ -303,12 +303,12 @@ class _Run:
         self, pipeline: Pipeline, files: RunFiles, progress: RunProgress, line: Progress, stack: ExitStack
     ) -> None:
         """Write every track to all files, which the stack closes, and show it."""
-        endpoint, held = pipeline.endpoint, bool(pipeline.holding)
+        endpoint, has_said = pipeline.endpoint, False
         write = stack.enter_context(files.opened(endpoint, resume=True)) if self.resume is not None else None
         moment = time.perf_counter()
-        for tracks in pipeline.by_frame(_REFRESH_SECONDS) if held else pipeline.by_frame():
-            if held and "detector" in pipeline.health:  # it answers commands from now on
-                held = False
+        for tracks in pipeline.by_frame(_REFRESH_SECONDS):
+            if not has_said and "detector" in pipeline.health:  # it answers commands from now on
+                has_said = True
                 self._say_what_holds(pipeline, line.console)
             if not tracks:
                 continue

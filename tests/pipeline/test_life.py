@@ -1,11 +1,9 @@
 """A pipeline in a program: with `with` and without, more than once, in threads, and in an event loop."""
 
 import asyncio
-import copy
 import gc
 import json
 import os
-import pickle
 import signal
 import sys
 import time
@@ -90,15 +88,6 @@ def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
         _ = pipeline.endpoint
 
 
-@pytest.mark.parametrize("made", [lambda it: it.starting_after(None), copy.copy, copy.deepcopy, pickle.dumps])
-def test_a_pipeline_is_copied_before_its_start_only(pipeline, made):
-    made(pipeline)
-    with pipeline:
-        with pytest.raises(ServiceError, match="before that"):
-            made(pipeline)
-        assert len(list(pipeline)) == 20
-
-
 @pytest.mark.timeout(60)
 def test_a_run_of_a_live_source_is_resumed_with_its_first_frame(tmp_path):
     """The second frame would come after 100 s."""
@@ -167,14 +156,14 @@ def test_a_process_that_dies_is_restarted_however_long_the_loop_takes(pipeline, 
         assert pipeline.restarts == 1
 
 
-def test_a_run_that_starts_paused_waits_with_its_first_frame(video):
+def test_a_run_that_starts_paused_waits_with_its_first_frame(video, until):
     path, boxes = video
     with (
         Pipeline(path, boxes[0], SETTINGS, part=PART, paused=True) as pipeline,
         subscribe(pipeline.endpoint, "tracks", timeout=60) as tracks,
         control(pipeline.endpoint, timeout=60) as steering,
     ):
-        assert pipeline.holding == "paused"
+        until(lambda: pipeline.holding == "paused")
         assert steering.resume().reason == "resumed before the first frame"
         assert [track.frame for track in pipeline] == list(range(20))
         assert [track.frame for track in tracks] == list(range(20))

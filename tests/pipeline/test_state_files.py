@@ -44,13 +44,11 @@ def test_a_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_that_was_paused_or_has_no_object_left_says_so_when_it_is_resumed(state):
-    assert Pipeline(resume=state).holding == ""
-    desired = DesiredState.load(state / DESIRED)
-    replace(desired, paused=True).save(state / DESIRED)
-    assert Pipeline(resume=state).holding == "paused"
-    replace(desired, objects={}).save(state / DESIRED)
-    assert Pipeline(resume=state).holding == "waiting"
+@pytest.mark.parametrize(("changed", "held"), [({"paused": True}, "paused"), ({"objects": {}}, "waiting")])
+def test_a_run_that_was_paused_or_has_no_object_left_says_so_when_it_is_resumed(state, until, changed, held):
+    replace(DesiredState.load(state / DESIRED), **changed).save(state / DESIRED)
+    with Pipeline(resume=state) as pipeline:
+        until(lambda: pipeline.holding == held)
 
 
 @pytest.mark.parametrize("lockstep", [False, True])
