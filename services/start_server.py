@@ -114,12 +114,6 @@ class StartedProcess:
             self._receive(_LOOK_SECONDS)
         self._answers.close()
 
-    def reap(self) -> None:
-        """Ask for the exit code of a process that the server has left behind to this one, if that has the number 1."""
-        if self.lost and self._pid and os.getpid() == 1:
-            with suppress(ChildProcessError):
-                os.waitpid(self._pid, 0)
-
 
 class StartServer:
     """A start server, as its program sees it; ServiceError if the program is not one that Python runs."""
@@ -128,7 +122,6 @@ class StartServer:
         if getattr(sys, "frozen", False) or not os.access(sys.executable or "", os.X_OK):
             raise ServiceError("a frozen program has no Python to start processes with: run it with python")
         self.program = os.getpid()  # a copy of this process that is forked later has no server
-        self._started: list[StartedProcess] = []
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # If the program has closed its standard output, the socket may have its number.
         passed = fcntl.fcntl(theirs, fcntl.F_DUPFD_CLOEXEC, 3)
@@ -165,17 +158,13 @@ class StartServer:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, suppress(ConnectionError):  # the server has just ended: so has the process
             socket.send_fds(self._requests, [json.dumps(request).encode()], [log, watchdog, theirs.fileno()])
-        self._started = [each for each in self._started if each.poll() is None]
-        self._started.append(StartedProcess(ours))
-        return self._started[-1]
+        return StartedProcess(ours)
 
     def close(self) -> None:
         """End the server, and its processes with it."""
         self._requests.close()
         self._process.kill()  # it may be in a long import
         self._process.wait()
-        for each in self._started:
-            each.reap()
 
 
 _server: StartServer | None = None
