@@ -17,7 +17,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Literal
@@ -32,7 +32,6 @@ from starlette.staticfiles import StaticFiles
 
 from catstream.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
-from catstream.messages.names import check_name
 from catstream.video.annotate import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
@@ -132,11 +131,8 @@ class Site:
             if len(body := body + part) > _MAX_BODY:
                 raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
         command = decode_json(body, Command)
-        if command.object:
-            check_name(command.object)
         try:
-            fields = command.verb, command.object, command.box, command.keep, command.seconds, command.time
-            answer = await run_in_threadpool(feed.execute, *fields)
+            answer = await run_in_threadpool(feed.execute, **asdict(command))
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
             raise HTTPException(503, "the server of this page has ended\n") from None
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
@@ -201,12 +197,6 @@ class Command:
     keep: bool = False
     seconds: float | None = None
     time: float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.box is not None) != (self.verb == "set-box"):
-            raise ProtocolError(f"expected a box with set-box and with nothing else, got {self.verb}")
-        if self.object and self.verb not in ("set-box", "forget"):
-            raise ProtocolError(f"expected no object with {self.verb}, got {self.object!r}")
 
 
 def _failed(_: Request, error: Exception) -> Response:

@@ -18,12 +18,11 @@ from typing import Any, cast
 
 from starlette.exceptions import HTTPException
 
-from catstream.box import Box
 from catstream.client.control import Control
 from catstream.client.registry import Registry, address_of, locate
 from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
-from catstream.messages.kinds import Answer, End, Verb
+from catstream.messages.kinds import Answer, End
 from catstream.web.dashboard import Dashboard, FleetDashboard, Parts
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
@@ -135,12 +134,10 @@ class PipelineFeed(Feed):
     def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
         return self
 
-    def execute(
-        self, verb: Verb, object: str, box: Box | None, keep: bool, seconds: float | None, time: float | None
-    ) -> Answer:
-        """Send a command to the pipeline, and wait for its answer."""
+    def execute(self, **command: Any) -> Answer:
+        """Send a command, by its fields, to the pipeline, and wait for its answer."""
         with Control(self._place or self._endpoint, keys=self._keys) as pipeline:
-            return pipeline.execute(verb, object, box=box, keep=keep, seconds=seconds, time=time)
+            return pipeline.execute(**command)
 
     def _feed(self) -> None:
         self._place = locate(self._endpoint, self._keys)
