@@ -15,6 +15,7 @@ import contextlib
 import logging
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -139,28 +140,18 @@ def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterato
     Yields the list of the files that were saved, filled afterwards.
     """
     done: list[Path] = []
+    errors: list[CatstreamError] = []
     owner = os.getpid()
     try:
         yield done
-    except BaseException:
-        if owner == os.getpid():  # not a copy that was forked during the run
-            for error in _save(files, state, settings, done):
-                _log.warning("%s", error)
-        raise
-    errors = _save(files, state, settings, done)
-    for error in errors[1:]:
-        _log.warning("%s", error)
+    finally:
+        for name, file in files.items() if owner == os.getpid() else ():  # not in a copy that was forked during the run
+            try:
+                learned(state, settings, name).save(file)
+                done.append(file)
+            except CatstreamError as error:
+                errors.append(error)
+        for error in errors[0 if sys.exception() else 1 :]:
+            _log.warning("%s", error)
     if errors:
         raise errors[0]
-
-
-def _save(files: Mapping[str, Path], state: Path, settings: Settings, done: list[Path]) -> list[CatstreamError]:
-    """Save what was learned of each object to its file, and add it to `done`; returns the errors of the others."""
-    errors: list[CatstreamError] = []
-    for name, file in files.items():
-        try:
-            learned(state, settings, name).save(file)
-            done.append(file)
-        except CatstreamError as error:
-            errors.append(error)
-    return errors
