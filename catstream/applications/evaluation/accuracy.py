@@ -253,25 +253,16 @@ def _plots(runs: list[EvaluationRun]) -> str:
 
 
 def _table(rows: list[Row]) -> str:
-    lines = [[escape(row.name), row.tracker, row.frames, *_shaded(cells(row))] for row in rows]
+    lines = [[escape(row.name), row.tracker, row.frames, *cells(row)] for row in rows]
     means = mean_of(rows)
-    lines += [["mean", tracker, "", *_shaded(cells(mean))] for tracker, mean in means.items()]
+    lines += [["mean", tracker, "", *cells(mean)] for tracker, mean in means.items()]
     return table(("sequence", "tracker", "frames", *HEADINGS), lines, texts=2, means=len(means))
 
 
 def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
     lines = [
-        [escape(attribute), tracker, len(attributes[attribute]), *_shaded(cells(mean))]
+        [escape(attribute), tracker, len(attributes[attribute]), *cells(mean)]
         for attribute, means in by_attribute(rows, attributes).items()
         for tracker, mean in means.items()
     ]
     return table(("attribute", "tracker", "sequences", *HEADINGS), lines, texts=2, means=0)
-
-
-def _shaded(texts: list[str]) -> list[str]:
-    """Give the means of the measures from 0 to 1 a background that is darker for a higher value."""
-    shaded = len(MEASURES) - 1  # all but frames/s
-    shades = [0 if text == "-" else 40 * float(text.partition(" ")[0]) ** 2 for text in texts[:shaded]]
-    style = "background: rgb(47 158 68 / {:.0f}%); padding: .1rem .3rem"
-    shown = [f'<span style="{style.format(each)}">{text}</span>' for each, text in zip(shades, texts, strict=False)]
-    return [*shown, *(f'<span style="white-space: nowrap">{text}</span>' for text in texts[shaded:])]
