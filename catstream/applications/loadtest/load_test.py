@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from catstream.applications.loadtest import crowd
 from catstream.applications.loadtest.camera import Camera, Schedule
 from catstream.applications.loadtest.latency import (
     PERCENTILES,
@@ -81,10 +80,6 @@ class Plan:
         if self.frames < 1:
             raise SettingsError(
                 f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
-            )
-        if self.objects > (most := len(crowd.NAMES)):
-            raise SettingsError(
-                f"the video of a load test shows at most {most} objects, not {self.objects}: give fewer"
             )
         if self.source == "h264" and any(side % 2 for side in self.size):
             raise SettingsError("a frame of H.264 has an even width and an even height: give another size")
@@ -441,7 +436,7 @@ def run_load_test(
     load_test = LoadTest(limits, find)
     images = rendered.FRAMES if find == "rate" else min(plan.frames, rendered.FRAMES)
 
-    def told(activity: str, count: int, total: int) -> None:
+    def report_frames(activity: str, count: int, total: int) -> None:
         report(activity, count / total, f"{count} of {total} frames")
 
     def holds(value: float) -> bool:
@@ -461,10 +456,10 @@ def run_load_test(
         return not violations(limits, result)
 
     try:
-        video = render(plan.objects, images, plan.size, lambda count: told("rendering", count, images))
+        video = render(plan.objects, images, plan.size, lambda count: report_frames("rendering", count, images))
         files = video.files
         if plan.source == "h264":
-            files = encode(files, plan.size, lambda count: told("encoding", count, 2 * images))
+            files = encode(files, plan.size, lambda count: report_frames("encoding", count, 2 * images))
         if find == "rate":
             load_test.highest = find_highest(plan.rate, holds)
         elif find == "streams":

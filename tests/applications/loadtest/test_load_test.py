@@ -165,7 +165,6 @@ def test_a_malformed_limit_is_an_error(text):
     ("facts", "said"),
     [
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
-        ({"objects": 99}, "shows at most 16 objects, not 99"),
         ({"size": (321, 240), "source": "h264"}, "an even width"),
         ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
     ],
