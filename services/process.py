@@ -14,6 +14,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from secrets import token_hex
+from typing import Self
 
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.messages.kinds import Health, run_state
@@ -43,60 +44,48 @@ _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
 _log = logging.getLogger(__name__)
 
 
-class Watchdog:
-    """Four numbers in memory that a process shares with its supervisor; its descriptor is inherited.
+class Watchdog(ctypes.Structure):
+    """Four numbers in memory that a process shares with its supervisor; the descriptor `handle` is inherited.
 
     No message can be late or lost: a supervisor that was suspended reads the newest count at once, and the count stops
     with the loop of the process, even if other threads continue. A turn may take `limit` seconds.
+
+    turns     number of turns of the loop so far
+    patience  seconds that the present turn may take
+    after     number of the last frame that the owner of the run had when the process was started
+    read      number of the last frame that the owner of the run has read, infinite once it has received the end: a
+              detector is not too far ahead of it
     """
 
-    def __init__(self, handle: int | None = None) -> None:
-        self.limit = RUNNING_SECONDS
-        self.handle = os.memfd_create("watchdog") if handle is None else handle
-        os.truncate(self.handle, 32)
-        self._cells = memoryview(mmap.mmap(self.handle, 32)).cast("d")
-        self.allow()
+    _fields_ = (
+        *(("turns", ctypes.c_double), ("patience", ctypes.c_double)),
+        *(("after", ctypes.c_int64), ("read", ctypes.c_double)),
+    )
+    turns: float
+    patience: float
+    after: int
+    read: float
+    handle: int
+    limit: float
 
-    @property
-    def turns(self) -> float:
-        """Number of turns of the loop so far."""
-        return self._cells[0]
-
-    @property
-    def patience(self) -> float:
-        """Seconds that the present turn may take."""
-        return self._cells[1]
+    @classmethod
+    def opened(cls, handle: int | None = None) -> Self:
+        """The numbers in the memory of a descriptor, or in new memory."""
+        handle, size = os.memfd_create("watchdog") if handle is None else handle, ctypes.sizeof(cls)
+        os.truncate(handle, size)
+        watchdog = cls.from_buffer(mmap.mmap(handle, size))
+        watchdog.handle, watchdog.limit = handle, RUNNING_SECONDS
+        watchdog.allow()
+        return watchdog
 
     def beat(self) -> None:
         """Count a turn of the loop."""
-        self._cells[1] = self.limit
-        self._cells[0] += 1
+        self.allow(self.limit)
 
     def allow(self, seconds: float = LONG_SECONDS) -> None:
         """Announce that the present turn takes long."""
-        self._cells[1] = seconds
-        self._cells[0] += 1
-
-    @property
-    def after(self) -> int:
-        """Number of the last frame that the owner of the run had when the process was started."""
-        return int(self._cells[2])
-
-    @after.setter
-    def after(self, seq: int) -> None:
-        self._cells[2] = self._cells[3] = seq
-
-    @property
-    def read(self) -> float:
-        """Number of the last frame that the owner of the run has read, infinite once it has received the end.
-
-        A detector is not too far ahead of it.
-        """
-        return self._cells[3]
-
-    @read.setter
-    def read(self, seq: float) -> None:
-        self._cells[3] = seq
+        self.patience = seconds
+        self.turns += 1
 
     def close(self) -> None:
         """Close the file descriptor; the memory stays as long as the object."""
@@ -119,7 +108,7 @@ class Process:
         self.endpoint = replace(place, run=job.run or (token_hex(8) if name == "detector" else ""))
         self.trouble = self.source = ""
         self.source_failed = self.has_ended = False
-        self.watchdog = Watchdog(watchdog)
+        self.watchdog = Watchdog.opened(watchdog)
         self._stop_moment = float("inf")  # at which a signal asked the process to end
         self._health = Publisher(HEALTH, self.endpoint, sender=name)
         self._reported = 0.0

@@ -94,7 +94,7 @@ class Child:
         self.due = self.silent = self._turns = 0.0
         self.restarts: deque[float] = deque()
         self.process: StartedProcess | None = None
-        self.watchdog = Watchdog()
+        self.watchdog = Watchdog.opened()
         self.log = ProcessLog(name, (folder / f"{name}.log").open("w+b"))
 
     @property
@@ -106,8 +106,8 @@ class Child:
         """Start the process; the owner of the run has the frames up to message `after`."""
         self.end()
         self.watchdog.close()
-        self.watchdog, self._turns, self.silent = Watchdog(), 0.0, 0.0
-        self.watchdog.after = after
+        self.watchdog, self._turns, self.silent = Watchdog.opened(), 0.0, 0.0
+        self.watchdog.after = self.watchdog.read = after
         self.log.begin()
         log, watchdog = self.log.fileno(), self.watchdog.handle
         self.process = start_server().start(self.name, self._job, log, watchdog, restarted=bool(self.restarts))

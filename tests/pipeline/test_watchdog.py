@@ -15,9 +15,9 @@ from catstream.settings import Settings
 
 
 def test_a_watchdog_counts_turns_and_only_an_announced_long_step_may_take_long():
-    with closing(Watchdog()) as watchdog:
+    with closing(Watchdog.opened()) as watchdog:
         assert watchdog.patience == LONG_SECONDS, "a start takes long"
-        loop = Watchdog(watchdog.handle)
+        loop = Watchdog.opened(watchdog.handle)
         before = watchdog.turns
         loop.beat()
         assert (watchdog.turns, watchdog.patience) == (before + 1, RUNNING_SECONDS)

@@ -36,7 +36,7 @@ def start(server, folder, tmp_path, until):  # noqa: ARG001  its processes end b
         place = folder / str(len(started))
         place.mkdir()
         file = job or Job(endpoint=str(place)).save(place)
-        log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog()
+        log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog.opened()
         process = start_server().start("trainer", file, log.fileno(), watchdog.handle, restarted=False)
         started.append((process, watchdog, log))
         until(lambda: job or watchdog.turns > 2)
@@ -131,7 +131,7 @@ from pathlib import Path
 from catstream.services.start_server import start_server
 from catstream.services.process import Watchdog
 with open({str(log)!r}, "w+b") as log:
-    watchdog = Watchdog()
+    watchdog = Watchdog.opened()
     process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), watchdog.handle, restarted=False)
     while watchdog.turns < 3 and process.poll() is None:
         pass
