@@ -25,11 +25,10 @@ from catstream.messages.names import UNNAMED, check_name
 from catstream.run.learned import Learned
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Place, find, is_deserted, source_at
+from catstream.wire.endpoint import Place, find, source_at
 from catstream.wire.newest import Subscriber
 
 ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
-DESERTED_SECONDS = 1.0  #: for an answer from a folder in which no pipeline seems to run; its detector may be restarted
 REGISTRY_SECONDS = 1.0  #: for the registry before each command; without an answer, the stream has not moved
 
 
@@ -50,8 +49,7 @@ class Control:
     CommandRejectedError
         From each command, if the pipeline does not execute it.
     SilenceError
-        From each command, if no answer arrives in time, or after a second if no pipeline runs in the folder; the
-        command may still be executed later.
+        From each command, if no answer arrives in time; the command may still be executed later.
     ServiceError
         From each command, if these keys do not have the role "control".
     ObjectError
@@ -154,17 +152,7 @@ class Control:
         """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol."""
         command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds, time)
         self._follow()
-        first = min(self.timeout, DESERTED_SECONDS) if self._place.folder is not None else 0.0
-        answer = self._commands.ask(command, first)
-        if answer is None and first and is_deserted(self._place):
-            answer = self._commands.receive(command.id, 0)  # of a pipeline that has just ended
-            if answer is None:
-                raise SilenceError(
-                    f"no answer to {verb}: no pipeline runs at {self.endpoint}, start one (catstream track), "
-                    "or give the endpoint of one that runs (--endpoint)"
-                )
-        answer = answer or self._commands.ask(command, self.timeout - first)
-        if answer is None:
+        if (answer := self._commands.ask(command, self.timeout)) is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
                 "Check it with catstream status"

@@ -309,26 +309,12 @@ def _listed(endpoints: list[Endpoint]) -> str:
     return "".join(f"; {place.source or 'a pipeline'} at {place}" for place in sorted(endpoints, key=str))
 
 
-def is_deserted(endpoint: Endpoint) -> bool:
-    """Whether an endpoint is a folder in which no pipeline runs: neither one of this user nor one that takes commands.
-
-    A folder that does not exist may be that of a pipeline that starts at this moment.
-    """
-    folder = endpoint.folder
-    is_unknown = folder is not None and folder.is_dir() and _running_at(endpoint) is None
-    return is_unknown and not endpoint.taken(CHANNELS["control"])  # asked last: a detector counts it as a rejected peer
-
-
 def source_at(endpoint: Endpoint) -> str:
     """The source of the pipeline at an endpoint, if that is one of this user; empty if it is not known."""
-    known = None if endpoint.source else _running_at(endpoint)
-    return known.source if known is not None else endpoint.source
-
-
-def _running_at(endpoint: Endpoint) -> Endpoint | None:
-    """This user's running pipeline at an endpoint."""
+    if endpoint.source:
+        return endpoint.source
     place = str(endpoint.folder.absolute()) if endpoint.folder is not None else str(endpoint)
-    return next((other for other in running() if str(other) == place), None)
+    return next((other.source for other in running() if str(other) == place), "")
 
 
 def _follows(endpoint: Endpoint, source: str) -> bool:

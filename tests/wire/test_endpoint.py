@@ -14,7 +14,7 @@ import pytest
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, find, is_deserted, meeting_place, note, private_folder, running, source_at
+from catstream.wire.endpoint import Endpoint, find, meeting_place, note, private_folder, running, source_at
 from catstream.wire.keys import Keys, create
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
@@ -169,21 +169,6 @@ def test_a_pipeline_is_found_by_a_source_whose_name_is_not_utf_8():
     source = os.fsdecode(b"walk\xff.mp4")
     with private_folder() as own, meeting_place("", own, source=source) as endpoint:
         assert find(source=source) == endpoint
-
-
-def test_a_pipeline_of_this_user_is_known_to_run_without_a_connection_to_it(folder):
-    """Its detector would count a peer that says nothing as a rejected one."""
-    with (
-        private_folder() as private,
-        meeting_place(str(folder / "run"), private) as endpoint,
-        socket.socket(socket.AF_UNIX) as detector,
-    ):
-        detector.bind(endpoint.address(CHANNELS["control"]).removeprefix("ipc://"))
-        detector.listen()
-        detector.setblocking(False)
-        assert not is_deserted(endpoint)
-        with pytest.raises(BlockingIOError):
-            detector.accept()
 
 
 @pytest.mark.parametrize("text", ["", "run", "run\n", "http://run\n\n"])
