@@ -107,9 +107,9 @@ class Subscription(Generic[Message]):
         # The end has a socket of its own: if this subscriber is slow, it could be among the messages that are dropped.
         self._messages: Subscriber[Any] | None = None
         self._ends: Subscriber[Any] | None = None
-        self._reports: Subscriber[Health] | None = None  # at the end of a silence
-        self._health: Subscriber[Health] | None = None  # once `behind` was asked for
+        self._health: Subscriber[Health] | None = None  # once `behind` was asked for, or nothing has arrived for long
         self._read = self._newest = 0.0  # times of the frame that was read last, and of the newest one that is known
+        self._state = ""  # of the pipeline, as a health report has said while a message is awaited
         self._has_run = False  # whether the pipeline was there before
         self._over = self._closed = False
         self._owner = os.getpid()
@@ -149,10 +149,8 @@ class Subscription(Generic[Message]):
         before the first report, and on other channels.
         """
         with self._turn:
-            if self._health is None and self.place is not None and self._channel.keeps == "every":
-                self._health = Subscriber(HEALTH, self.place)
-            for report in self._health.receive_all() if self._health is not None else ():
-                self._newest = report.counters.get("time", self._newest)  # of the detector
+            if self._channel.keeps == "every":
+                self._receive_health()
             return max(0.0, self._newest - self._read)
 
     @property
@@ -202,6 +200,8 @@ class Subscription(Generic[Message]):
         return message
 
     def _deadline(self) -> float:
+        """The end of the time-out of a message that is awaited from now on."""
+        self._state = ""
         return float("inf") if self.timeout is None else monotonic() + self.timeout
 
     def _poller(self, poller: Any) -> Any:
@@ -224,12 +224,11 @@ class Subscription(Generic[Message]):
                 raise ServiceError("the subscription was closed, perhaps by another thread or task: make another one")
             if (message := self._receive()) is not None:
                 self._has_run = True
-                self._close_reports()
                 return message
             if self.end is None:
                 self._look_for_pipeline()
-            if self.end is None:
-                self._open_reports(deadline)
+            if self.end is None and (self.timeout or 0.0) >= REASON_SECONDS > deadline - monotonic():
+                self._receive_health()
             if self.end is None and monotonic() >= deadline:
                 raise SilenceError(
                     f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {self._why_silent()}"
@@ -259,26 +258,20 @@ class Subscription(Generic[Message]):
             self._pipeline_ended(end, DRAIN_SECONDS)
         return None
 
-    def _open_reports(self, deadline: float) -> None:
-        """Shortly before a deadline, subscribe to the health of the pipeline, whose last report arrives at once."""
-        has_time = self.timeout is not None and self.timeout >= REASON_SECONDS > deadline - monotonic()
-        if has_time and self._reports is None and self.place is not None and self._channel is not HEALTH:
-            self._reports = Subscriber(HEALTH, self.place)
-
-    def _close_reports(self) -> None:
-        if self._reports is not None:
-            self._reports.close()
-        self._reports = None
+    def _receive_health(self) -> None:
+        """Take the health reports of the detector that have arrived; the last one arrives at once."""
+        if self._health is None and self.place is not None and self._channel is not HEALTH:
+            self._health = Subscriber(HEALTH, self.place)
+        for report in self._health.receive_all() if self._health is not None else ():
+            if report.process == "detector":
+                self._newest, self._state = report.counters.get("time", self._newest), run_state(report.counters)[1]
 
     def _why_silent(self) -> str:
         """The reason why no message arrives, as far as it is known."""
         if self._stream is not None:
             return described(self._stream.status)
-        reports = self._reports.receive_all() if self._reports is not None else []
-        states = [run_state(report.counters)[1] for report in reports if report.process == "detector"]
-        self._close_reports()  # the next ones would wait behind these
-        if states:
-            return f"the state of the pipeline is: {states[-1]}"
+        if self._state:
+            return f"the state of the pipeline is: {self._state}"
         removed = self.place is not None and self.place.lacks_sockets()
         return REMOVED if removed else "is a pipeline running there?"
 
@@ -327,7 +320,6 @@ class Subscription(Generic[Message]):
         if self._health is not None:
             self._health.close()
         self._messages = self._ends = self._health = None
-        self._close_reports()
 
 
 def subscribe(
