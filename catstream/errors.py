@@ -7,22 +7,11 @@ command line prints it as one line and exits with 1; a program catches
 
 from __future__ import annotations
 
-import re
 import shlex
 import shutil
 import sys
 from importlib.util import find_spec
-from itertools import takewhile
 from pathlib import Path
-
-#: An address, also with one slash; or a user and a password before a host.
-_ADDRESS = re.compile(r"(?:([a-z][a-z0-9+.-]*):/+|(?=[^/@]*:[^@]*@))(.*)", re.IGNORECASE | re.DOTALL)
-_HOST = re.compile(r"([\w.-]*|\[[\w:.%]+\])(:\d+)?")
-_PLAIN = re.compile(r"(?!.*(pass|pwd|token|secret|auth|key|login|user|usr|cred|sign))[\w.~+,-]*", re.IGNORECASE)
-
-
-#: A word of a text that may be an address with a password.
-_SUSPECT = re.compile(r"""[^\s'"()]*:[^\s'"()]*[@=][^\s'"()]*""")
 
 
 class CatstreamError(Exception):
@@ -130,38 +119,3 @@ def install_command(extra: str) -> str:
     beside = Path(sys.executable).with_name("pip")
     pip = "pip" if shutil.which("pip") == str(beside) else f"{shlex.quote(sys.executable)} -m pip"
     return f'{pip} install "catstream[{extra}]"'
-
-
-def without_password(source: str) -> str:
-    """Return the address of a stream without what may be a password, and any other source unchanged.
-
-    The protocol, the host and the path are left, up to the first part of the path that looks like a password.
-
-    >>> without_password("rtsp://me:secret@10.0.0.7/stream1"), without_password("http://10.0.0.7/video.cgi?pwd=secret")
-    ('rtsp://10.0.0.7/stream1', 'http://10.0.0.7/video.cgi?...')
-    >>> without_password("rtsp://me:1/2@3#4@10.0.0.7:554/one")  # no address: these characters are not escaped
-    'rtsp://10.0.0.7:554/one'
-    >>> without_password("rtsp://10.0.0.7/user=me_password=secret_channel=1.sdp")
-    'rtsp://10.0.0.7/...'
-    """
-    parts = _ADDRESS.fullmatch(source)
-    if parts is None or (parts[1] or "").lower() == "file":
-        return source
-    protocol, place = f"{parts[1]}://" if parts[1] else "", parts[2]
-    if re.search(r"\?.*=.*@", place, re.DOTALL) and "@" not in re.split("[/?#]", place)[0]:
-        return f"{protocol}..."  # the password may be before the @ or behind it
-    place, query, _ = re.split("([?#]|$)", place.rpartition("@")[2], maxsplit=1)
-    host, *path = place.split("/")
-    if not _HOST.fullmatch(host):
-        return f"{protocol}..."
-    plain = [*takewhile(_PLAIN.fullmatch, path)]
-    return protocol + "/".join([host, *plain]) + ("/..." if len(plain) < len(path) else "?..." if query else "")
-
-
-def without_passwords(text: str) -> str:
-    """Return a text without the passwords of the addresses in it.
-
-    >>> without_passwords("a box is x,y,w,h, got 'rtsp://me:secret@10.0.0.7/one'")
-    "a box is x,y,w,h, got 'rtsp://10.0.0.7/one'"
-    """
-    return _SUSPECT.sub(lambda word: without_password(word[0]), text)

@@ -18,7 +18,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from catstream.errors import ServiceError, SettingsError, without_password
+from catstream.addresses import without_password
+from catstream.errors import ServiceError, SettingsError
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.messages.names import Boxes, boxes_by_name, check_boxes

@@ -15,9 +15,10 @@ from time import monotonic, sleep
 
 import cv2
 
+from catstream.addresses import without_password
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
-from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError, without_password
+from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state
 from catstream.run.learned import Learned
 from catstream.run.state import SEARCHED

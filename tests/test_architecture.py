@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 #: From the lowest. A module imports only from lower levels than its own, and from its own folder.
 LEVELS = [
-    {"errors", "numerics"},
+    {"errors", "addresses", "numerics"},
     {"box", "settings"},
     {"messages"},
     {"features"},

@@ -9,8 +9,9 @@ from importlib import import_module
 
 import click
 
+from catstream.addresses import without_passwords
 from catstream.cli.common import INTERRUPTS, complain, stopped
-from catstream.errors import CatstreamError, without_passwords
+from catstream.errors import CatstreamError
 
 #: Command -> summary. The module of a command is imported when it is called, because some imports take long.
 COMMANDS = {

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column, Table
 
-from catstream.errors import ServiceError, without_passwords
+from catstream.addresses import without_passwords
+from catstream.errors import ServiceError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDTH = 140  # columns of a table that is not printed to a terminal

@@ -19,16 +19,9 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from hashlib import sha256
 
+from catstream.addresses import without_password
 from catstream.client.control import control
-from catstream.errors import (
-    CatstreamError,
-    CommandRejectedError,
-    FencedError,
-    FleetError,
-    ServiceError,
-    StoreError,
-    without_password,
-)
+from catstream.errors import CatstreamError, CommandRejectedError, FencedError, FleetError, ServiceError, StoreError
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Generation, Store
 from catstream.messages.kinds import StreamState, StreamStatus, Track

@@ -18,8 +18,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+from catstream.addresses import without_password
 from catstream.client.registry import RegistryServer
-from catstream.errors import CatstreamError, without_password
+from catstream.errors import CatstreamError
 from catstream.fleet import life
 from catstream.fleet.actor import Stream, given_model
 from catstream.fleet.life import Actor, Node

@@ -14,7 +14,8 @@ from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
-from catstream.errors import VideoError, require_extra, without_password
+from catstream.addresses import without_password
+from catstream.errors import VideoError, require_extra
 from catstream.messages.kinds import Track
 from catstream.messages.storage import check_file, writing
 from catstream.run.job import SinkOptions

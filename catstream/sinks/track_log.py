@@ -19,8 +19,9 @@ from math import isnan, nan
 from pathlib import Path
 from typing import IO, get_args
 
+from catstream.addresses import without_password
 from catstream.box import Box
-from catstream.errors import VideoError, without_password
+from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
 from catstream.messages.names import UNNAMED, check_name
 from catstream.messages.storage import writing

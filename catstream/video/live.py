@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 
-from catstream.errors import VideoError, without_password
+from catstream.addresses import without_password
+from catstream.errors import VideoError
 from catstream.settings import RunSettings
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
 

@@ -20,10 +20,11 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from catstream.addresses import without_password
 from catstream.box import Box, Window
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
-from catstream.errors import SettingsError, VideoError, without_password
+from catstream.errors import SettingsError, VideoError
 from catstream.features.cells import Cells
 from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
 from catstream.features.layout import CELL, WINDOW
