@@ -251,7 +251,7 @@ def loadtest(
     if find_limit and find_streams:
         raise click.UsageError("--find-limit and --find-streams each search for one number: give one of them")
     find: Parameter | None = "rate" if find_limit else "streams" if find_streams else None
-    asked = [Limit.parse(text) for text in limits or _FIND[find]]
+    parsed = [Limit.parse(text) for text in limits or _FIND[find]]
     parameters = Plan(**plan)
     if output is not None:
         with writing(output):
@@ -266,27 +266,29 @@ def loadtest(
 
         def done(result: Result) -> None:
             if find is not None:
-                (cores, memory), verdict = result.cost, "; ".join(violations(asked, result)) or "met"
+                (cores, memory), verdict = result.cost, "; ".join(violations(parsed, result)) or "met"
                 click.echo(
                     f"{counted(result.plan.streams, 'stream')}, {result.plan.rate:g} frames/s due; in the worst stream "
                     f"{result.followed:.1f} tracked, p99 {milliseconds(KINDS['p99'].measure(result))} ms; each takes "
                     f"{cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
                 )
 
-        load_test = run_load_test(parameters, asked, find=find, report=report, done=done)
+        load_test = run_load_test(parameters, parsed, find=find, report=report, done=done)
     for value, reason in load_test.refused.items():
         click.echo(f"{value:g} streams did not start: {reason}")
     if load_test.results:
         if find == "streams":
             click.echo(f"{answer(load_test)}.")
-        _print_run(load_test.result, asked)
+        _print_run(load_test.result, parsed)
         write_json(json_file, to_json(load_test))
         if output is not None:
             click.echo(f"report: {write_report(output / 'report.html', load_test)}")
     if load_test.interrupted:
         stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
     if find == "rate" and load_test.highest:
-        click.echo(f"the highest rate that meets {', '.join(map(str, asked))}: {load_test.highest:g} frames/s a stream")
+        click.echo(
+            f"the highest rate that meets {', '.join(map(str, parsed))}: {load_test.highest:g} frames/s a stream"
+        )
     for line in load_test.violations:
         complain(f"broken: {line}")
     if load_test.violations:

@@ -89,12 +89,12 @@ def doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
     a box of 234x216 in a frame of 352x288: if 213,121,234,216 are two corners, give 213,121,21,95
     """
     whole = Box(0, 0, width, height)
-    told = [
+    doubts = [
         f"the box of {listed([name])} is the whole frame: draw it around one object"
         for name, box in boxes.items()
         if box.overlap(whole) > _SAME
     ]
-    told += [
+    doubts += [
         f"{name and name + ': '}a box of {w:g}x{h:g} in a frame of {width}x{height}: "
         f"if {x:g},{y:g},{w:g},{h:g} are two corners, give {x:g},{y:g},{w - x:g},{h - y:g}"
         for name, (x, y, w, h) in boxes.items()
@@ -102,7 +102,7 @@ def doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
         and 0 <= y < h <= height
         and (x + w > width or y + h > height or 4 * w * h > width * height)
     ]
-    return told + [
+    return doubts + [
         f"{one} and {other} have the same box: each costs time"
         for (one, box), (other, twin) in combinations(boxes.items(), 2)
         if box.overlap(twin) > _SAME

@@ -128,8 +128,13 @@ def write_via(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
         for frame, places in _places(frames, about):
             for index, (number, label, track, (x, y, w, h)) in enumerate(places):
                 shape = {"name": "rect", "x": x, "y": y, "width": w, "height": h}
-                said = {"track": number, "confidence": track.score, "class": label, "doubtful": int(track.doubtful)}
-                dicts = [json.dumps(each) for each in ({"frame": frame}, shape, said)]
+                attributes = {
+                    "track": number,
+                    "confidence": track.score,
+                    "class": label,
+                    "doubtful": int(track.doubtful),
+                }
+                dicts = [json.dumps(each) for each in ({"frame": frame}, shape, attributes)]
                 rows.writerow([f"{_stem(about, frame)}.jpg", -1, dicts[0], len(places), index, *dicts[1:]])
 
 

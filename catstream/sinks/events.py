@@ -94,8 +94,8 @@ class Events:
             if track.frame != self._frame:
                 self._frame, self._frames = track.frame, self._frames + 1
             events += self._of(track)
-        for name, thing in [*self._objects.items()]:
-            if self._frames - thing.frames > _FORGOTTEN_FRAMES:
+        for name, known in [*self._objects.items()]:
+            if self._frames - known.frames > _FORGOTTEN_FRAMES:
                 events += self._end(name)
         return self._wanted(events)
 
@@ -105,40 +105,40 @@ class Events:
 
     def status(self, name: str) -> dict[str, Any] | None:
         """Whether an object is present, that is found and not lost, and the names of its zones; None if it ended."""
-        thing = self._objects.get(name)
-        if thing is None:
+        known = self._objects.get(name)
+        if known is None:
             return None
-        return {"present": thing.seen is not None and not thing.lost, "zones": thing.zones}
+        return {"present": known.seen is not None and not known.lost, "zones": known.zones}
 
     def _wanted(self, events: list[Event]) -> list[Event]:
         return [event for event in events if event.kind in self._options.events]
 
     def _of(self, track: Track) -> Iterator[Event]:
         """Yield the events of a track, except the end of other objects."""
-        thing = self._objects.get(track.object)
-        if thing is not None and thing.track.began != track.began:
+        known = self._objects.get(track.object)
+        if known is not None and known.track.began != track.began:
             yield from self._end(track.object)
-            thing = None
-        thing = thing or self._objects.setdefault(track.object, _Object(track))
-        thing.track, thing.frames = track, self._frames
+            known = None
+        known = known or self._objects.setdefault(track.object, _Object(track))
+        known.track, known.frames = track, self._frames
         if track.box is None:
-            if thing.seen is not None and not thing.lost and track.time - thing.seen >= self._options.lost_seconds:
-                thing.lost = True
+            if known.seen is not None and not known.lost and track.time - known.seen >= self._options.lost_seconds:
+                known.lost = True
                 yield Event("lost", track)
             return
-        if thing.seen is None or thing.lost:
-            yield Event("found" if thing.seen is None else "returned", track)
-        thing.seen, thing.lost = track.time, False
+        if known.seen is None or known.lost:
+            yield Event("found" if known.seen is None else "returned", track)
+        known.seen, known.lost = track.time, False
         for name, corners in self._zones.items():
             inside = cv2.pointPolygonTest(corners, track.box.centre, measureDist=True)  # pixels; negative if outside
-            if name not in thing.zones and inside >= 0:
-                thing.zones.append(name)
+            if name not in known.zones and inside >= 0:
+                known.zones.append(name)
                 yield Event("entered", track, name)
-            elif name in thing.zones and inside < -self._options.margin:
-                thing.zones.remove(name)
+            elif name in known.zones and inside < -self._options.margin:
+                known.zones.remove(name)
                 yield Event("left", track, name)
 
     def _end(self, name: str) -> Iterator[Event]:
-        thing = self._objects.pop(name)
-        yield from (Event("left", thing.track, zone) for zone in thing.zones)
-        yield Event("ended", thing.track)
+        known = self._objects.pop(name)
+        yield from (Event("left", known.track, zone) for zone in known.zones)
+        yield Event("ended", known.track)

@@ -78,12 +78,12 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, ab
         times[frame.number] = frame.seconds
         for track in frame.tracks:
             rows.setdefault(track.object, {})[frame.number] = (*(track.box or [np.nan] * 4), track.score)
-    for thing, found in rows.items():
+    for name, found in rows.items():
         table = np.full((max(times) + 1, 6), np.nan)
         table[list(found), :5] = list(found.values())
         table[list(times), 5] = list(times.values())
         seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
-        whole = f"{about.name}-{thing}" if thing else about.name
+        whole = f"{about.name}-{name}" if name else about.name
         write_layout(layout, folder, whole, table[:, :4], table[:, 4], seconds)
 
 

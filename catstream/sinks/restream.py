@@ -86,10 +86,10 @@ class StreamSink:
             stdout=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C is for this process
         )
-        told, taken = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
-        told.write(json.dumps([self._place, self._origin.endpoint, self._origin.keys]).encode() + b"\n")
-        told.flush()
-        self._output = taken.fileno()
+        stdin, stdout = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
+        stdin.write(json.dumps([self._place, self._origin.endpoint, self._origin.keys]).encode() + b"\n")
+        stdin.flush()
+        self._output = stdout.fileno()
         os.set_blocking(self._output, False)
 
     def _stop(self) -> None:

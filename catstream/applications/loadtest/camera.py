@@ -128,8 +128,8 @@ def _broadcast(
     with Broadcast(files, size, streams, source) as broadcast:
         pipe.send(broadcast.urls)
         while True:
-            asked = pipe.recv()
-            pipe.send(broadcast.late if asked is None else broadcast.play(asked))
+            question = pipe.recv()
+            pipe.send(broadcast.late if question is None else broadcast.play(question))
 
 
 class Broadcast(ThreadingHTTPServer):
