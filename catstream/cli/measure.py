@@ -277,7 +277,7 @@ def loadtest(
     for value, reason in load_test.refused.items():
         click.echo(f"{value:g} streams did not start: {reason}")
     if load_test.results:
-        if find == "streams":
+        if find is not None:
             click.echo(f"{answer(load_test)}.")
         _print_run(load_test.result, parsed)
         write_json(json_file, to_json(load_test))
@@ -285,10 +285,6 @@ def loadtest(
             click.echo(f"report: {write_report(output / 'report.html', load_test)}")
     if load_test.interrupted:
         stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
-    if find == "rate" and load_test.highest:
-        click.echo(
-            f"the highest rate that meets {', '.join(map(str, parsed))}: {load_test.highest:g} frames/s a stream"
-        )
     for line in load_test.violations:
         complain(f"broken: {line}")
     if load_test.violations:

@@ -216,7 +216,8 @@ def answer(load_test: LoadTest) -> str:
         what = "number of streams" if load_test.find == "streams" else "rate"
         return f"Interrupted before a {what} was found" if load_test.interrupted else f"No {what} meets the limits"
     if load_test.find == "rate":
-        return f"The highest rate that meets the limits: {load_test.highest:g} frames/s"
+        limits = ", ".join(map(str, load_test.limits))
+        return f"The highest rate that meets {limits}: {load_test.highest:g} frames/s a stream"
     (cores, memory), most = load_test.result.cost, "at least " * (load_test.highest == MOST_STREAMS)
     return (
         f"This machine serves {most}{load_test.result.plan}; a stream takes {cores:.2f} cores and {memory / 1e6:.0f} MB"

@@ -19,7 +19,7 @@ def test_a_search_shows_the_highest_rate_and_the_violations_of_the_others(result
     load_test = LoadTest([Limit("p99", 0.1)], find="rate", results=runs, highest=37.5)
     assert (load_test.result.plan.rate, load_test.violations) == (37.5, [])
     page = write_report(tmp_path / "report.html", load_test).read_text()
-    assert "The highest rate that meets the limits: 37.5 frames/s" in page
+    assert "The highest rate that meets p99=0.1: 37.5 frames/s a stream" in page
     assert page.count(">met<") == 2
     assert "p99 is 300 ms, limit at most 100 ms" in page
     steps = to_json(load_test)["steps"]
