@@ -139,7 +139,6 @@ class CompressorLoop:
             self._forest.check_features(message)
 
     def _counters(self) -> dict[str, float]:
-        """The counters for the health of the process."""
         return self._forest.counters() | {"stored": self._stored}
 
 

@@ -53,7 +53,6 @@ class ProcessLog:
         self._begin = 0  # of what the process that runs now has logged
 
     def fileno(self) -> int:
-        """The descriptor of the file."""
         return self._file.fileno()
 
     def new_lines(self) -> list[str]:
@@ -77,7 +76,6 @@ class ProcessLog:
         return lines[-1].removeprefix(self._mark) if lines else ""
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
 
@@ -141,7 +139,6 @@ class Child:
                 turn()
 
     def end(self) -> None:
-        """Kill the process if it runs."""
         if self.process is not None:
             self.process.close()
             self.process = None

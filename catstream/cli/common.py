@@ -147,7 +147,6 @@ with_json_file = click.option(
 
 
 def write_json(file: Path | None, figures: dict[str, object]) -> None:
-    """Write figures to a file, if one is given."""
     from catstream.messages.storage import writing
 
     if file is not None:

@@ -156,7 +156,6 @@ def evaluate(
 
 
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
-    """Return a table of the sequences and the means."""
     from catstream.applications.evaluation.accuracy import HEADINGS, cells
 
     numbers = ("frames", *HEADINGS)

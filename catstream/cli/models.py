@@ -152,7 +152,6 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
 
 
 def _print(results: list[FileResult], report: Path) -> None:
-    """Print the best intervals, and the path of the report."""
     from catstream.applications.page import clock
 
     intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)

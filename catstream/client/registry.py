@@ -91,11 +91,9 @@ class Registry(AbstractContextManager["Registry"]):
         return None if answer is None else _status(answer)
 
     def fileno(self) -> int:
-        """Readable if an answer may have arrived."""
         return self._requester.fileno()
 
     def close(self) -> None:
-        """Disconnect."""
         self._requester.close()
 
     def __exit__(self, *_: object) -> None:
@@ -130,7 +128,6 @@ def _local(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
 
 
 def _status(answer: Listing) -> FleetStatus:
-    """The content of an answer."""
     try:
         return msgspec.json.decode(answer.fleet, type=FleetStatus)
     except (msgspec.DecodeError, RecursionError) as error:
@@ -209,11 +206,9 @@ class FollowedStream:
         return self.place
 
     def fileno(self) -> int:
-        """Readable if an answer may have arrived."""
         return self._registry.fileno()
 
     def close(self) -> None:
-        """Disconnect from the registry."""
         self._registry.close()
 
     def _keep(self, status: StreamStatus) -> bool:
@@ -260,7 +255,6 @@ class RegistryServer(AbstractContextManager["RegistryServer"]):
         return len(questions)
 
     def close(self) -> None:
-        """Stop listening."""
         self._stack.close()
 
     def __exit__(self, *_: object) -> None:

@@ -98,7 +98,6 @@ class Controller:
         return self._change(lambda before: replace(spec, draining=before.draining), models)
 
     def add(self, stream: StreamSpec, models: Models) -> list[str]:
-        """Add a stream, or change the one of its name."""
         return self._change(lambda before: replace(before, streams=before.streams | {stream.name: stream}), models)
 
     def remove(self, names: tuple[str, ...]) -> list[str]:
@@ -118,14 +117,12 @@ class Controller:
         )
 
     def status(self) -> FleetStatus:
-        """The state of all streams and nodes."""
         with self._lock:
             streams = {name: self._stream_status(name) for name in sorted(self._spec.streams)}
             nodes = {node.name: self._node_status(node) for node in self._nodes}
             return FleetStatus(self._name, time.time(), streams, nodes)
 
     def spec(self) -> FleetSpec:
-        """The desired streams."""
         return self._spec
 
     def close(self) -> list[str]:
@@ -316,7 +313,6 @@ class Controller:
             actor.since = actor.answered = now
 
     def _start(self, spec: StreamSpec, actor: Actor, now: float) -> None:
-        """Ask Ray to run a stream."""
         import ray
 
         order = life.order(spec, self._nodes)
@@ -374,7 +370,6 @@ def actor_name(fleet: str, *words: str) -> str:
 
 
 def named_actors() -> list[str]:
-    """The names of the actors of all fleets."""
     from ray.util import list_named_actors
 
     return [each["name"] for each in list_named_actors(all_namespaces=True) if each["namespace"] == NAMESPACE]

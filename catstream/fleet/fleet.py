@@ -472,7 +472,6 @@ def _is_up(folder: Path) -> bool:
 
 
 def _only(fleets: Sequence[str], place: str) -> str:
-    """The only fleet of a place."""
     if len(fleets) != 1:
         help_ = f"say which (--name), there are {', '.join(fleets)}" if fleets else "start one with catstream fleet up"
         raise FleetError(f"{len(fleets)} fleets run on {place}: {help_}")

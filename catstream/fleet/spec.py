@@ -207,7 +207,6 @@ class FleetSpec:
                 )
 
     def check_stream(self, name: str) -> None:
-        """Raise FleetError if there is no such stream."""
         if name not in self.streams:
             known = ", ".join(self.streams) or "none"
             raise FleetError(f"there is no stream {name!r} in the fleet {self.name}: there are {known}")

@@ -94,7 +94,6 @@ class Store:
         return States(self, "fleet")
 
     def stream(self, name: str) -> States:
-        """The states of a stream."""
         check_fleet_name(name, "stream")
         return States(self, f"streams/{name}")
 
@@ -345,7 +344,6 @@ class States:
         return "another process"
 
     def create(self, place: _Place, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Create a state."""
         arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
         self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
 

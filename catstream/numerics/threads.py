@@ -150,7 +150,6 @@ def _cores() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    """The threads of this process."""
     return ThreadPoolExecutor(_cores(), "catstream")
 
 

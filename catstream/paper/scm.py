@@ -206,7 +206,6 @@ def _grey(image: np.ndarray) -> Pyramid:
 
 
 def _squares(rows: np.ndarray) -> np.ndarray:
-    """Squared length of each row."""
     squares: np.ndarray = np.einsum("ij,ij->i", rows, rows)
     return squares
 

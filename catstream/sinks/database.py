@@ -56,13 +56,11 @@ class SqliteSink:
             self._database.executemany(_INSERT, rows([frame]))
 
     def close(self) -> None:
-        """Close the file."""
         with _errors(self._place):
             self._database.close()
 
 
 def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
-    """Make the database from a log."""
     path.unlink(missing_ok=True)  # left by a process that was killed
     with _errors(path), closing(sqlite3.connect(path)) as database, database:
         database.execute(_CREATE)

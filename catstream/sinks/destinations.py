@@ -37,7 +37,6 @@ class TrackedFrame(NamedTuple):
 
     @property
     def number(self) -> int:
-        """Number of the frame."""
         return self.tracks[0].frame
 
 

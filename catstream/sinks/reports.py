@@ -42,7 +42,6 @@ class Reports:
             self._previews = Subscription(origin.endpoint, "previews", timeout=0, keys=origin.keys)
 
     def update(self, tracks: Sequence[Track]) -> list[bytes]:
-        """Return the events of further tracks."""
         with suppress(SilenceError):  # no further picture has arrived
             for each in self._previews or ():
                 jpeg = b64encode(each.jpeg).decode()
@@ -50,7 +49,6 @@ class Reports:
         return [self._json(event) for event in self.events.update(tracks)]
 
     def close(self) -> list[bytes]:
-        """Return the last events."""
         if self._previews is not None:
             self._previews.close()
         return [self._json(event) for event in self.events.close()]

@@ -42,7 +42,6 @@ class SourceVideo:
             raise
 
     def write(self, frame: TrackedFrame) -> None:
-        """Draw the tracks of a frame over it."""
         image = next((each.image for each in self._frames if each.number == frame.number), None)
         if image is None:
             raise VideoError(f"the source has no frame {frame.number}: give the one that the pipeline tracks")
@@ -50,7 +49,6 @@ class SourceVideo:
         self._video.write(draw(image, frame.tracks, self._colours), frame.tracks[0].time)
 
     def close(self) -> None:
-        """Finish the video."""
         self._frames.close()
         self._video.close()
 
@@ -95,14 +93,12 @@ class PictureVideo:
         self._video: VideoWriter | None = None
 
     def write(self, frame: TrackedFrame) -> None:
-        """Write a picture whose frame is over."""
         if (drawn := self._pictures.take(frame)) is not None:
             image, time = drawn
             self._video = self._video or VideoWriter(self._place, RATE, (image.shape[1], image.shape[0]))
             self._video.write(image, time)
 
     def close(self) -> None:
-        """Finish the video."""
         self._pictures.close()
         if self._video is None:
             raise VideoError(

@@ -48,7 +48,6 @@ class Webhook:
         _key(options)
 
     def write(self, frame: TrackedFrame) -> None:
-        """Queue the events of a frame."""
         self._queue(self._reports.update(frame.tracks))
 
     def close(self) -> None:

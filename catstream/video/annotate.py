@@ -169,7 +169,6 @@ def _text_width(text: str, unit: float) -> int:
 
 
 def _write(canvas: np.ndarray, text: str, left: int, unit: float) -> None:
-    """Write text in the line below an image."""
     place = (left, canvas.shape[0] - round(9 * unit))
     cv2.putText(canvas, text, place, _FONT, 0.45 * unit, _WHITE, max(1, round(unit)), cv2.LINE_AA)
 

@@ -294,7 +294,6 @@ class Backlog:
         return self._is_late and not is_key
 
     def is_done(self, now: float) -> None:
-        """Note that a packet is decoded."""
         self._done = now
 
 

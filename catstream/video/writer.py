@@ -144,7 +144,6 @@ class LiveWriter:
             raise VideoError((error.strerror or str(error)).lower()) from None
 
     def close(self) -> None:
-        """Disconnect."""
         import av
 
         with contextlib.suppress(OSError, av.FFmpegError):

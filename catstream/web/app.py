@@ -163,7 +163,6 @@ class Site:
             yield _event({**feed.dashboard.updates(seen), "closed": True})
 
     async def _annotated_pictures(self, feed: PipelineFeed) -> AsyncIterator[bytes]:
-        """Yield the parts of an MJPEG stream."""
         shown = None
         with feed.viewed():
             yield b"--picture\r\n"
@@ -200,6 +199,5 @@ class Command:
 
 
 def _failed(_: Request, error: Exception) -> Response:
-    """Return the answer to a request that has failed."""
     code = next(code for kind, code in _CODES.items() if isinstance(error, kind))
     return JSONResponse({"done": False, "reason": str(error)}, code)

@@ -21,7 +21,6 @@ _Sample = tuple[str, float, dict[str, str]]
 
 
 def text(feed: Feed) -> bytes:
-    """Return the current metrics of what a feed shows."""
     samples = _of_fleet(feed) if isinstance(feed, FleetFeed) else _of_pipeline(feed.pipeline(""))
     registry, metrics = CollectorRegistry(), dict[str, Gauge]()
     for name, value, labels in [("viewers", feed.viewers, {}), *samples]:

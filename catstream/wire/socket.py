@@ -192,7 +192,6 @@ class _ZapHandler:
         return domain
 
     def unregister(self, domain: bytes) -> None:
-        """Unregister a closed socket."""
         with self._lock:
             self._sockets.pop(domain, None)
             if self._thread is not None and not self._sockets:

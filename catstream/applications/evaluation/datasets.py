@@ -230,7 +230,6 @@ class Variation:
     higher: float = 1.0
 
     def applied(self, box: Box) -> Box:
-        """Return the changed box."""
         x, y = box.centre
         return box.scaled(self.wider, self.higher).centred(x + self.right * box.w, y + self.down * box.h)
 

@@ -41,7 +41,6 @@ class _Task(NamedTuple):
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
         return len(self.sequence) - self.start.frame
 
 

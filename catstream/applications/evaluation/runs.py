@@ -80,7 +80,6 @@ class EvaluationRun:
         return (len(self.seconds) - 1) / max(float(self.seconds[1:].sum()), 1e-9)
 
     def score(self) -> Score:
-        """Return the measures of this run."""
         return score(self.boxes, self.truth, self.confidence)
 
 

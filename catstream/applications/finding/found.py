@@ -83,7 +83,6 @@ class FileResult:
     intervals: list[Interval] = field(default_factory=list)
 
     def add(self, step: Step) -> None:
-        """Add the sightings in a frame."""
         self.position, self.time = step.frame.number, step.frame.time
         for sighting in step.sightings:
             self.sightings.append(sighting)

@@ -47,7 +47,6 @@ class Schedule:
     frames: int
 
     def due(self, number: int) -> float:
-        """Return the due time of a frame."""
         return self.start + number / self.rate
 
     def number(self, moment: float) -> int:
@@ -210,8 +209,6 @@ class Broadcast(ThreadingHTTPServer):
 
 
 class _Connection(BaseHTTPRequestHandler):
-    """The connection of one receiver."""
-
     disable_nagle_algorithm = True  # otherwise the end of a frame waits 40 ms for a delayed acknowledgement
 
     def do_GET(self) -> None:

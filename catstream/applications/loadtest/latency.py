@@ -60,7 +60,6 @@ class Observations:
         )
 
     def add(self, moment: float, message: Track | Model | Health) -> None:
-        """Add a message that arrived at a moment."""
         if isinstance(message, Track):
             if message.pts is not None:
                 message = replace(message, pts=due_time(message.pts, moment))
@@ -135,7 +134,6 @@ class Measures:
 
     @property
     def frames(self) -> int:
-        """Number of due frames."""
         return len(self.due)
 
     @property

@@ -80,7 +80,6 @@ def tables(result: Result) -> Iterator[Table]:
 
 
 def milliseconds(seconds: float) -> str:
-    """Format a duration in milliseconds."""
     return f"{1000 * seconds:.3g}" if seconds < 1 else f"{1000 * seconds:.0f}"
 
 

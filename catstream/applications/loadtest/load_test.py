@@ -101,7 +101,6 @@ class Plan:
 
     @property
     def frames(self) -> int:
-        """Number of frames of each stream."""
         return round(self.rate * self.duration)
 
 
@@ -178,7 +177,6 @@ class Limit:
         return value >= self.value if kind.minimum else value <= self.value
 
     def describe(self, result: Result) -> str:
-        """Describe the limit and the measured value."""
         kind = KINDS[self.name]
         sense = "least" if kind.minimum else "most"
         value, limit = kind.in_words(kind.measure(result)), kind.in_words(self.value)
@@ -229,12 +227,10 @@ class Result:
 
     @property
     def track(self) -> Float64:
-        """Track latencies of all streams."""
         return np.concatenate([stream.track for stream in self.streams])
 
     @property
     def model(self) -> Float64:
-        """Model latencies of all streams."""
         return np.concatenate([stream.model for stream in self.streams])
 
     def cores(self, number: int) -> float:
@@ -400,7 +396,6 @@ class LoadTest:
     interrupted: bool = False
 
     def value(self, result: Result) -> float:
-        """Return the searched parameter of a run."""
         return float(getattr(result.plan, self.find or "rate"))
 
     @property
