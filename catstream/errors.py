@@ -43,14 +43,7 @@ class VideoError(CatstreamError):
 
 
 class ProtocolError(CatstreamError, ValueError):
-    """A message does not conform to the protocol of its channel.
-
-    reason  category of the violation in one word, by which the health report counts such messages
-    """
-
-    def __init__(self, text: str, reason: str = "content") -> None:
-        super().__init__(text)
-        self.reason = reason
+    """A message does not conform to the protocol of its channel, or a file is damaged."""
 
 
 class ServiceError(CatstreamError):
