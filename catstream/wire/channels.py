@@ -81,11 +81,6 @@ class Channel(Generic[Message]):
     high_water_mark: int = 1000
 
     @property
-    def acknowledged(self) -> bool:
-        """Whether one process receives every message."""
-        return self.receiver is not None
-
-    @property
     def by_object(self) -> bool:
         """Whether each message is about one object."""
         return any(field.name == "object" for field in fields(self.messages[0]))

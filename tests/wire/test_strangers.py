@@ -16,7 +16,7 @@ from catstream.wire.socket import rejects
 from tests.wire.examples import rejected
 
 WINDOW = 4
-PUBLISHED = [name for name, channel in CHANNELS.items() if not channel.acknowledged]
+PUBLISHED = [name for name, channel in CHANNELS.items() if channel.receiver is None]
 
 
 def features(seq, width=5):
