@@ -141,11 +141,7 @@ def score(boxes: Float64, truth: Float64, confidence: Float64 | None = None) -> 
     boxes, truth : float64 (frames, 4), x, y, w, h in pixels, NaN if there is no box
     confidence : float64 (frames,), or None for a tracker without a confidence
     """
-    if boxes.shape != truth.shape or boxes.shape[1:] != (4,):
-        raise ValueError(f"boxes and truth need the same shape (frames, 4), got {boxes.shape} and {truth.shape}")
     present = _present(truth)
-    if not present.any():
-        raise ValueError("the truth has no box: there is nothing to measure")
     success = success_plot(boxes, truth)
     off = distances(boxes, truth, normalised=True)[present]
     return Score(
