@@ -26,7 +26,24 @@ CLOSE_SECONDS = 5.0
 _log = logging.getLogger(__name__)
 
 
-class Reports:
+class Warnings:
+    """Warns about a destination, which is shown without its password."""
+
+    def __init__(self, place: str) -> None:
+        self._shown, self._problem = shown(place), ""
+
+    def warn(self, problem: str) -> None:
+        """Warn of a problem of the destination, once however often it occurs; with "", say that it is over."""
+        if problem != self._problem:
+            self._problem = problem
+            self.tell(problem or "is back")
+
+    def tell(self, text: str) -> None:
+        """Warn of something about the destination."""
+        _log.warning("%s: %s", self._shown, text)
+
+
+class Reports(Warnings):
     """Makes a JSON object of each event: `Event.to_dict`, `id`, `sent` in seconds since 1970, and `picture` if wanted.
 
     The picture is the newest that the pipeline has sent: the JPEG file in Base64, the number of its frame, and the
@@ -34,8 +51,8 @@ class Reports:
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
+        super().__init__(place)
         self.events = Events(origin.options)
-        self._place, self._problem = shown(place), ""
         self._picture: dict[str, object] | None = None
         self._previews: Subscription[Preview] | None = None
         if origin.options.picture:
@@ -52,16 +69,6 @@ class Reports:
         if self._previews is not None:
             self._previews.close()
         return [self._json(event) for event in self.events.close()]
-
-    def warn(self, problem: str) -> None:
-        """Warn of a problem of the destination, once however often it occurs; with "", say that it is over."""
-        if problem != self._problem:
-            self._problem = problem
-            self.tell(problem or "is back")
-
-    def tell(self, text: str) -> None:
-        """Warn of something about the destination."""
-        _log.warning("%s: %s", self._place, text)
 
     def _json(self, event: Event) -> bytes:
         picture = {"picture": self._picture} if self._previews is not None else {}

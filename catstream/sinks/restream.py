@@ -8,7 +8,6 @@ and writes a byte for each picture that the server took. The pipeline makes pict
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import socket
@@ -29,7 +28,7 @@ from catstream.messages.kinds import Track
 from catstream.messages.names import counted
 from catstream.run.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame, shown
-from catstream.sinks.reports import split
+from catstream.sinks.reports import Warnings, split
 from catstream.sinks.video_sink import DrawnPictures
 from catstream.video.writer import LiveWriter
 
@@ -37,8 +36,6 @@ _LATE_SECONDS = 2.0  # without a picture, after which the frames that pass are m
 _STUCK_SECONDS = 15  # in which a server has to take a picture
 _PAUSE_SECONDS = 2.0  # between two attempts to connect
 _REPEAT_SECONDS = 1.0  # without a track, after which the last picture is sent again: servers drop a silent stream
-
-_log = logging.getLogger(__name__)
 
 
 class StreamSink:
@@ -76,7 +73,7 @@ class StreamSink:
         """End the process, and warn about what the server missed."""
         self._stop()
         if self.missed:
-            _log.warning("%s: %s passed while it was away or slow", shown(self._place), counted(self.missed, "frame"))
+            Warnings(self._place).tell(f"{counted(self.missed, 'frame')} passed while it was away or slow")
 
     def _start(self) -> None:
         self._started = monotonic()
@@ -97,47 +94,36 @@ class StreamSink:
             self._process.kill()
 
 
-class _Pusher:
-    """Pushes to one place, and warns once of each problem."""
+def push(place: str, origin: Origin) -> None:
+    """Push to one place until the pipeline ends; connect again and again, and warn once of each problem."""
+    url, warnings = urlsplit(place), Warnings(place)
+    address = url.hostname or "", url.port or (554 if url.scheme == "rtsp" else 1935)
+    while True:
+        try:
+            socket.create_connection(address, _STUCK_SECONDS).close()  # no picture is made for one that is away
+            return _push(place, origin, warnings)
+        except (OSError, CatstreamError) as error:
+            warnings.warn(f"not connected ({getattr(error, 'strerror', None) or error}), it is tried again")
+        sleep(_PAUSE_SECONDS)
 
-    def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._origin, self._problem = place, origin, ""
 
-    def run(self) -> None:
-        """Push until the pipeline ends; connect again and again."""
-        url = urlsplit(self._place)
-        address = url.hostname or "", url.port or (554 if url.scheme == "rtsp" else 1935)
-        while True:
-            try:
-                socket.create_connection(address, _STUCK_SECONDS).close()  # no picture is made for one that is away
-                return self._push()
-            except (OSError, CatstreamError) as error:
-                self._warn(f"not connected ({getattr(error, 'strerror', None) or error}), it is tried again")
-            sleep(_PAUSE_SECONDS)
-
-    def _push(self) -> None:
-        """Connect with the first picture, and push until the pipeline ends; VideoError if the server takes no more."""
-        origin = self._origin
-        with (
-            Subscription[Track](origin.endpoint, "tracks", timeout=_REPEAT_SECONDS, keys=origin.keys) as tracks,
-            closing(DrawnPictures(origin)) as pictures,
-            ExitStack() as stack,
-        ):
-            stream: LiveWriter | None = None
-            for image in _images(tracks, pictures):
-                signal.alarm(_STUCK_SECONDS)  # which kills this process
-                if stream is None:
-                    stream = stack.enter_context(closing(LiveWriter(self._place, (image.shape[1], image.shape[0]))))
-                stream.write(image)
-                signal.alarm(0)
-                self._warn("")
-                with suppress(BlockingIOError):  # nobody reads while no track arrives
-                    os.write(1, b".")
-
-    def _warn(self, problem: str) -> None:
-        if problem != self._problem:
-            self._problem = problem
-            _log.warning("%s: %s", shown(self._place), problem or "is back")
+def _push(place: str, origin: Origin, warnings: Warnings) -> None:
+    """Connect with the first picture, and push until the pipeline ends; VideoError if the server takes no more."""
+    with (
+        Subscription[Track](origin.endpoint, "tracks", timeout=_REPEAT_SECONDS, keys=origin.keys) as tracks,
+        closing(DrawnPictures(origin)) as pictures,
+        ExitStack() as stack,
+    ):
+        stream: LiveWriter | None = None
+        for image in _images(tracks, pictures):
+            signal.alarm(_STUCK_SECONDS)  # which kills this process
+            if stream is None:
+                stream = stack.enter_context(closing(LiveWriter(place, (image.shape[1], image.shape[0]))))
+            stream.write(image)
+            signal.alarm(0)
+            warnings.warn("")
+            with suppress(BlockingIOError):  # nobody reads while no track arrives
+                os.write(1, b".")
 
 
 def _images(tracks: Subscription[Track], pictures: DrawnPictures) -> Iterator[np.ndarray]:
@@ -166,4 +152,4 @@ if __name__ == "__main__":
     address, endpoint, keys = json.loads(sys.stdin.readline())
     Thread(target=_end_with_parent, daemon=True).start()
     os.set_blocking(1, False)
-    _Pusher(address, Origin(endpoint=endpoint, keys=keys)).run()
+    push(address, Origin(endpoint=endpoint, keys=keys))
