@@ -151,7 +151,7 @@ def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterato
                 done.append(file)
             except CatstreamError as error:
                 errors.append(error)
-        for error in errors[0 if sys.exception() else 1 :]:
-            _log.warning("%s", error)
+        for problem in errors[0 if sys.exception() else 1 :]:
+            _log.warning("%s", problem)
     if errors:
         raise errors[0]
