@@ -94,6 +94,10 @@ class Pipeline:
         Width and height of a frame.
     live : bool
         Whether the source is a camera or a stream.
+    source, part, settings
+        Those of the run, also if it is resumed; the path of a source is absolute.
+    results, earlier_results : Results
+        The files that the program writes, with those of the run that is resumed; and those of that run alone.
     after : int or None
         As given; another value counts if it is set before the start.
     saved_models : list of Path
@@ -173,6 +177,8 @@ class Pipeline:
             settings = settings.but({"features.network": str(Path(settings.features.network).absolute())})
         network = digest_of(descriptor_of(settings, job.network))
         self._job = replace(job, source=path, size=self.size, settings=settings, network=network)
+        self.source, self.part, self.settings, self.results = path, job.part, settings, job.results
+        self.earlier_results = self._resumed_job.results if self._resumed_job is not None else Results()
         check_files(job.models, settings, network)
         if self._resumed_job is not None and self._state is not None:
             self._resumed_job.check_fits(self._job, self._state)
@@ -184,31 +190,6 @@ class Pipeline:
         self._rows = 0
         self._rest: deque[Track] = deque()  # tracks of the last frame that were not yielded yet
         self._supervisor: Supervisor | None = None
-
-    @property
-    def source(self) -> str:
-        """The source as given, or that of the resumed run; a path is absolute."""
-        return self._job.source
-
-    @property
-    def part(self) -> slice:
-        """The frames that are tracked."""
-        return self._job.part
-
-    @property
-    def settings(self) -> Settings:
-        """All settings of the run."""
-        return self._job.settings
-
-    @property
-    def results(self) -> Results:
-        """The files that the program writes, with those of the run that is resumed."""
-        return self._job.results
-
-    @property
-    def earlier_results(self) -> Results:
-        """The files of the run that is resumed; none for a new run."""
-        return self._resumed_job.results if self._resumed_job is not None else Results()
 
     def __enter__(self) -> Self:
         if self._stack is not None:
