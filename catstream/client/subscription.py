@@ -103,7 +103,6 @@ class Subscription(Generic[Message]):
         self.end: End | None = None
         self.place: Endpoint | None = None
         self._close_time = float("inf")  # until which messages may still arrive after the end
-        self._rejected = 0  # by the connections before this one
         # The end has a socket of its own: if this subscriber is slow, it could be among the messages that are dropped.
         self._messages: Subscriber[Any] | None = None
         self._ends: Subscriber[Any] | None = None
@@ -157,11 +156,6 @@ class Subscription(Generic[Message]):
     def run(self) -> str:
         """Id of the run that the last message is from: of one start of one pipeline; empty if it is not known."""
         return self._messages.run if self._messages is not None else ""
-
-    @property
-    def rejected(self) -> int:
-        """Messages that were dropped because they were not what the channel carries."""
-        return self._rejected + (self._messages.rejected if self._messages is not None else 0)
 
     def close(self) -> None:
         """Disconnect. A loop of another thread or task ends with a ServiceError, soon."""
@@ -316,7 +310,6 @@ class Subscription(Generic[Message]):
         if self._messages is not None and self._ends is not None:
             self._messages.close()
             self._ends.close()
-            self._rejected += self._messages.rejected
         if self._health is not None:
             self._health.close()
         self._messages = self._ends = self._health = None
