@@ -90,9 +90,6 @@ class Registry(AbstractContextManager["Registry"]):
         answer = self._requester.receive(self._question, 0)
         return None if answer is None else _status(answer)
 
-    def fileno(self) -> int:
-        return self._requester.fileno()
-
     def close(self) -> None:
         self._requester.close()
 
@@ -204,9 +201,6 @@ class FollowedStream:
         if self.place is None or not self.status.endpoint:
             raise ServiceError(f"the stream {self._stream} runs nowhere, {described(self.status)}")
         return self.place
-
-    def fileno(self) -> int:
-        return self._registry.fileno()
 
     def close(self) -> None:
         self._registry.close()
