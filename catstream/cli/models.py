@@ -134,12 +134,8 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
             result = log.begin(file)
             if result.complete:
                 continue
-
-            def opened(frames: int | None, result: FileResult = result) -> None:
-                result.frames = frames
-
             try:
-                for step in search.file(file, opened=opened, damaged=result.problems.append):
+                for step in search.file(file, result):
                     with INTERRUPTS.deferred():
                         result.add(step)
                     frame = f"frame {step.frame.number + 1}/{result.frames or '?'}"

@@ -11,7 +11,7 @@ import logging
 import math
 import os
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -42,10 +42,6 @@ from catstream.video.source import VIDEOS, is_live, open_source
 _One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
 #: A frame that is searched, and the name of its file in a folder of images.
 _Searched = tuple[Frame, str]
-#: Is called with the number of frames of a file, if it is known, before the first one.
-Opened = Callable[[int | None], None]
-#: Is called with the reason for each image that cannot be read, and at the end of a video of which frames were skipped.
-Damaged = Callable[[str], None]
 
 #: Seconds of a video between two frames that are searched.
 EVERY = 0.2
@@ -97,6 +93,18 @@ class Sighting:
     image: str = ""
 
 
+@dataclass(slots=True, kw_only=True)
+class Reading:
+    """What is noted of a file while it is read.
+
+    frames    number of its frames, None if unknown
+    problems  reasons for what could not be read: each image, or at the end of a video the frames that were skipped
+    """
+
+    frames: int | None = None
+    problems: list[str] = field(default_factory=list)
+
+
 @dataclass(frozen=True, slots=True)
 class File:
     """A video, a folder of images, or a single image.
@@ -119,7 +127,7 @@ class File:
         """The video, or the images in order."""
         return image_files(self.path) if self.kind == "images" else [self.path]
 
-    def frames(self, every: float, settings: RunSettings, opened: Opened, damaged: Damaged) -> Generator[_Searched]:
+    def frames(self, every: float, settings: RunSettings, reading: Reading) -> Generator[_Searched]:
         """Yield the frames to search: all images; of a video the first one in each `every` seconds, and the last one.
 
         A video that is damaged raises VideoError after the frames before the damage.
@@ -127,7 +135,7 @@ class File:
         if self.kind == "video":
             # Not in equal numbers of frames: the rate of a file may be nominal, and its frames need not be regular.
             with open_source(self.path, settings=settings, resize=True) as source:
-                opened(source.frames)
+                reading.frames = source.frames
                 before, last = -1.0, None
                 with closing(read_ahead(source)) as frames:
                     for frame in frames:
@@ -141,15 +149,15 @@ class File:
                 if scaled := source.counters.get("scaled"):
                     _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
                 if skipped := source.counters.get("damaged"):
-                    damaged(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
+                    reading.problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
             return
         pages = first_pages(self.paths()) if self.kind == "images" else pages_of(self.path)
-        opened(len(pages))
+        reading.frames = len(pages)
         read_image = ImageReader(pages)
         for number, (path, _) in enumerate(pages):
             image = read_image(number)
             if image is None:
-                damaged(f"cannot read the image {str(path)!r}: it is left out")
+                reading.problems.append(f"cannot read the image {str(path)!r}: it is left out")
             else:
                 yield Frame(number, number / settings.image_rate, image), path.name if self.kind == "images" else ""
 
@@ -387,9 +395,9 @@ class Search:
             "skip_damaged": self.settings.skip_damaged,
         }
 
-    def file(self, file: File, *, opened: Opened = lambda _: None, damaged: Damaged = lambda _: None) -> Iterator[Step]:
+    def file(self, file: File, reading: Reading | None = None) -> Iterator[Step]:
         """Search a file. At damage of a video, VideoError is raised after the steps before it."""
-        frames = file.frames(self.every, self.settings, opened, damaged)
+        frames = file.frames(self.every, self.settings, reading or Reading())
         with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
             for (frame, image), found in scanned:
                 place = str(file.path), frame.number, frame.time
@@ -479,14 +487,14 @@ def _digest(learned: Learned) -> str:
 def _sightings(search: Search, files: list[File]) -> Iterator[Sighting]:
     problems: list[VideoError] = []
     for file in files:
-        unread: list[str] = []
+        reading = Reading()
         try:
-            for step in search.file(file, damaged=unread.append):
+            for step in search.file(file, reading):
                 yield from step.sightings
         except VideoError as error:
             problems.append(error)
         if file.kind != "video":  # of a video, the caller asked to skip them
-            problems += map(VideoError, unread)
+            problems += map(VideoError, reading.problems)
     if problems:
         raise problems[0]
 

@@ -15,7 +15,7 @@ from typing import Any, Self
 import msgspec
 import numpy as np
 
-from catstream.applications.finding.find import File, Sighting, Step
+from catstream.applications.finding.find import File, Reading, Sighting, Step
 from catstream.applications.page import Bar, clock, figure, legend, table, timeline, write_page
 from catstream.box import Box
 from catstream.errors import ServiceError
@@ -53,7 +53,7 @@ class Interval:
 
 
 @dataclass(slots=True)
-class FileResult:
+class FileResult(Reading):
     """The result for one file so far, frame by frame.
 
     A sighting continues the interval of its object if that ended a short time ago, wherever in the frame it is: a model
@@ -62,11 +62,9 @@ class FileResult:
     file       path of the video, the image or the folder
     signature  of the file when it was searched, see `File.signature`
     gap        longest time between two sightings of an interval, in seconds
-    frames     number of its frames, None if unknown
     position   last frame that was searched, None before the first one
     time       time of this frame in seconds
     complete   whether the file was searched to its end, or to its damage
-    problems   reasons for what could not be read
     sightings  in the order of the frames
     intervals  of all objects, in the order of their first sighting
     """
@@ -74,11 +72,9 @@ class FileResult:
     file: str
     signature: list[int]
     gap: float
-    frames: int | None = None
     position: int | None = None
     time: float = 0.0
     complete: bool = False
-    problems: list[str] = field(default_factory=list)
     sightings: list[Sighting] = field(default_factory=list)
     intervals: list[Interval] = field(default_factory=list)
 
