@@ -9,7 +9,6 @@ from time import monotonic
 
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.compression.forest import Forest
 from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Features, Position, SavedModel
 from catstream.run.learned import Learned, begun
@@ -51,12 +50,10 @@ class CompressorLoop:
     """A forest, its checkpoints, and the sockets that it is connected to."""
 
     def __init__(self, process: Process, stack: ExitStack) -> None:
-        job, settings, endpoint = process.job, process.settings, process.endpoint
+        settings, endpoint = process.settings, process.endpoint
         self._process = process
-        self._checkpoints: CheckpointStore | None = None  # started by hand without --state: all is in memory only
-        if job.state is not None:
-            self._checkpoints = CheckpointStore(stack.enter_context(locked(job.state / TREES, _LOCK_SECONDS)))
-        self._forest = self._checkpoints.load(settings) if self._checkpoints is not None else Forest(settings)
+        self._checkpoints = CheckpointStore(stack.enter_context(locked(process.state / TREES, _LOCK_SECONDS)))
+        self._forest = self._checkpoints.load(settings)
         seq = self._forest.seq
         self._position = Position(seq, seq, versions=self._forest.versions)
         self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was written, and for how long
@@ -94,7 +91,7 @@ class CompressorLoop:
         before, seq = self._position, self._forest.seq
         is_end = isinstance(message, End)
         features = self._features
-        urgent = self._checkpoints is None or is_end or features.window.half_full or bool(features.asking)
+        urgent = is_end or features.window.half_full or bool(features.asking)
         interval = self._process.settings.run.checkpoint_seconds
         if seq > self._stored and (urgent or checkpoint_is_due(monotonic() - self._tried, self._took, interval)):
             self._store(urgent)
@@ -110,10 +107,9 @@ class CompressorLoop:
         return self._position.seq - self._position.unsaved
 
     def _store(self, urgent: bool) -> None:
-        """Write a checkpoint, if there are checkpoints."""
         self._process.watchdog.allow()
         began = monotonic()
-        saved = self._checkpoints is None or self._checkpoints.save(self._forest)
+        saved = self._checkpoints.save(self._forest)
         self._position = stored(self._position, self._forest.seq, saved=saved, urgent=urgent)
         self._tried = monotonic()
         self._took = self._tried - began
@@ -124,7 +120,7 @@ class CompressorLoop:
             self._samples.send(end)
         self._samples.serve_late_joiners()
         self._saved_models.turn(self._forest.compressors, self._process.watchdog.beat)
-        self._process.trouble = self._checkpoints.trouble if self._checkpoints is not None else ""
+        self._process.trouble = self._checkpoints.trouble
         self._process.beat(self._counters, self._forest.object_counters, now=end is not None)
 
     def stop(self) -> None:

@@ -88,7 +88,7 @@ class DetectorLoop:
         process.source = without_password(process.job.source).encode(errors="replace").decode()[:_LONGEST_SOURCE]
         job, endpoint = process.job, process.endpoint
         self._process = process
-        self._model_files = ModelFiles(job.state / SEARCHED if job.state is not None else None)
+        self._model_files = ModelFiles(process.state / SEARCHED)
         self.desired = _desired(process, self._model_files)
         self.detectors = Detectors(process.settings, job.network)
         self._control: Responder[Command, Answer] = stack.enter_context(
@@ -386,16 +386,16 @@ class DetectorLoop:
 
     def _conclude(self, *answers: Answer) -> None:
         """Store the desired state if it has changed, then send the answers; those say so if it could not be stored."""
-        state, desired, lost = self._process.job.state, self.desired, ""
-        if state is not None and desired != self._kept:
+        file, desired, lost = self._process.state / DESIRED, self.desired, ""
+        if desired != self._kept:
             try:
                 self._model_files.store()  # before the state that names them
-                desired.save(state / DESIRED)
+                desired.save(file)
                 self._kept = desired
             except OSError as error:
-                _log.warning("the desired state cannot be written to %s (%s)", state / DESIRED, error.strerror)
-                lost = f"; a resumed run will not know it, as {state / DESIRED} cannot be written ({error.strerror})"
-        if state is None or desired == self._kept:  # otherwise the file may name a model that is not needed any more
+                _log.warning("the desired state cannot be written to %s (%s)", file, error.strerror)
+                lost = f"; a resumed run will not know it, as {file} cannot be written ({error.strerror})"
+        if desired == self._kept:  # otherwise the file may name a model that is not needed any more
             self._model_files.keep_only({each.model for each in desired.objects.values()})
         for each in answers:
             self._control.answer(replace(each, reason=each.reason + lost) if each.done else each)
@@ -469,10 +469,10 @@ class DetectorLoop:
 
 def _desired(process: Process, models: ModelFiles) -> DesiredState:
     """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
-    job = process.job
-    if job.resume and job.state is not None and (job.state / DESIRED).exists():
+    job, file = process.job, process.state / DESIRED
+    if job.resume and file.exists():
         try:
-            desired = DesiredState.load(job.state / DESIRED)
+            desired = DesiredState.load(file)
             return replace(desired, paused=desired.paused or job.paused)
         except ProtocolError as error:  # the checkpoints are not affected, so the run continues
             process.trouble = str(error)

@@ -107,10 +107,10 @@ class Previews(Publisher[Preview]):
 class ModelFiles:
     """The saved models that objects begin with: a restarted detector begins the objects again.
 
-    Each has a name, which is a digest of its content. They are in memory, and in a folder if there is one.
+    Each has a name, which is a digest of its content. They are in memory, and in a folder.
     """
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._models: dict[str, Learned] = {}
 
@@ -123,7 +123,7 @@ class ModelFiles:
 
     def get(self, name: str) -> Learned | None:
         """The saved model of a name, None if its file cannot be read."""
-        if name not in self._models and self._folder is not None:
+        if name not in self._models:
             try:
                 self._models[name] = Learned.load(self._file(name))
             except CatstreamError as error:
@@ -133,7 +133,7 @@ class ModelFiles:
     def store(self) -> None:
         """Write the saved models in memory that have no file yet; OSError if that fails."""
         for name, learned in self._models.items():
-            if self._folder is not None and not self._file(name).exists():
+            if not self._file(name).exists():
                 self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
                 storage.write_atomically(self._file(name), learned.to_bytes(), mode=0o600)
 
@@ -141,9 +141,9 @@ class ModelFiles:
         """Remove all saved models but those of these names; a file that cannot be removed is left to a later call."""
         self._models = {name: learned for name, learned in self._models.items() if name in names}
         with suppress(OSError):
-            for file in self._folder.glob("*.safetensors") if self._folder is not None else ():
+            for file in self._folder.glob("*.safetensors"):
                 if file.stem not in names:
                     file.unlink()
 
     def _file(self, name: str) -> Path:
-        return (self._folder or Path()) / f"{name}.safetensors"
+        return self._folder / f"{name}.safetensors"

@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +22,7 @@ from catstream.messages.kinds import Health, run_state
 from catstream.run.job import Job
 from catstream.services.start_server import reset_process
 from catstream.wire.channels import HEALTH
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.endpoint import Endpoint, private_folder
 from catstream.wire.newest import Publisher
 from catstream.wire.socket import rejects
 
@@ -95,6 +96,7 @@ class Watchdog(ctypes.Structure):
 class Process:
     """The state that every process of the pipeline has.
 
+    state            folder of what is kept; a private one, removed at the end, of a process started without one
     trouble, source  description of a current problem, and the source; both are published with the health
     source_failed    whether the stream ended because the source failed
     has_ended        whether the process has sent or received the end of the stream
@@ -110,7 +112,9 @@ class Process:
         self.source_failed = self.has_ended = False
         self.watchdog = Watchdog.opened(watchdog)
         self._stop_moment = float("inf")  # at which a signal asked the process to end
-        self._health = Publisher(HEALTH, self.endpoint, sender=name)
+        self._stack = ExitStack()
+        self._health = self._stack.enter_context(Publisher(HEALTH, self.endpoint, sender=name))
+        self.state = job.state or self._stack.enter_context(private_folder())
         self._reported = 0.0
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._end)
@@ -143,7 +147,7 @@ class Process:
 
     def close(self) -> None:
         """Close the channel `health`, after its last message was sent."""
-        self._health.close()
+        self._stack.close()
 
     def _end(self, *_: object) -> None:
         self._stop_moment = min(self._stop_moment, time.monotonic())

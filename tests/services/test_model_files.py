@@ -49,15 +49,6 @@ def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, ca
     assert "is not searched for any more" in caplog.text
 
 
-def test_without_a_folder_models_are_kept_in_memory(learned):
-    files = ModelFiles(None)
-    name = files.add(learned).model
-    files.store()
-    files.keep_only({name})
-    assert files.get(name) is learned
-    assert files.get("another") is None
-
-
 @pytest.mark.parametrize("has_state", [True, False])
 def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp_path, monkeypatch, has_state):
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
