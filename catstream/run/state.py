@@ -33,7 +33,6 @@ TREES = "trees"
 #: Folder of the saved models that objects are searched for by, in that of the state.
 SEARCHED = "searched_models"
 
-_HELP = "give another folder"
 _SMALL = ("job.safetensors", "desired_state.json")
 _NAMES = re.compile(
     rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
@@ -96,11 +95,9 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
     for name, data in content.items():
         if not _NAMES.fullmatch(name):
             raise ServiceError(f"{name!r} is not a file of the state of a pipeline")
-        try:
+        with storage.writing(folder):
             (folder / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             storage.write_atomically(folder / name, data, mode=0o600)
-        except OSError as error:
-            raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
 
 
 @contextlib.contextmanager
@@ -114,9 +111,11 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             handle = stack.enter_context(storage.descriptor(folder, os.O_DIRECTORY))
         except OSError as error:
-            raise ServiceError(f"cannot keep the state in {str(folder)!r} ({error.strerror}): {_HELP}") from None
+            raise ServiceError(
+                f"cannot keep the state in {str(folder)!r} ({error.strerror}): give another folder"
+            ) from None
         if not storage.lock(handle, seconds):
-            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or {_HELP}")
+            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or give another folder")
         yield folder
 
 
