@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_t
 import msgspec
 from msgspec import Meta
 
-from catstream.errors import SettingsError
+from catstream.errors import CatstreamError, SettingsError
 
 #: The value of a setting.
 Value = str | int | float | bool
@@ -353,7 +353,7 @@ class Settings:
                 raise SettingsError(f"there is no preset {preset!r}: there are {', '.join(PRESETS)}")
             values.update(PRESETS[preset])
         if file is not None:
-            values.update(flat(_read(Path(file))))
+            values.update(flat(read_toml(Path(file), SettingsError)))
         for variable, text in (os.environ if environment is None else environment).items():
             name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
             if variable.startswith("CATSTREAM_") and not _is_foreign(name):
@@ -574,11 +574,12 @@ def _pair(text: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
-def _read(path: Path) -> dict[str, object]:
+def read_toml(path: Path, kind: type[CatstreamError]) -> dict[str, object]:
+    """The tables of a TOML file; raises an error of this kind if it cannot be read, or is none."""
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
     except OSError as error:
-        raise SettingsError(f"cannot read the settings file {path}: {error.strerror}") from None
+        raise kind(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # not UTF-8, not TOML, or nested without end
-        raise SettingsError(f"the settings file {path} is not TOML: {error}") from None
+        raise kind(f"{path}: this is not TOML: {error}") from None

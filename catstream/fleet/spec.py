@@ -11,7 +11,6 @@ import hashlib
 import json
 import re
 import reprlib
-import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from catstream.box import Box
 from catstream.errors import CatstreamError, FleetError
 from catstream.messages.names import UNNAMED, boxes_by_name, check_name, listed
 from catstream.run.job import Job, changed_setting
-from catstream.settings import Settings, flat
+from catstream.settings import Settings, flat, read_toml
 from catstream.video.source import is_live
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
@@ -168,16 +167,7 @@ class FleetSpec:
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
         """Read the file of a fleet; FleetError if it has no streams, or has a key or value that is not valid."""
-        try:
-            text = path.read_text(encoding="utf-8")
-        except OSError as error:
-            raise FleetError(f"cannot read the fleet file {path}: {error.strerror}") from None
-        except ValueError:
-            raise FleetError(f"the fleet file {path} is not UTF-8 text: save it as TOML") from None
-        try:
-            tables = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            raise FleetError(f"{path}: this is not TOML: {error}") from None
+        tables = read_toml(path, FleetError)
         with _errors_in(str(path)):
             values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
             if not values.get("streams"):

@@ -107,13 +107,9 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
     ServiceError if another process keeps it locked, or it cannot be made.
     """
     with contextlib.ExitStack() as stack:
-        try:
+        with storage.writing(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             handle = stack.enter_context(storage.descriptor(folder, os.O_DIRECTORY))
-        except OSError as error:
-            raise ServiceError(
-                f"cannot keep the state in {str(folder)!r} ({error.strerror}): give another folder"
-            ) from None
         if not storage.lock(handle, seconds):
             raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or give another folder")
         yield folder

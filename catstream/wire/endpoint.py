@@ -229,13 +229,9 @@ def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fl
 def _locked(folder: Path, text: str) -> Iterator[Path]:
     """A folder for the sockets of one pipeline, which is made; the sockets are removed afterwards."""
     with contextlib.ExitStack() as stack:
-        try:
+        with writing(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
-        except OSError as error:
-            raise ServiceError(
-                f"cannot use the folder {text!r} as an endpoint ({error.strerror}): give another folder"
-            ) from None
         facts = os.fstat(handle)
         if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
             raise ServiceError(f"other users may write to {text!r}: give a folder of your own, chmod 700")

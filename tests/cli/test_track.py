@@ -158,7 +158,7 @@ REJECTED = {
     "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
     "a value that does not fit": (["--set", "coreset.size=x"], "coreset.size cannot be 'x'"),
     "a preset that does not exist": (["--preset", "cat11"], "cat11"),
-    "a settings file that is not there": (["--settings", "none.toml"], "cannot read the settings file"),
+    "a settings file that is not there": (["--settings", "none.toml"], "cannot read none.toml"),
     "an endpoint on the network": (["--set", "run.endpoint=tcp://0.0.0.0:5700"], "other machines"),
 }
 

@@ -111,7 +111,7 @@ def test_a_folder_that_is_made_is_for_this_user_alone_and_another_one_has_to_be(
     (folder / "file").touch()
     (folder / "open").mkdir()
     (folder / "open").chmod(0o777)
-    bad = {"file": "give another folder", "open": "other users may write"}
+    bad = {"file": "give another place", "open": "other users may write"}
     if os.geteuid() == 0:  # only root can give a folder away
         (folder / "theirs").mkdir(mode=0o755)
         os.chown(folder / "theirs", 12345, 12345)
