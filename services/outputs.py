@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from hashlib import blake2b
 from pathlib import Path
 from time import monotonic
-from typing import Self
 
 from catstream.box import Box
 from catstream.errors import CatstreamError
@@ -33,7 +32,7 @@ _KEPT_BYTES = 256 << 20  # of these frames at most
 _log = logging.getLogger(__name__)
 
 
-class Outputs:
+class Outputs(AbstractContextManager["Outputs"]):
     """The sockets that a detector sends on, with `results` only if the run has an owner; a context manager."""
 
     def __init__(self, process: Process) -> None:
@@ -57,9 +56,6 @@ class Outputs:
         for each in tracks.tracks.values() if isinstance(tracks, Tracks) else (tracks,):
             self._tracks.send(each)
         self._training.send(features)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from time import monotonic
-from typing import Self
 from uuid import uuid4
 
 from catstream.box import Box
@@ -32,7 +32,7 @@ ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
 REGISTRY_SECONDS = 1.0  #: for the registry before each command; without an answer, the stream has not moved
 
 
-class Control:
+class Control(AbstractContextManager["Control"]):
     """Sends commands to one running pipeline, from one thread at a time; close it, or use it in a `with`.
 
     In each command, `object` is the name of an object; without a name, the only object is meant.
@@ -166,9 +166,6 @@ class Control:
         self._commands.close()
         if self._stream is not None:
             self._stream.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

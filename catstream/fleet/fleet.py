@@ -30,10 +30,10 @@ import tempfile
 import time
 import warnings
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from catstream.client.registry import REGISTRY_PORT
 from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
@@ -80,7 +80,7 @@ class Merged:
     skipped: tuple[str, ...]
 
 
-class Fleet:
+class Fleet(AbstractContextManager["Fleet"]):
     """Connects to the controller of a fleet, which `up` starts. Use it in a `with`.
 
     Parameters
@@ -232,9 +232,6 @@ class Fleet:
         if self.is_owner and self.is_running:
             self.down()
         self._end_ray()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from time import monotonic
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ _TICKS_PER_FRAME = 100
 _LARGE_PIXELS = 1920 * 1200
 
 
-class VideoWriter:
+class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
     """Writes an MP4; a context manager, which leaves no file if an error or Ctrl-C ends its block.
 
     The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed. If no frame was
@@ -99,9 +99,6 @@ class VideoWriter:
         except (OSError, av.FFmpegError) as error:
             self.frames = 0  # the file is unreadable; writing more to it would crash the process
             raise VideoError(f"cannot write the video {str(self.path)!r} any more: {error.strerror}") from None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:

@@ -7,10 +7,11 @@ import io
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -102,7 +103,7 @@ def _picture(image: np.ndarray, box: Box) -> bytes:
     return jpeg(image[top : top + side, left : left + side], _PICTURE)
 
 
-class SearchLog:
+class SearchLog(AbstractContextManager["SearchLog"]):
     """The results of all files; those that were searched to the end are lines of a JSON file. Use it in a `with`.
 
     path       of the file; it is continued if it exists
@@ -120,9 +121,6 @@ class SearchLog:
             self._stream.truncate(good)  # the last line of a process that was killed may be incomplete
             if not good:
                 self._write({"kind": _KIND, "search": search})
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._stream.close()
