@@ -117,7 +117,7 @@ class Arena:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             endpoint = Endpoint.parse(stack.enter_context(tempfile.TemporaryDirectory(prefix="catstream-")))
-            job = Job(self._source, self._boxes, settings=self._settings, owned=True, resume=True)
+            job = Job(self._source, self._boxes, settings=self._settings, run="chaos", resume=True)
             file = replace(job, state=self.state, endpoint=str(endpoint)).save(self._folder)
             (self._folder / "sitecustomize.py").write_text(_MODULE)
             window = self._settings.run.unstored_frames + 1

@@ -219,7 +219,6 @@ class Pipeline:
         return replace(
             self._job,
             endpoint=endpoint,
-            owned=True,
             state=self._state,
             resume=self._resumed_job is not None,
             since=time.monotonic() - passed,

@@ -157,7 +157,7 @@ class DetectorLoop:
     def resume(self) -> bool:
         """Continue after the last frame that compressor and owner have; returns whether no signal came first."""
         process, features = self._process, self._outputs.features
-        after = process.watchdog.after if process.job.owned else NO_OWNER
+        after = process.watchdog.after if process.job.run else NO_OWNER
         models: dict[str, Model] = {}
         self._repeats = NO_OWNER  # commands wait
         while True:

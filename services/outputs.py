@@ -39,7 +39,7 @@ class Outputs(AbstractContextManager["Outputs"]):
         window, endpoint = process.settings.run.unstored_frames, process.endpoint
         with ExitStack() as stack:
             self.features = stack.enter_context(Sender(FEATURES, endpoint, window))
-            self.results = stack.enter_context(ResultsSender(endpoint, window + 1)) if process.job.owned else None
+            self.results = stack.enter_context(ResultsSender(endpoint, window + 1)) if process.job.run else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
             self._training = stack.enter_context(Publisher(TRAINING, endpoint))
             self.previews = stack.enter_context(Previews(endpoint, keeps=is_live(process.job.source)))

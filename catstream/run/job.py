@@ -103,8 +103,8 @@ class Job:
     endpoint  where the processes meet; the setting of the same name if this is empty
     state     folder of the checkpoints and of the desired state; None if nothing is kept
     resume    whether the processes continue from that state
-    run       id of this start of the run, which its messages carry; empty if the processes were started by hand
-    owned     whether the process that started the run receives every track on the channel `results`
+    run       id of this start of the run, which its messages carry, and whose program receives every track on the
+              channel `results`; empty if the processes were started by hand
     since     value of `time.monotonic` from which the times of a live source count; None for its first frame
     """
 
@@ -122,7 +122,6 @@ class Job:
     state: Path | None = None
     resume: bool = False
     run: str = ""
-    owned: bool = False
     since: float | None = None
 
     def __post_init__(self) -> None:
@@ -159,7 +158,7 @@ class Job:
         try:
             settings = Settings.from_values(metadata.pop("settings"))
             read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}
-            return cls(**(metadata | read), settings=settings)
+            return cls(**read, settings=settings)
         except (AttributeError, KeyError, TypeError, msgspec.ValidationError) as error:
             raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
 

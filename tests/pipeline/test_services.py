@@ -135,7 +135,7 @@ def failed(job, folder):
 
 
 def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(folder, caplog):
-    job = Job(str(folder / "gone.mp4"), {"": Box(1, 1, 9, 9)}, endpoint=str(folder), owned=True)
+    job = Job(str(folder / "gone.mp4"), {"": Box(1, 1, 9, 9)}, endpoint=str(folder))
     error, restarts = failed(job, folder)
     assert ("no video or folder" in error, restarts) == (True, 0)
     assert "the detector" not in caplog.text  # another process may hang on a busy machine
@@ -166,14 +166,14 @@ def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder, monkeyp
             child.process.send_signal(signal.SIGKILL)
 
     monkeypatch.setattr(Child, "start", start_and_kill)
-    error, restarts = failed(Job(video[0], {"": video[1][0]}, endpoint=str(folder), owned=True), folder)
+    error, restarts = failed(Job(video[0], {"": video[1][0]}, endpoint=str(folder)), folder)
     assert error.startswith("the trainer died 6 times in a minute, the last time with signal SIGKILL")
     assert restarts == 6
 
 
 def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_one(video, folder, until):
     path, boxes = video
-    job, runs = Job(path, {"": boxes[0]}, endpoint=str(folder), owned=True), []
+    job, runs = Job(path, {"": boxes[0]}, endpoint=str(folder)), []
     for resume in (False, True):
         supervisor = Supervisor(replace(job, resume=resume), folder)
         try:
@@ -218,7 +218,7 @@ def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_t
 
 def test_a_run_whose_folder_was_removed_ends_with_that_reason(endless, folder):
     """The folder is one that the system cleans, as the folder of a user at the logout."""
-    supervisor = Supervisor(Job(endless, {"": Box(150, 90, 50, 50)}, endpoint=str(folder), owned=True), folder)
+    supervisor = Supervisor(Job(endless, {"": Box(150, 90, 50, 50)}, endpoint=str(folder)), folder)
     try:
         assert supervisor.next_frame()
         shutil.rmtree(folder)

@@ -76,7 +76,7 @@ def test_a_job_that_is_not_there_or_damaged_is_an_error_that_names_the_file(tmp_
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("size", [320]), ("owned", "yes"), ("models", ["ben"]), ("boxes", {"": [1, 2]}), ("part", 3)]
+    ("field", "value"), [("size", [320]), ("resume", "yes"), ("models", ["ben"]), ("boxes", {"": [1, 2]}), ("part", 3)]
 )
 def test_a_field_of_another_type_is_an_error(tmp_path, field, value):
     file = JOB.save(tmp_path)
