@@ -202,7 +202,7 @@ class Pipeline:
                 stack.enter_context(begun(self._state, self._resumed_job, self._job))
             job = self._started(str(endpoint))
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
-            self._supervisor = Supervisor(job, folder, self._start, live=self.live)
+            self._supervisor = Supervisor(job, folder, self._start)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._stack = str(endpoint), stack.pop_all()
             self._owner = os.getpid()  # a copy of this process that is forked later does not end the run

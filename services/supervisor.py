@@ -25,6 +25,7 @@ from catstream.messages.kinds import End, Health, Track, Tracks
 from catstream.run.job import Job
 from catstream.services.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS, Watchdog
 from catstream.services.start_server import NAMES, StartedProcess, start_server
+from catstream.video.source import is_live
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
@@ -157,24 +158,21 @@ class Supervisor:
 
     folder  of the file of the job, of the logs, and of the state if the job has no folder for it
     after   number of the last frame that the program has, which a run that is resumed follows
-    live    whether the source is live; its detector then logs what the user has to know
     end     the last message of the run; None before it was received
     health  the newest health report of each process, by its name
     """
 
-    def __init__(self, job: Job, folder: Path, after: int = 0, *, live: bool = False) -> None:
+    def __init__(self, job: Job, folder: Path, after: int = 0) -> None:
         self.end: End | None = None
         self.health: dict[str, Health] = {}
-        self._live, self._folder = live, folder
+        self._live, self._folder = is_live(job.source), folder
         self._frames: deque[Tracks] = deque()  # that were received, and not returned yet
         self._changed = threading.Condition()
         self._over: bool = False  # whether no further frames are received
         self._error: Exception | None = None
         self._checked = time.monotonic()
         self._ending, self._hurries, self._ended = threading.Event(), threading.Event(), threading.Event()
-        # A restarted detector continues the time stamps of a live source, and every process the run.
-        since = time.monotonic() if job.since is None else job.since
-        file = replace(job, state=job.state or folder, since=since, run=token_hex(8)).save(folder)
+        file = replace(job, state=job.state or folder, run=token_hex(8)).save(folder)
         endpoint = Endpoint.parse(job.endpoint, job.settings.run.keys)
         with ExitStack() as stack:
             window = job.settings.run.unstored_frames
