@@ -31,7 +31,6 @@ from catstream.applications.evaluation.datasets import (
     read_attributes,
     spatial,
     temporal,
-    with_attributes,
 )
 from catstream.applications.evaluation.onepass import TRACKERS, evaluate
 from catstream.applications.evaluation.runs import EvaluationRun
@@ -146,6 +145,19 @@ def losses(found: Found, groups: Mapping[str, set[str]]) -> Iterator[list[Cell]]
 def flips(rows: list[Row], part: str) -> int | None:
     """Return the number of sequences that flip with the jitter of the first box; None for the other parts."""
     return sum(bool(row.flips) for row in rows) if part == "jitter" else None
+
+
+def with_attributes(names: Iterable[str], attributes: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
+    """Return which of these sequences have each attribute; `attributes` is what `read_attributes` returns.
+
+    >>> with_attributes(["walk", "run"], {"walk": ["blur"], "run": ["blur", "occlusion"], "other": ["blur"]})
+    {'blur': ['walk', 'run'], 'occlusion': ['run']}
+    """
+    found: dict[str, list[str]] = {}
+    for name in names:
+        for attribute in dict.fromkeys(attributes.get(name, ())):
+            found.setdefault(attribute, []).append(name)
+    return dict(sorted(found.items()))
 
 
 def by_attribute(found: Found, attributes: Mapping[str, list[str]]) -> Table:

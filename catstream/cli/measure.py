@@ -145,10 +145,9 @@ def evaluate(
     for line in accuracy.describe_flips(rows):
         click.echo(line)
     if json_file is not None or output is not None:
-        shared = datasets.with_attributes(dict.fromkeys(run.sequence.name for run in runs), seen)
-        write_json(json_file, accuracy.to_json(rows, settings, shared))
+        write_json(json_file, accuracy.to_json(rows, settings, seen))
         if output is not None:
-            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, shared, errors)}")
+            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, seen, errors)}")
     if errors:
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"

@@ -115,16 +115,13 @@ def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
     return [*measures, *shares, f"{values['fps']:.0f}"]
 
 
-def by_attribute(
-    rows: Iterable[Row], attributes: Mapping[str, Sequence[str]]
-) -> dict[str, dict[str, dict[str, float | None]]]:
-    """Return the means of each tracker over the sequences with an attribute: {attribute: {tracker: {measure: mean}}}.
-
-    attributes : names of the sequences that have each attribute
-    """
-    rows = list(rows)
-    means = {attribute: mean_of(row for row in rows if row.name in names) for attribute, names in attributes.items()}
-    return {attribute: mean for attribute, mean in means.items() if mean}
+def by_attribute(rows: Iterable[Row], attributes: Mapping[str, Iterable[str]]) -> dict[str, list[Row]]:
+    """Return the rows of the sequences with each attribute; `attributes` are those of each sequence, by its name."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        for attribute in dict.fromkeys(attributes.get(row.name, ())):
+            found.setdefault(attribute, []).append(row)
+    return dict(sorted(found.items()))
 
 
 def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
@@ -147,16 +144,16 @@ def describe_flips(rows: Iterable[Row]) -> list[str]:
     ]
 
 
-def to_json(rows: list[Row], settings: Settings, attributes: Mapping[str, Sequence[str]]) -> dict[str, object]:
+def to_json(rows: list[Row], settings: Settings, attributes: Mapping[str, Iterable[str]]) -> dict[str, object]:
     """Return the JSON of `catstream evaluate --json`: rows, means, flips and attributes, and provenance."""
-    means = by_attribute(rows, attributes)
     return {
         **provenance(settings),
         "sequences": [dataclasses.asdict(row) for row in rows],
         "mean": mean_of(rows),
         "flips": flips_of(rows),
         "attributes": {
-            attribute: {"sequences": list(attributes[attribute]), "mean": mean} for attribute, mean in means.items()
+            attribute: {"sequences": list(dict.fromkeys(row.name for row in group)), "mean": mean_of(group)}
+            for attribute, group in by_attribute(rows, attributes).items()
         },
     }
 
@@ -196,12 +193,12 @@ def write_report(
     path: Path,
     runs: list[EvaluationRun],
     settings: Settings,
-    attributes: Mapping[str, Sequence[str]],
+    attributes: Mapping[str, Iterable[str]],
     errors: Sequence[CatstreamError] = (),
 ) -> Path:
     """Write the report of an evaluation as one self-contained HTML file.
 
-    attributes : names of the sequences that have each attribute
+    attributes : those of each sequence, by its name
     errors : those of runs that are not included
     """
     rows = rows_of(runs)
@@ -259,10 +256,10 @@ def _table(rows: list[Row]) -> str:
     return table(("sequence", "tracker", "frames", *HEADINGS), lines, texts=2, means=len(means))
 
 
-def _attribute_table(rows: list[Row], attributes: Mapping[str, Sequence[str]]) -> str:
+def _attribute_table(rows: list[Row], attributes: Mapping[str, Iterable[str]]) -> str:
     lines = [
-        [escape(attribute), tracker, len(attributes[attribute]), *cells(mean)]
-        for attribute, means in by_attribute(rows, attributes).items()
-        for tracker, mean in means.items()
+        [escape(attribute), tracker, len({row.name for row in group}), *cells(mean)]
+        for attribute, group in by_attribute(rows, attributes).items()
+        for tracker, mean in mean_of(group).items()
     ]
     return table(("attribute", "tracker", "sequences", *HEADINGS), lines, texts=2, means=0)

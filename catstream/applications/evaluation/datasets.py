@@ -25,7 +25,7 @@ A run starts from one of these:
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping
+from collections.abc import Callable, Collection, Generator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -371,16 +371,3 @@ def read_attributes(file: Path) -> dict[str, list[str]]:
         raise SettingsError(
             f'cannot read the attributes in {str(file)!r} ({error}): give a JSON file {{"sequence": ["occlusion"]}}'
         ) from None
-
-
-def with_attributes(names: Iterable[str], attributes: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
-    """Return which of these sequences have each attribute; `attributes` is what `read_attributes` returns.
-
-    >>> with_attributes(["walk", "run"], {"walk": ["blur"], "run": ["blur", "occlusion"], "other": ["blur"]})
-    {'blur': ['walk', 'run'], 'occlusion': ['run']}
-    """
-    found: dict[str, list[str]] = {}
-    for name in names:
-        for attribute in dict.fromkeys(attributes.get(name, ())):
-            found.setdefault(attribute, []).append(name)
-    return dict(sorted(found.items()))

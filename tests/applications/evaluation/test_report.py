@@ -23,7 +23,7 @@ def run_of(sequence, boxes, tracker: str = "catstream") -> EvaluationRun:
 
 def test_the_report_is_self_contained(tmp_path, sequence, found):
     runs = [run_of(sequence, found, "mil"), run_of(sequence, found)]
-    attributes = {"blur": ["walk"], "occlusion": ["walk"]}
+    attributes = {"walk": ["blur", "occlusion"]}
     page = write_report(tmp_path / "report.html", runs, Settings(coreset={"size": 32}), attributes).read_text()
     assert page.count("<svg") == 2
     assert not re.search(r"(src|href)=\"(?!data:)|<script|@import|url\(", page)
