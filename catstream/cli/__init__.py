@@ -1,4 +1,4 @@
-"""The command line: argument parsing and output, no algorithms. Commands that belong together share a module."""
+"""The command line: argument parsing and output, no algorithms."""
 
 from __future__ import annotations
 
@@ -13,47 +13,38 @@ from catstream.addresses import without_passwords
 from catstream.cli.common import INTERRUPTS, complain, stopped
 from catstream.errors import CatstreamError
 
-#: Command -> summary. The module of a command is imported when it is called, because some imports take long.
+#: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
+#: long; commands that belong together share one.
 COMMANDS = {
-    "track": "Track objects in a video.",
-    "demo": "Track an object in a rendered demo video.",
-    "find": "Find the objects of saved models in videos, folders and images.",
-    "evaluate": "Measure accuracy on annotated sequences, also of other trackers.",
-    "loadtest": "Run pipelines under load, and measure latency and losses.",
-    "watch": "Print the messages of a running pipeline.",
-    "view": "Watch and control a running pipeline in a browser.",
-    "sink": "Write the tracks of a running pipeline to files and elsewhere.",
-    "export": "Make other formats from the log of a run.",
-    "status": "Show the state of a running pipeline.",
-    "set-box": "Set the box of an object in a running pipeline.",
-    "search": "Search for the object of a saved model in a running pipeline.",
-    "forget": "Stop tracking an object in a running pipeline.",
-    "pause": "Pause a running pipeline.",
-    "resume": "Resume a paused pipeline.",
-    "save": "Save what a pipeline has learned to a file.",
-    "merge": "Merge saved models of one object.",
-    "stop": "Stop a running pipeline as if its source had ended.",
-    "fleet": "Run many streams on one machine or many.",
-    "network": "Use the features of a small network beside HOG and colours.",
-    "keys": "Manage the keys of a pipeline and its clients.",
-    "settings": "List all settings with their defaults and descriptions.",
-}
-
-#: Module of the commands that share a module, or whose module has another name.
-_MODULES = {
-    "fleet": "fleet_commands",
-    "network": "network_commands",
-    **dict.fromkeys(("watch", "status", "set-box", "search", "forget", "pause", "resume", "save", "stop"), "attach"),
-    **dict.fromkeys(("find", "merge"), "models"),
-    **dict.fromkeys(("evaluate", "loadtest", "demo"), "measure"),
-    **dict.fromkeys(("sink", "export"), "write"),
-    **dict.fromkeys(("keys", "settings"), "configure"),
+    "track": ("track", "Track objects in a video."),
+    "demo": ("measure", "Track an object in a rendered demo video."),
+    "find": ("models", "Find the objects of saved models in videos, folders and images."),
+    "evaluate": ("measure", "Measure accuracy on annotated sequences, also of other trackers."),
+    "loadtest": ("measure", "Run pipelines under load, and measure latency and losses."),
+    "watch": ("attach", "Print the messages of a running pipeline."),
+    "view": ("view", "Watch and control a running pipeline in a browser."),
+    "sink": ("write", "Write the tracks of a running pipeline to files and elsewhere."),
+    "export": ("write", "Make other formats from the log of a run."),
+    "status": ("attach", "Show the state of a running pipeline."),
+    "set-box": ("attach", "Set the box of an object in a running pipeline."),
+    "search": ("attach", "Search for the object of a saved model in a running pipeline."),
+    "forget": ("attach", "Stop tracking an object in a running pipeline."),
+    "pause": ("attach", "Pause a running pipeline."),
+    "resume": ("attach", "Resume a paused pipeline."),
+    "save": ("attach", "Save what a pipeline has learned to a file."),
+    "merge": ("models", "Merge saved models of one object."),
+    "stop": ("attach", "Stop a running pipeline as if its source had ended."),
+    "fleet": ("fleet_commands", "Run many streams on one machine or many."),
+    "network": ("network_commands", "Use the features of a small network beside HOG and colours."),
+    "keys": ("configure", "Manage the keys of a pipeline and its clients."),
+    "settings": ("configure", "List all settings with their defaults and descriptions."),
 }
 
 
 def load_command(name: str) -> click.Command:
     """Import the module of one of the `COMMANDS`, and return the click command."""
-    command: click.Command = getattr(import_module(f"catstream.cli.{_MODULES.get(name, name)}"), name.replace("-", "_"))
+    module = import_module(f"catstream.cli.{COMMANDS[name][0]}")
+    command: click.Command = getattr(module, name.replace("-", "_"))
     return command
 
 
@@ -74,7 +65,7 @@ class _Commands(click.Group):
 
     def format_commands(self, _: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
 
 @click.command(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
