@@ -93,6 +93,8 @@ def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceEr
     """A block that writes a file, or into a folder: an OSError in it becomes an error of this kind, for a person."""
     try:
         yield
+    except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
+        raise
     except OSError as error:
         raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
 

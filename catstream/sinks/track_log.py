@@ -76,25 +76,16 @@ class LineSink(ABC):
         """Add the lines of a frame, in one write."""
         tracks = sorted(frame.tracks, key=lambda track: track.object in self._before)
         self._before = _objects(frame)
-        with self._translated_errors():
+        with writing(self.path, VideoError):
             self._file.write("".join(f"{self.line(track, frame.seconds)}\n" for track in tracks))
 
     def close(self) -> None:
         """Close the file; a line for which the disk had no room is tried again."""
-        with self._translated_errors():
+        with writing(self.path, VideoError):
             self._file.close()
 
     def _open(self, mode: str) -> IO[str]:
         return self.path.open(mode, encoding="utf-8", buffering=1)
-
-    @contextmanager
-    def _translated_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
-            raise
-        except OSError as error:
-            raise VideoError(f"cannot write to {self.path} any more: {error.strerror}") from None
 
 
 class NdjsonSink(LineSink):
