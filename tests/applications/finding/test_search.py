@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import catstream
-from catstream.applications.finding.find import File, Scan, Search, Sighting, Step, find_files, load_models
+from catstream.applications.finding.find import File, Reading, Scan, Search, Sighting, Step, find_files, load_models
 from catstream.applications.finding.found import FileResult, SearchLog
 from catstream.box import Box
 from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoError
@@ -239,9 +239,9 @@ def tree(tmp_path, video):
 
 
 def frames(file):
-    problems = []
-    searched = file.frames(0.0, RunSettings(), lambda _: None, problems.append)
-    return [(frame.number, name, frame.image.shape) for frame, name in searched], problems
+    reading = Reading()
+    searched = file.frames(0.0, RunSettings(), reading)
+    return [(frame.number, name, frame.image.shape) for frame, name in searched], reading.problems
 
 
 def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
@@ -312,10 +312,10 @@ def test_a_video_is_searched_by_time_whatever_its_rate_and_its_size_may_change(t
             container.mux(stream.encode(None))
     joined = tmp_path / "joined.ts"
     joined.write_bytes((tmp_path / "a.ts").read_bytes() + (tmp_path / "b.ts").read_bytes())
-    problems = []
-    steps = File(joined, "video").frames(0.2, RunSettings(), lambda _: None, problems.append)
+    reading = Reading()
+    steps = File(joined, "video").frames(0.2, RunSettings(), reading)
     assert [frame.number for frame, _ in steps] == [0, 4, 6, 8, 13, 16, 18, 19]
-    assert not problems
+    assert not reading.problems
     assert "10 frames of another size" in caplog.text
 
 
