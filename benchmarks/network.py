@@ -18,7 +18,7 @@ from catstream.applications.evaluation.accuracy import Row, rows_of
 from catstream.settings import Settings
 
 MEASURES = ("auc", "success")
-COLUMNS = ("features", "sequences", *(word for measure in ("AUC", "success") for word in (measure, "gained", "±")))
+COLUMNS = ("sequences", "", "features", *(word for measure in ("AUC", "success") for word in (measure, "gained", "±")))
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
@@ -26,18 +26,20 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     variants |= {file.stem: Settings(features={"network": str(file)}) for file in options.networks}
     found = {name: rows_of(runs) for name, runs in compared(options, videos(options), variants).items()}
     note = f"{described(options)} of each sequence; gained: beside HOG and colours alone; ±: the standard error"
-    for group, members in (("the tuning sequences", False), ("the check list", True), ("all", None)):
+    means: list[list[Cell]] = []
+    for group, members in (("tuning", False), ("check list, *", True), ("all", None)):
         rows = {name: [row for row in of if members in (row.name in CHECK, None)] for name, of in found.items()}
         if rows["HOG and colours"]:
-            yield Table(f"Means of {group}", COLUMNS, list(beside(rows)), note)
+            means += ([group, *cells] for cells in beside(rows))
+    yield Table("Means", COLUMNS, means, note)
     heads = ("sequence", *(f"{measure}, {name}" for name in found for measure in ("AUC", "success")))
-    yield Table("Each sequence", heads, list(by_sequence(found)), "* check list")
+    yield Table("Each sequence", heads, list(by_sequence(found)))
 
 
 def beside(found: dict[str, list[Row]]) -> Iterator[list[Cell]]:
     """Yield a row for each variant: means, and differences to the first variant."""
     for name, rows in found.items():
-        cells: list[Cell] = [name, len(rows)]
+        cells: list[Cell] = [len(rows), name]
         for measure in MEASURES:
             values = [getattr(row, measure) for row in rows]
             before = [getattr(row, measure) for row in next(iter(found.values()))]
