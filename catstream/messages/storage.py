@@ -46,7 +46,7 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
     OSError if the file cannot be written; the old one stays unchanged.
     """
     path = Path(path)
-    remove_parts(path.parent, path.name)
+    _remove_parts(path)
     with _written_beside(path, data, mode) as part:
         part.replace(path)
 
@@ -80,9 +80,9 @@ def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
-def remove_parts(folder: Path, name: str = "") -> None:
-    """Remove the unfinished files, of this name or of any, that processes left when they were killed while writing."""
-    for part in folder.glob(f".{glob.escape(name)}{'.' if name else ''}*.part"):
+def _remove_parts(path: Path) -> None:
+    """Remove the unfinished files for a file that processes left when they were killed while writing it."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         with contextlib.suppress(OSError):
             if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
                 shutil.rmtree(part) if part.is_dir() else part.unlink()
@@ -177,7 +177,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> N
     OSError if the file cannot be written; the old one stays unchanged.
     """
     path = Path(path)
-    remove_parts(path.parent, path.name)
+    _remove_parts(path)
     # In a folder of its own, because safetensors makes a file beside the one that it writes.
     with tempfile.TemporaryDirectory(".part", f".{path.name}.", path.parent, ignore_cleanup_errors=True) as folder:
         part, (contiguous, header) = Path(folder, path.name), _content(arrays, metadata)
