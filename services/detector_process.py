@@ -87,7 +87,7 @@ class DetectorLoop:
         # The name of a file need not be UTF-8.
         process.source = without_password(process.job.source).encode(errors="replace").decode()[:_LONGEST_SOURCE]
         job, endpoint = process.job, process.endpoint
-        self._process = process
+        self._process, self._live = process, is_live(job.source)
         self._model_files = ModelFiles(process.state / SEARCHED)
         self.desired = _desired(process, self._model_files)
         self.detectors = Detectors(process.settings, job.network)
@@ -169,8 +169,7 @@ class DetectorLoop:
             self._serve()
             if process.stop_requested:
                 return False
-        context, live = process.settings.search.context, is_live(process.job.source)
-        start = resume_at(position, after, self.desired, context, live=live)
+        start = resume_at(position, after, self.desired, process.settings.search.context, live=self._live)
         self.detectors.seq, self._repeats, self.desired = start.seq, start.repeats, start.desired
         for name, state in start.states.items():
             detector = self.detectors.add(name)
@@ -185,22 +184,22 @@ class DetectorLoop:
     def open(self, stack: ExitStack) -> Iterator[Frame]:
         """The frames of the source from the next one on. A file is opened at the one before, which always exists."""
         job, settings, watchdog = self._process.job, self._process.settings, self._process.watchdog
-        live, step = is_live(job.source), job.part.step or 1
-        first = self.detectors.seq if live else max(self.detectors.seq - 1, 0)
+        step = job.part.step or 1
+        first = self.detectors.seq if self._live else max(self.detectors.seq - 1, 0)
         watchdog.allow(LONG_SECONDS + ((job.part.start or 0) + first * step) * _SKIP_SECONDS)
         watchdog.limit += (step - 1) * _SKIP_SECONDS
         part, since = job.part, job.since
         source = open_source(job.source, first, part=part, since=since, idle=self._idle, settings=settings.run)
         self._source = stack.enter_context(source)
-        if live:
+        if self._live:
             self._source.size = job.size or self._source.size  # a camera may have another one than when the run began
-        frames = self._source if live else stack.enter_context(closing(read_ahead(self._source)))
+        frames = self._source if self._live else stack.enter_context(closing(read_ahead(self._source)))
         return (frame for frame in frames if frame.number >= self.detectors.seq)
 
     def _idle(self) -> bool:
         """One turn while a live source provides no frame; returns whether to stop waiting."""
         self.turn()
-        if self._boxes and self._source is not None and self._source.counters.get("lost_seconds"):
+        if self._boxes and self._source_counters().get("lost_seconds"):
             self._reject_boxes("the source is lost, so there is no frame for a box: try again once it is back")
         return bool(self.end_reason)
 
@@ -214,9 +213,8 @@ class DetectorLoop:
         given = self._begin_boxes(frame)
         if self._holds and not given:
             # The other objects, while a box is drawn. A live source goes on: where they are by now is not known.
-            live = self._source is not None and self._source.live
-            self._show(self.detectors.seq, frame, {} if live else self._tracks.tracks)
-        while self._holds and not given and not self.end_reason and self._source is not None and not self._source.live:
+            self._show(self.detectors.seq, frame, {} if self._live else self._tracks.tracks)
+        while self._holds and not (given or self.end_reason or self._live):
             sleep(TURN_SECONDS)
             self.turn()
             given = self._begin_boxes(frame)
@@ -281,7 +279,7 @@ class DetectorLoop:
         """Wait until the models are recent enough: see `awaited`. A live source does not wait."""
         run, features = self._process.settings.run, self._outputs.features
         due = self.detectors.seq - (0 if run.lockstep else run.lag_frames)
-        while not self.end_reason and self._source is not None and not self._source.live:
+        while not (self.end_reason or self._live):
             known = self.detectors.detectors.items()
             newest = {name: each.newest_version for name, each in known if each.state and each.state.first_frame < due}
             channel = awaited(due, features.window.taken, features.window.count_samples(due), newest)
