@@ -110,12 +110,12 @@ class ModelFiles:
         self._folder = folder
         self._models: dict[str, Learned] = {}
 
-    def add(self, learned: Learned, begins: int = 1) -> DesiredObject:
-        """Keep a saved model in memory; returns the object that it begins in message `begins`, with its name."""
+    def add(self, learned: Learned) -> DesiredObject:
+        """Keep a saved model in memory; returns the object that it begins in the first message, with its name."""
         data = learned.to_bytes()
         name = blake2b(data, digest_size=16).hexdigest()
         self._models[name] = learned
-        return DesiredObject(learned.box, begins, name, len(data), learned.model.version)
+        return DesiredObject(learned.box, 1, name, len(data), learned.model.version)
 
     def get(self, name: str) -> Learned | None:
         """The saved model of a name, None if its file cannot be read."""
