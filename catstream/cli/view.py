@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import secrets
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from catstream.cli.attach import with_endpoint, with_fleet_address
-from catstream.messages.storage import write_atomically
+from catstream.messages.storage import state_home, write_atomically
 from catstream.services.options import Decorator, combined, with_keys
 
 if TYPE_CHECKING:
@@ -53,8 +52,7 @@ def _token_of_user() -> str:
     """The token of this user, which is made once, so that links stay valid; a new one if it cannot be kept."""
     token = secrets.token_hex(16)
     try:
-        home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-        file = home / "catstream" / "view-token"
+        file = state_home() / "view-token"
         if file.exists() and file.stat().st_uid == os.geteuid() and not file.stat().st_mode & 0o077:
             return file.read_text(encoding="ascii").strip()
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -42,7 +42,7 @@ from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus
 from catstream.messages.names import UNNAMED, check_name
-from catstream.messages.storage import is_locked, lock, write_atomically
+from catstream.messages.storage import is_locked, lock, state_home, write_atomically
 from catstream.run import state
 from catstream.run.job import Job
 from catstream.run.learned import Learned, merge
@@ -458,7 +458,7 @@ def _disconnect() -> None:
 
 def _home() -> Path:
     """The folder with one for each fleet of this user."""
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream" / "fleets"
+    return state_home() / "fleets"
 
 
 def _is_up(folder: Path) -> bool:

@@ -40,6 +40,11 @@ _VERSION = 1  # version of the metadata's format
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 
 
+def state_home() -> Path:
+    """The folder of what is kept for this user; RuntimeError if the user has none."""
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream"
+
+
 def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
     """Replace a file atomically; the new content then survives a power cut. The umask reduces the permissions `mode`.
 
