@@ -265,13 +265,11 @@ def _transmit_rest() -> None:
 class ChannelSocket(Generic[Message]):
     """One ZeroMQ socket of a channel, of one of ZeroMQ's kinds; it queues `high_water_mark` messages for each peer.
 
-    rejected  messages that were dropped because they were not what the channel carries
-    run       id of the run that the last message is from, see `catstream.wire.codec`; empty if it is not known
+    run  id of the run that the last message is from, see `catstream.wire.codec`; empty if it is not known
     """
 
     def __init__(self, kind: int, channel: Channel[Message], endpoint: Endpoint, high_water_mark: int) -> None:
         self.channel = channel
-        self.rejected = 0
         self.run = ""
         self._endpoint = endpoint
         self._listens = False
@@ -410,7 +408,6 @@ class ChannelSocket(Generic[Message]):
 
     def _reject(self, cause: str, text: str) -> None:
         """Count a message that is not what the channel carries, and log it once for each cause."""
-        self.rejected += 1
         reject(self.channel.name, cause, text)
 
     def _read_events(self, seconds: float = 0.0, until: Event | None = None) -> None:
