@@ -477,6 +477,7 @@ SECTIONS = (
 
 DETAILS = (
     Section("Accuracy on each sequence", _SEQUENCES, (Shown("accuracy-peers", by_sequence),)),
+    Section("With a network", _NETWORKS, (Shown("network", every),)),
     Section(
         "The paper's experiments",
         _PAPER_DETAILS,
@@ -508,7 +509,6 @@ DETAILS = (
 
 MORE = (
     Section("Several objects", _OBJECTS, (Shown("objects", every),)),
-    Section("With a network", _NETWORKS, (Shown("network", every),)),
     Section("Frequent directions", _REDUCTION, (Shown("reduction", every),)),
     Section(
         "Saved models",
