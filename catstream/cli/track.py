@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.cli.write import check_used, with_sink_options, with_table
 from catstream.errors import require_extra
 from catstream.messages.kinds import Track
-from catstream.messages.names import UNNAMED, counted, doubtful, listed
+from catstream.messages.names import UNNAMED, counted, listed
 from catstream.pipeline import Pipeline
 from catstream.run.job import Results, SinkOptions
 from catstream.run.state import contains_run
@@ -39,6 +40,7 @@ from catstream.services.options import (
 from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_result, is_file, shown
 from catstream.sinks.track_log import RunFiles, places_of
 
+_SAME = 0.95  # overlap of boxes that were meant to be one
 _SHORTEST_SECONDS = 1.0  # a shorter run is reported without its frames per second
 _REFRESH_SECONDS = 0.1  # between two updates of the progress
 
@@ -262,7 +264,7 @@ class _Run:
         objects = {*self.boxes, *self.models}
         if objects and (unknown := self.saved.keys() - objects - {UNNAMED}):  # without a name, the only one is meant
             yield f"there is no object {listed(sorted(unknown))} yet: its model is saved if one begins under this name"
-        yield from doubtful(self.boxes, *pipeline.size)
+        yield from _doubtful(self.boxes, *pipeline.size)
 
     def _run(self, pipeline: Pipeline, files: RunFiles, progress: RunProgress, console: Console) -> bool:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
@@ -318,6 +320,38 @@ class _Run:
             with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                 write(TrackedFrame([*tracks.values()], moment - before))
                 progress.show(line, tracks)
+
+
+def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
+    """Descriptions of boxes that can be followed, but hardly are what was meant.
+
+    Such a box is that of the whole frame, or one of two that are the same; or it reaches out of the frame or covers
+    more than a quarter of it, and its four numbers may be two corners.
+
+    >>> _doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
+    ['anna and ben have the same box: each costs time']
+    >>> print(*_doubtful({"": Box(213, 121, 234, 216)}, 352, 288))
+    a box of 234x216 in a frame of 352x288: if 213,121,234,216 are two corners, give 213,121,21,95
+    """
+    whole = Box(0, 0, width, height)
+    doubts = [
+        f"the box of {listed([name])} is the whole frame: draw it around one object"
+        for name, box in boxes.items()
+        if box.overlap(whole) > _SAME
+    ]
+    doubts += [
+        f"{name and name + ': '}a box of {w:g}x{h:g} in a frame of {width}x{height}: "
+        f"if {x:g},{y:g},{w:g},{h:g} are two corners, give {x:g},{y:g},{w - x:g},{h - y:g}"
+        for name, (x, y, w, h) in boxes.items()
+        if 0 <= x < w <= width
+        and 0 <= y < h <= height
+        and (x + w > width or y + h > height or 4 * w * h > width * height)
+    ]
+    return doubts + [
+        f"{one} and {other} have the same box: each costs time"
+        for (one, box), (other, twin) in combinations(boxes.items(), 2)
+        if box.overlap(twin) > _SAME
+    ]
 
 
 @dataclass(slots=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from itertools import combinations
 
 from catstream.box import Box
 from catstream.errors import BoxError, ObjectError
@@ -17,7 +16,6 @@ UNNAMED = ""
 Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
 
 _LONGEST = 64
-_SAME = 0.95  # overlap of boxes that were meant to be one
 #: Regular expression of the name of an object.
 PATTERN = rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?"
 
@@ -75,38 +73,6 @@ def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
     for name, box in boxes.items():
         with errors_about(name):
             box.validated(width, height)
-
-
-def doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
-    """Descriptions of boxes that can be followed, but hardly are what was meant.
-
-    Such a box is that of the whole frame, or one of two that are the same; or it reaches out of the frame or covers
-    more than a quarter of it, and its four numbers may be two corners.
-
-    >>> doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
-    ['anna and ben have the same box: each costs time']
-    >>> print(*doubtful({"": Box(213, 121, 234, 216)}, 352, 288))
-    a box of 234x216 in a frame of 352x288: if 213,121,234,216 are two corners, give 213,121,21,95
-    """
-    whole = Box(0, 0, width, height)
-    doubts = [
-        f"the box of {listed([name])} is the whole frame: draw it around one object"
-        for name, box in boxes.items()
-        if box.overlap(whole) > _SAME
-    ]
-    doubts += [
-        f"{name and name + ': '}a box of {w:g}x{h:g} in a frame of {width}x{height}: "
-        f"if {x:g},{y:g},{w:g},{h:g} are two corners, give {x:g},{y:g},{w - x:g},{h - y:g}"
-        for name, (x, y, w, h) in boxes.items()
-        if 0 <= x < w <= width
-        and 0 <= y < h <= height
-        and (x + w > width or y + h > height or 4 * w * h > width * height)
-    ]
-    return doubts + [
-        f"{one} and {other} have the same box: each costs time"
-        for (one, box), (other, twin) in combinations(boxes.items(), 2)
-        if box.overlap(twin) > _SAME
-    ]
 
 
 @contextmanager
