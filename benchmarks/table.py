@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from catstream.applications.evaluation.runs import provenance
+from catstream.applications.provenance import provenance
 from catstream.errors import CatstreamError
 from catstream.numerics.threads import one_thread
 from catstream.settings import Settings

@@ -76,7 +76,7 @@ IMPORTERS = {
         *("catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
         *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
     ],
-    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/evaluation/runs.py"],
+    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/provenance.py"],
     "psutil": ["catstream/applications/loadtest/latency.py"],
     "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
     "starlette": ["catstream/web"],

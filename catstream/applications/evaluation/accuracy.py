@@ -11,9 +11,10 @@ from statistics import fmean, pstdev
 
 import numpy as np
 
-from catstream.applications.evaluation.runs import EvaluationRun, provenance
+from catstream.applications.evaluation.runs import EvaluationRun
 from catstream.applications.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.applications.page import SHARES, Axis, plot, table, write_page
+from catstream.applications.provenance import provenance
 from catstream.errors import CatstreamError
 from catstream.numerics.arrays import Float64
 from catstream.settings import Settings

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from catstream.applications.evaluation.runs import provenance
 from catstream.applications.loadtest.latency import PERCENTILES, percentiles, summary
 from catstream.applications.loadtest.load_test import KINDS, MOST_STREAMS, LoadTest, Result, violations
 from catstream.applications.page import Axis, plot, table, write_page
+from catstream.applications.provenance import provenance
 from catstream.messages.names import counted
 from catstream.numerics.arrays import Float64
 

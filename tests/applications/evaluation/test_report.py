@@ -10,10 +10,11 @@ import subprocess
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation import runs as module
+from catstream.applications import provenance as module
 from catstream.applications.evaluation.accuracy import COUNTS, MEASURES, mean_of, rows_of, write_report
 from catstream.applications.evaluation.datasets import FIRST
-from catstream.applications.evaluation.runs import EvaluationRun, machine, provenance
+from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.applications.provenance import machine, provenance
 from catstream.settings import Settings
 
 
