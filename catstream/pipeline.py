@@ -26,7 +26,7 @@ from catstream.messages.names import Boxes, boxes_by_name, check_boxes
 from catstream.messages.storage import check_file
 from catstream.run.job import Job, Models, Results, files_by_name
 from catstream.run.learned import check_files
-from catstream.run.state import begun, last_seq, last_time, saved
+from catstream.run.state import last_seq, last_time, locked_for_run, saved
 from catstream.services.start_server import start_server
 from catstream.services.supervisor import Supervisor
 from catstream.settings import Settings
@@ -199,7 +199,7 @@ class Pipeline:
             settings, shown = self.settings, without_password(self.source)
             endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
             if self._state is not None:
-                stack.enter_context(begun(self._state, self._resumed_job, self._job))
+                stack.enter_context(locked_for_run(self._state, self._resumed_job, self._job))
             job = self._started(str(endpoint))
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
             self._supervisor = Supervisor(job, folder, self._start)

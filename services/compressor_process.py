@@ -11,7 +11,7 @@ from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Features, Position, SavedModel
-from catstream.run.learned import Learned, begun
+from catstream.run.learned import Learned, continued
 from catstream.run.state import TREES, locked
 from catstream.services.decisions import checkpoint_is_due, stored, with_end
 from catstream.services.process import MESSAGE_SECONDS, Process
@@ -80,7 +80,7 @@ class CompressorLoop:
         if any(part.model for part in features.objects.values()):
             self._process.watchdog.allow()
         beat = self._process.watchdog.beat  # after each object: all of them together may take long on a slow machine
-        for sample in self._forest.take(features, begun(features, self._process.settings), beat):
+        for sample in self._forest.take(features, continued(features, self._process.settings), beat):
             self._samples.send(sample)
             beat()
         if self._forest.compressors.keys() != before:

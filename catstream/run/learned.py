@@ -228,7 +228,7 @@ def check_sizes(sizes: Mapping[str, int]) -> None:
         )
 
 
-def begun(features: Features, settings: Settings) -> dict[str, Compressor]:
+def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
     """The compressors of the objects that begin with a saved model in a message, by name.
 
     ProtocolError if a saved model is damaged, or one of other features; SettingsError if the settings do not suit it.

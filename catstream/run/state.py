@@ -116,7 +116,7 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def begun(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
+def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
     """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
         if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
