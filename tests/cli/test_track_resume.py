@@ -142,7 +142,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
 
 
 def test_settings_that_are_given_again_change_and_all_others_stay(video, said, succeed, monkeypatch, tmp_path):
-    monkeypatch.setattr(Pipeline, "by_frame", lambda _: iter(()))  # kept when it starts: no frame has to be followed
+    monkeypatch.setattr(Pipeline, "by_frame", lambda *_: iter(()))  # kept when it starts: no frame has to be followed
     (source, box), kept = video, tmp_path / "kept"
     assert said("track", source, "--box", box, "--state", kept, *OFTEN)[0] == 0
     (tmp_path / "mine.toml").write_text("[run]\nunstored_frames = 99\nlag_frames = 7\n")
@@ -211,7 +211,7 @@ def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed,
 
 
 def test_the_files_of_a_resumed_run_are_cut_before_it_receives_a_frame(killed, said, monkeypatch):
-    monkeypatch.setattr(Pipeline, "by_frame", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(Pipeline, "by_frame", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     table = killed / "out" / "demo.csv"
     whole = table.read_bytes()
     table.write_bytes(whole + b"32,1.0")
