@@ -312,8 +312,9 @@ class _Run:
                 self._say_what_holds(pipeline, line.console)
             if not tracks:
                 continue
-            # New files are opened with the first track: a run that cannot start does not change older results.
-            write = write or stack.enter_context(files.opened(endpoint))
+            # New files are opened with the first track: a run that cannot start does not change older results. They are
+            # checked again: while this one started or waited, another run may have written them.
+            write = write or stack.enter_context(self._files(pipeline).opened(endpoint))
             before, moment = moment, time.perf_counter()
             with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                 write(TrackedFrame([*tracks.values()], moment - before))

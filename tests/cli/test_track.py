@@ -280,3 +280,15 @@ def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video
         succeed("resume", "--endpoint", endpoint)
         assert [track.frame for track in tracks] == list(range(32))
     assert run.wait(60) == 0
+
+
+def test_results_that_another_run_wrote_while_this_one_waited_are_not_replaced(video, catstream, succeed, tmp_path):
+    source, box = video
+    place = str(tmp_path / "run")
+    run = catstream("track", source, "--box", box, "--output", tmp_path, "--paused", "--set", f"run.endpoint={place}")
+    assert "paused: to continue" in run.stderr.readline()
+    log = tmp_path / "demo.ndjson"
+    log.write_text("of another run")
+    succeed("resume", "--endpoint", place)
+    assert f"{log} exists already: replace it with --overwrite" in run.communicate(timeout=60)[1]
+    assert (run.returncode, log.read_text()) == (1, "of another run")
