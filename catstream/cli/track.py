@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -200,7 +201,7 @@ class _Run:
             unsaved = [str(file) for file in pipeline.results.models.values() if file not in saved]
             lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
             folder = self.state or self.resume
-            hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
+            hint = f"; to continue: catstream track --resume {quote(str(folder))}" if folder is not None else ""
             stopped(f"the results so far are kept{lost}{hint}")
 
     def _check_options(self) -> None:
@@ -291,7 +292,7 @@ class _Run:
 
     def _say_what_holds(self, pipeline: Pipeline, console: Console) -> None:
         """Say how a run goes on that is paused or has no object."""
-        place = f"--endpoint {pipeline.endpoint}"
+        place = f"--endpoint {quote(pipeline.endpoint)}"
         if pipeline.holding == "waiting":
             page = "the page" if self.view is not None else f"the page of catstream view {place}"
             ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"

@@ -284,9 +284,9 @@ def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video
 
 def test_results_that_another_run_wrote_while_this_one_waited_are_not_replaced(video, catstream, succeed, tmp_path):
     source, box = video
-    place = str(tmp_path / "run")
+    place = str(tmp_path / "my run")
     run = catstream("track", source, "--box", box, "--output", tmp_path, "--paused", "--set", f"run.endpoint={place}")
-    assert "paused: to continue" in run.stderr.readline()
+    assert f"paused: to continue, catstream resume --endpoint '{place}'" in run.stderr.readline()
     log = tmp_path / "demo.ndjson"
     log.write_text("of another run")
     succeed("resume", "--endpoint", place)
