@@ -125,7 +125,7 @@ def test_nothing_outlives_a_program_that_is_killed(until):
 def test_a_program_without_standard_streams_has_processes_that_run(tmp_path, folder, closed):
     job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"
     program = f"""
-import os
+import os, time
 from pathlib import Path
 {closed}
 from catstream.services.start_server import start_server
@@ -134,7 +134,7 @@ with open({str(log)!r}, "w+b") as log:
     watchdog = Watchdog()
     process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), watchdog.handle, restarted=False)
     while watchdog.turns < 3 and process.poll() is None:
-        pass
+        time.sleep(0.01)
     code = process.poll()
     process.close()
 os._exit(0 if code is None else 1)
