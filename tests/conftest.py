@@ -240,11 +240,12 @@ def said():
     """Runs the command in this process, which imports nothing anew: exit code, output, errors."""
 
     def run(*arguments, cwd=None, env=None):
-        output, errors = io.StringIO(), io.StringIO()
+        errors = io.StringIO()
         warnings = logging.StreamHandler(errors)
         warnings.setLevel(logging.WARNING)
         with (
             pytest.MonkeyPatch.context() as patch,
+            tempfile.TemporaryFile("w+") as output,  # it has a descriptor
             redirect_stdout(output),
             redirect_stderr(errors),
             ExitStack() as stack,
@@ -263,7 +264,8 @@ def said():
                 main()
             except SystemExit as end:
                 code = end.code or 0
-        return code, output.getvalue(), errors.getvalue()
+            output.seek(0)
+            return code, output.read(), errors.getvalue()
 
     return run
 

@@ -60,10 +60,10 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
             assert np.median(difference) < 8
 
 
-def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, catstream, tmp_path):
+def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, succeed, tmp_path):
     source, box = video
     results = ["--output", tmp_path / "out", "--write", "-", "--save-model", tmp_path / "model"]
-    output, _ = catstream("track", source, "--box", box, *results, "--lockstep").communicate(timeout=60)
+    output, _ = succeed("track", source, "--box", box, *results, "--lockstep")
     assert output == (whole_run / "stdout").read_text()
     assert [json.loads(line)["frame"] for line in output.splitlines()] == list(range(32))
     for file in ("model", "out/demo.ndjson"):
