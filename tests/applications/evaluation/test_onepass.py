@@ -240,13 +240,13 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
     assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}
 
 
-def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, tmp_path):
+def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, until, tmp_path):
     """The terminal sends it to all of them, of which the workers are at their imports."""
     runs = ["--starts", 4, "--jobs", 2, "--output", tmp_path / "out"]
     process = catstream("evaluate", walk, *runs, process_group=0)
     family = psutil.Process(process.pid)
-    while len(family.children()) < 3 and process.poll() is None:  # two workers, and the tracker of their resources
-        pass
+    # Two workers, and the tracker of their resources.
+    until(lambda: len(family.children()) >= 3 or process.poll() is not None)
     children = family.children()
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate()
