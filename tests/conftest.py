@@ -36,7 +36,10 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, create
 from tests.networks import write_network
 
-hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
+# No time is a pass mark.
+hypothesis.settings.register_profile(
+    "catstream", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
 hypothesis.settings.load_profile("catstream")
 
 # It is ignored if the tests run in the background of a script, and so it would be by the processes of the tests.
@@ -235,7 +238,7 @@ def catstream(program):
         yield start
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def said():
     """Runs the command in this process, which imports nothing anew: exit code, output, errors."""
 
@@ -270,7 +273,7 @@ def said():
     return run
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def succeed(said):
     """Runs the command in this process, which must succeed: output, errors."""
 
@@ -282,7 +285,7 @@ def succeed(said):
     return run
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def fail(said):
     """Runs the command in this process, which must end with an error of one line, and print no output: this line."""
 
