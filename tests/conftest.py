@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import hypothesis
@@ -26,6 +27,7 @@ import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 
 from catstream.box import Box
 from catstream.cli import main
+from catstream.cli.common import INTERRUPTS
 from catstream.client.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
 from catstream.numerics.threads import one_thread
@@ -248,7 +250,8 @@ def said():
         warnings.setLevel(logging.WARNING)
         with (
             pytest.MonkeyPatch.context() as patch,
-            tempfile.TemporaryFile("w+") as output,  # it has a descriptor
+            mock.patch.dict(os.environ, env or {}),  # the command sets variables, too
+            tempfile.TemporaryFile("w+", errors="surrogateescape") as output,  # it has a descriptor
             redirect_stdout(output),
             redirect_stderr(errors),
             ExitStack() as stack,
@@ -258,10 +261,9 @@ def said():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 stack.callback(signal.signal, number, signal.getsignal(number))
             patch.setattr(sys, "argv", ["catstream", *map(str, arguments)])
+            patch.setattr(INTERRUPTS, "exit_code", INTERRUPTS.exit_code)
             if cwd is not None:
                 patch.chdir(cwd)
-            for name, value in (env or {}).items():
-                patch.setenv(name, value)
             code = 0
             try:
                 main()
