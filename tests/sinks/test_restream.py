@@ -80,7 +80,8 @@ def test_pictures_are_made_and_sent_only_while_the_server_is_there(endpoint, tcp
             missed = sink.missed
             with open_source(path) as frames:
                 image = next(iter(frames)).image
-            (pushing,) = psutil.Process().children()[:-1]  # the other one is the server
+            children = psutil.Process().children()  # the server, and those of other tests, are too
+            (pushing,) = (child for child in children if "catstream.sinks.restream" in child.cmdline())
             pushing.kill()
             until(lambda: not pipeline.looked_at, lambda: sink.write(pipeline.next()))
             until(lambda: pipeline.looked_at, lambda: sink.write(pipeline.next()))
