@@ -6,7 +6,7 @@ import json
 import os
 import signal
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import cv2
@@ -111,8 +111,11 @@ def test_a_stopped_run_keeps_its_results(long_video, said, until, tmp_path, numb
 
 def running():
     """The processes of pipelines of this process."""
-    servers = psutil.Process().children()
-    return [each for server in servers for each in server.children() if each.status() != "zombie"]
+    found = []
+    for each in (each for server in psutil.Process().children() for each in server.children()):
+        with suppress(psutil.NoSuchProcess):  # it ends meanwhile
+            found += [each] * (each.status() != psutil.STATUS_ZOMBIE)
+    return found
 
 
 def test_a_damaged_video_is_followed_up_to_the_break_or_over_it_if_requested(video, fail, succeed, tmp_path):
