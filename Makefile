@@ -13,7 +13,7 @@ TOOLS := $(VENV)/.tools
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup develop demo test test-system test-slow lint format docs wheel picture life protocol bench results lock clean fuzz audit
+.PHONY: help setup develop demo test test-system test-slow lint format docs wheel picture protocol bench results lock clean fuzz audit
 
 help:  ## list all commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | column -t -s '|' 2>/dev/null \
@@ -72,9 +72,6 @@ wheel:  ## build sdist and wheel in dist/, and try them on each supported Python
 
 picture: $(READY)  ## render the animated picture of README.md
 	@$(BIN)/python .ci/picture
-
-life: $(TOOLS)  ## update the life of a stream in docs/how-to/fleet.md
-	$(BIN)/python tests/test_docs.py
 
 protocol: $(TOOLS)  ## update the fields in docs/protocol.md
 	$(BIN)/python tests/wire/test_protocol_page.py

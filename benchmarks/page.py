@@ -379,6 +379,9 @@ _FOUND = """
     rendered object is learned in 76 frames before a plain background, and searched before other backgrounds, turned,
     scaled and in other lights. The machine was busy: only the ratios of times count. See [the
     how-to](../docs/how-to/find.md)."""
+_NETWORKS = """
+    The backbones of NanoTrackV2 and of MobileNetV2, prepared with frames of the tuning sequences. See [the
+    how-to](../docs/how-to/network.md)."""
 _INGREDIENTS = """
     The loss of AUC without one component, on the tuning sequences with three first boxes each; the largest losses. A
     loss of less than two standard errors may be chance."""
@@ -474,6 +477,7 @@ SECTIONS = (
 
 DETAILS = (
     Section("Accuracy on each sequence", _SEQUENCES, (Shown("accuracy-peers", by_sequence),)),
+    Section("With a network", _NETWORKS, (Shown("network", every),)),
     Section(
         "The paper's experiments",
         _PAPER_DETAILS,

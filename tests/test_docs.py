@@ -1,7 +1,4 @@
-"""The documentation matches the code: it describes every public name, and its examples run.
-
-Run as a program, this file updates the life of a stream in `docs/how-to/fleet.md`: `make life`.
-"""
+"""The documentation matches the code: it describes every public name, and its examples run."""
 
 import ast
 import contextlib
@@ -22,7 +19,6 @@ import pytest
 
 import catstream
 from catstream.cli import COMMANDS, load_command
-from catstream.fleet import life
 from catstream.run.job import Results
 from catstream.settings import PRESETS, describe
 from catstream.sinks.destinations import EXPORTS, SINKS
@@ -35,8 +31,6 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("benchmarks/*.md"), *DOCS.glob("*
 sys.path.append(str(DOCS))
 
 import hooks  # noqa: E402
-
-_LIFE = re.compile(r"(<!-- life: .*? -->\n).*?(<!-- /life -->)", re.DOTALL)
 
 
 def page(name: str) -> str:
@@ -70,20 +64,6 @@ def anchors(path: Path) -> set[str]:
     headings = re.findall(r"^#+ (.*)", prose(path), re.MULTILINE)
     headings += COMMANDS if path.name == "command-line.md" else ()  # hooks.py adds their sections
     return {re.sub(r"[^\w -]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
-
-
-def life_of_a_stream() -> str:
-    """The table of the life of a stream, as `docs/how-to/fleet.md` shows it."""
-    lines = ["", "| state | event | action | next state |", "| --- | --- | --- | --- |"]
-    for (state, event), (after, action) in life.TABLE.items():
-        lines.append(f"| `{state}` | {life.EVENTS[event]} | {action} | `{after}` |")
-    return "\n".join([*lines, ""]) + "\n"
-
-
-def test_the_life_of_a_stream_is_shown_as_its_table_says():
-    shown = _LIFE.search(page("docs/how-to/fleet.md"))
-    assert shown, "docs/how-to/fleet.md: the marks around the life of a stream are missing"
-    assert life_of_a_stream() in shown[0], "docs/how-to/fleet.md does not show the table as it is: run `make life`"
 
 
 @cache
@@ -274,8 +254,3 @@ def test_the_version_is_the_same_everywhere_and_every_name_of_the_library_is_in_
     assert set(dir(catstream)) >= {*catstream.__all__, "__doc__"}, "before their first use"
     shown = set(re.findall(r"^::: catstream\.(\w+)", page("docs/api.md"), re.MULTILINE))
     assert shown - {"errors"} == set(catstream.__all__) - {"CatstreamError", "__version__"}
-
-
-if __name__ == "__main__":
-    fleet = DOCS / "how-to" / "fleet.md"
-    fleet.write_text(_LIFE.sub(lambda found: found[1] + life_of_a_stream() + found[2], fleet.read_text()))

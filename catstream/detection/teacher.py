@@ -142,7 +142,7 @@ def _mined(frame: Pyramid, window: Window, seq: int, model: Model, teaching: Tea
     end, begin = (each * rows // (len(parts) * _MINING_INTERVAL) for each in (number + 1, number))
     if begin == end:
         return None
-    scores = ScoreMap.within(frame, parts[number], window, model)
+    scores = ScoreMap.within(frame, parts[number], window, model, described=True)
     return _rows(_strongest(frame, scores, window, model, end - begin), 0, 1, teaching)
 
 
@@ -151,7 +151,7 @@ def _strongest(
 ) -> np.ndarray:
     """The rows, float32 (k, d), of the windows with the highest scores above `least` that hardly overlap another one.
 
-    Of a frame with a descriptor, the scores are those of HOG and colours; it computes only what the rows need.
+    Where the scores are those of HOG and colours, a descriptor computes only what the rows need.
     """
     places = non_maximum_suppression(scores.scores, most + 1, WINDOW // 2, least)
     places = [place for place in places if scores.window(*place).overlap(window) < _HARD_OVERLAP][:most]

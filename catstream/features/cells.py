@@ -19,8 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from catstream.features import kernels
+from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, PLACES, WINDOW, row_length
 from catstream.features.pyramid import planes_of
+from catstream.features.vectors import VectorMap
 from catstream.numerics.arrays import writable
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
@@ -45,10 +47,11 @@ class Cells:
     vectors: np.ndarray | None = None
 
     @classmethod
-    def of(cls, image: np.ndarray) -> Cells:
-        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells, without vectors."""
+    def of(cls, image: np.ndarray, descriptor: Descriptor | None = None) -> Cells:
+        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells; with vectors if a descriptor is given."""
         planes = planes_of(image)
-        return cls(grid(planes), shades(planes))
+        vectors = None if descriptor is None else VectorMap.between_cells(descriptor, planes)
+        return cls(grid(planes), shades(planes), vectors)
 
     @classmethod
     def within(cls, planes: np.ndarray, vectors: np.ndarray | None = None, margin: int = MARGIN) -> Cells:

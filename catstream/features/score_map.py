@@ -52,10 +52,12 @@ class ScoreMap:
         return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step, vectors)
 
     @classmethod
-    def within(cls, frame: Pyramid, region: Region, window: Window, model: Model) -> ScoreMap:
-        """All windows of a size in a region of a frame, by HOG and colours alone."""
+    def within(
+        cls, frame: Pyramid, region: Region, window: Window, model: Model, *, described: bool = False
+    ) -> ScoreMap:
+        """All windows of a size in a region of a frame, by HOG and colours alone; with a descriptor if `described`."""
         image, step = frame.part(region).resized(window)
-        cells = Cells.of(image)
+        cells = Cells.of(image, frame.descriptor if described else None)
         return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)
 
     @classmethod
@@ -65,7 +67,7 @@ class ScoreMap:
 
     def complete(self, frame: Pyramid, place: tuple[int, int], model: Model) -> tuple[ScoreMap, int, int]:
         """The map, row and column of a window with all its features: a map of its own if vectors are missing here."""
-        if frame.descriptor is None:
+        if frame.descriptor is None or self.cells.vectors is not None:
             return self, *place
         return ScoreMap.around(frame, self.window(*place), WINDOW, model), 0, 0
 

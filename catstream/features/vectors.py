@@ -11,7 +11,7 @@ import numpy as np
 from catstream.box import Window
 from catstream.features import kernels
 from catstream.features.descriptor import Descriptor
-from catstream.features.layout import PLACES, WINDOW
+from catstream.features.layout import CELL, EDGE, PLACES, STRIDE, WINDOW
 
 _WEIGHT = np.float32(WINDOW / PLACES)  # one vector stands for 2 x 2 cells, each of which varies as much as it
 
@@ -49,6 +49,21 @@ class VectorMap:
         left = (columns - 1 - (side - 2) * (right[0] + below[0])) / 2 + (x - middle_x) / step_x
         top = (rows - 1 - (side - 2) * (right[1] + below[1])) / 2 + (y - middle_y) / step_y
         kernels.sample_vectors(self.vectors, np.array([(left, top), right, below]), found)
+        return found
+
+    @staticmethod
+    def between_cells(descriptor: Descriptor, planes: np.ndarray) -> np.ndarray:
+        """Vectors where four cells meet, of all cells of an image, uint8 (3, h, w).
+
+        Returns float32 (h / 8 - 1, w / 8 - 1, channels).
+        """
+        _, height, width = planes.shape
+        edge = EDGE * CELL
+        sides = (edge, edge + -height % STRIDE), (edge, edge + -width % STRIDE)
+        vectors = descriptor(np.pad(planes, ((0, 0), *sides), "edge")) * _WEIGHT
+        found = np.empty((height // CELL - 1, width // CELL - 1, descriptor.channels), np.float32)
+        first, half = edge / STRIDE, CELL / STRIDE
+        kernels.sample_vectors(vectors, np.array([(first, first), (half, 0.0), (0.0, half)]), found)
         return found
 
     def row(self, window: Window, turn: float = 0.0) -> np.ndarray:

@@ -24,7 +24,7 @@ State = Literal["absent", "pending", "working", "stopping"]
 Event = Literal["wanted", "reports", "interrupted", "silent", "unwanted", "superseded", "ended", "gone"]
 Action = Literal["", "start", "stop", "restart", "kill"]
 
-#: What each event is, for the documentation.
+#: What each event is, for the log.
 EVENTS: dict[Event, str] = {
     "wanted": "the stream should run, and has not ended",
     "reports": "the actor answers",

@@ -121,3 +121,17 @@ def test_a_window_sampled_from_the_region_is_nearly_as_if_it_was_described_by_it
         sampled = around.row(window)
         assert sampled.shape == (PLACES**2 * 32,)
         assert np.linalg.norm(own - sampled) < 0.2 * np.linalg.norm(own)
+
+
+def test_all_windows_of_a_frame_that_is_described_at_once_are_nearly_as_if_each_was_by_itself(frame, rng):
+    model = Model(1, 0, rng.normal(size=row_length(frame.descriptor.channels)).astype(np.float32), 0.5)
+    scores = ScoreMap.within(frame, frame.region, OBJECT, model, described=True)
+    for place in ((0, 0), (7, 11), *np.argwhere(scores.scores == scores.scores.min()).tolist()):
+        row, own = scores.cells.row(*place), row_of(frame, scores.window(*place), model)
+        assert scores.scores[tuple(place)] == pytest.approx(model.weights @ row + 0.5, abs=1e-3)
+        assert np.linalg.norm(own - row) < 0.2 * np.linalg.norm(own)
+
+
+def row_of(frame, window, model):
+    """The row of a window that is described by itself."""
+    return ScoreMap.around(frame, window, WINDOW, model).cells.row(0, 0)
