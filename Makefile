@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Python compiles what it imports, a small part of what is installed.
 PIP := $(BIN)/pip install --quiet --quiet --disable-pip-version-check --no-compile
+INSTALLED := $(VENV)/.installed
 READY := $(VENV)/.ready
 TOOLS := $(VENV)/.tools
 
@@ -20,7 +21,7 @@ help:  ## list all commands
 
 setup: $(READY)  ## create the environment in .venv, from requirements.lock
 
-$(READY): requirements.lock pyproject.toml
+$(INSTALLED): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 		echo "catstream needs Python 3.11 or newer, '$(PYTHON)' is $$($(PYTHON) --version 2>/dev/null || echo missing):" \
 			"install one, or give its path: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
@@ -28,12 +29,15 @@ $(READY): requirements.lock pyproject.toml
 	@.ci/step "installing $$(grep -c '==' requirements.lock) packages, 900 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements.lock
 	@.ci/step "installing catstream itself" $(PIP) --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(READY): $(INSTALLED)
 	@.ci/step "compiling kernels, once" $(BIN)/python -P -c 'import logging; logging.disable(); import catstream.detection.detector'
 	@touch $@
 
-develop: $(TOOLS)  ## add the packages for tests and checks, from requirements-dev.lock
+develop: $(READY) $(TOOLS)  ## add the packages for tests and checks, from requirements-dev.lock
 
-$(TOOLS): $(READY) requirements-dev.lock
+$(TOOLS): $(INSTALLED) requirements-dev.lock
 	@.ci/step "installing $$(grep -c '==' requirements-dev.lock) packages for tests, 600 MB on disk: a minute or more" \
 		$(PIP) --require-hashes -r requirements-dev.lock -r requirements.lock
 	@touch $@
@@ -41,13 +45,13 @@ $(TOOLS): $(READY) requirements-dev.lock
 demo: $(READY)  ## render a video, track the object in it, print the accuracy
 	@$(BIN)/catstream demo
 
-test: $(TOOLS)  ## all tests but those of test-system and test-slow, with doctests
+test: $(READY) $(TOOLS)  ## all tests but those of test-system and test-slow, with doctests
 	@$(BIN)/pytest -n auto --dist worksteal
 
-test-system: $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, or a whole benchmark
+test-system: $(READY) $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, or a whole benchmark
 	@$(BIN)/pytest -n 2 --dist worksteal -m 'system and not slow'
 
-test-slow: $(TOOLS)  ## the slow ones: many faults, a load test (4 minutes)
+test-slow: $(READY) $(TOOLS)  ## the slow ones: many faults, a load test (4 minutes)
 	@$(BIN)/pytest -m slow --timeout 3600 -o faulthandler_timeout=0
 
 lint: $(TOOLS)  ## style, types, and unsafe code

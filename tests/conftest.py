@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import hypothesis
@@ -26,6 +27,7 @@ import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 
 from catstream.box import Box
 from catstream.cli import main
+from catstream.cli.common import INTERRUPTS
 from catstream.client.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
 from catstream.numerics.threads import one_thread
@@ -36,7 +38,10 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, create
 from tests.networks import write_network
 
-hypothesis.settings.register_profile("catstream", deadline=None)  # no time is a pass mark
+# No time is a pass mark.
+hypothesis.settings.register_profile(
+    "catstream", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
 hypothesis.settings.load_profile("catstream")
 
 # It is ignored if the tests run in the background of a script, and so it would be by the processes of the tests.
@@ -235,16 +240,18 @@ def catstream(program):
         yield start
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def said():
     """Runs the command in this process, which imports nothing anew: exit code, output, errors."""
 
     def run(*arguments, cwd=None, env=None):
-        output, errors = io.StringIO(), io.StringIO()
+        errors = io.StringIO()
         warnings = logging.StreamHandler(errors)
         warnings.setLevel(logging.WARNING)
         with (
             pytest.MonkeyPatch.context() as patch,
+            mock.patch.dict(os.environ, env or {}),  # the command sets variables, too
+            tempfile.TemporaryFile("w+", errors="surrogateescape") as output,  # it has a descriptor
             redirect_stdout(output),
             redirect_stderr(errors),
             ExitStack() as stack,
@@ -254,21 +261,21 @@ def said():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 stack.callback(signal.signal, number, signal.getsignal(number))
             patch.setattr(sys, "argv", ["catstream", *map(str, arguments)])
+            patch.setattr(INTERRUPTS, "exit_code", INTERRUPTS.exit_code)
             if cwd is not None:
                 patch.chdir(cwd)
-            for name, value in (env or {}).items():
-                patch.setenv(name, value)
             code = 0
             try:
                 main()
             except SystemExit as end:
                 code = end.code or 0
-        return code, output.getvalue(), errors.getvalue()
+            output.seek(0)
+            return code, output.read(), errors.getvalue()
 
     return run
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def succeed(said):
     """Runs the command in this process, which must succeed: output, errors."""
 
@@ -280,7 +287,7 @@ def succeed(said):
     return run
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def fail(said):
     """Runs the command in this process, which must end with an error of one line, and print no output: this line."""
 

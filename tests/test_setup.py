@@ -61,11 +61,25 @@ def test_sdist_and_wheel_are_built_without_a_warning_with_the_page_and_each_proc
     page = {f"catstream/web/page/{path.name}" for path in (ROOT / "catstream" / "web" / "page").iterdir()}
     processes = {path.name for path in (ROOT / "services").glob("*.py")}
     packed = set(zipfile.ZipFile(wheel).namelist())
-    assert {*page, "catstream/py.typed", *(f"catstream/services/{name}" for name in processes)} <= packed
+    content = {*page, "catstream/py.typed", *(f"catstream/services/{name}" for name in processes)}
+    assert content <= packed
     with tarfile.open(sdist) as archive:
         files = {name.partition("/")[2] for name in archive.getnames()}
-    assert {*page, "catstream/py.typed", *(f"services/{name}" for name in processes)} <= files
-    assert not [name for name in files if name.startswith(("catstream/services", "tests"))]
+    assert content <= files
+    assert not [name for name in files if name.startswith(("services", "tests"))]
+
+
+def test_an_editable_install_is_found_beside_the_caches_that_an_uninstalled_one_left(tmp_path):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "catstream"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    (tmp_path / "site" / "catstream" / "features" / "__pycache__").mkdir(parents=True)
+    build = "import setuptools.build_meta as build; build.build_editable('dist')"
+    subprocess.run([sys.executable, "-c", build], cwd=tmp_path, capture_output=True, check=True)
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    find = f"import site; site.addsitedir({str(tmp_path / 'site')!r}); import catstream; print(catstream.__file__)"
+    found = subprocess.run([sys.executable, "-S", "-c", find], capture_output=True, text=True, cwd="/", check=False)
+    assert found.stdout.strip() == str(tmp_path / "catstream" / "__init__.py"), found.stderr
 
 
 def test_nothing_of_ours_is_for_one_kind_of_processor():

@@ -61,7 +61,7 @@ def prepare(
 
 
 @network.command()
-@click.argument("file", type=PATH, metavar="FILE.onnx")
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="FILE.onnx")
 def check(file: Path) -> None:
     """Measure a file for the setting features.network.
 

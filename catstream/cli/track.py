@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -202,7 +203,7 @@ class _Run:
             unsaved = [str(file) for file in pipeline.results.models.values() if file not in saved]
             lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
             folder = self.state or self.resume
-            hint = f"; to continue: catstream track --resume {folder}" if folder is not None else ""
+            hint = f"; to continue: catstream track --resume {quote(str(folder))}" if folder is not None else ""
             stopped(f"the results so far are kept{lost}{hint}")
 
     def _check_options(self) -> None:
@@ -293,7 +294,7 @@ class _Run:
 
     def _say_what_holds(self, pipeline: Pipeline, console: Console) -> None:
         """Say how a run goes on that is paused or has no object."""
-        place = f"--endpoint {pipeline.endpoint}"
+        place = f"--endpoint {quote(pipeline.endpoint)}"
         if pipeline.holding == "waiting":
             page = "the page" if self.view is not None else f"the page of catstream view {place}"
             ways = f"draw one on {page}, or run catstream set-box [NAME=]X,Y,W,H {place}"
@@ -314,8 +315,9 @@ class _Run:
                 self._say_what_holds(pipeline, line.console)
             if not tracks:
                 continue
-            # New files are opened with the first track: a run that cannot start does not change older results.
-            write = write or stack.enter_context(files.opened(endpoint))
+            # New files are opened with the first track: a run that cannot start does not change older results. They are
+            # checked again: while this one started or waited, another run may have written them.
+            write = write or stack.enter_context(self._files(pipeline).opened(endpoint))
             before, moment = moment, time.perf_counter()
             with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                 write(TrackedFrame([*tracks.values()], moment - before))

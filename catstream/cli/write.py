@@ -102,7 +102,7 @@ with_sink_options = combined(
 
 def check_used(options: SinkOptions, places: Iterable[str]) -> None:
     """Raise UsageError if options were given that none of the destinations has."""
-    if options != SinkOptions() and not any("://" in place for place in places):
+    if options != SinkOptions() and not any(re.match(r"(mqtt|http)s?://", place) for place in places):
         raise click.UsageError(
             "--zone, --when, --rate, --picture and --secret-file are for mqtt:// and http://: add one"
         )

@@ -48,7 +48,7 @@ class Cells:
 
     @classmethod
     def of(cls, image: np.ndarray, descriptor: Descriptor | None = None) -> Cells:
-        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells; with vectors if a descriptor is given."""
+        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells; with vectors of a descriptor, if any."""
         planes = planes_of(image)
         vectors = None if descriptor is None else VectorMap.between_cells(descriptor, planes)
         return cls(grid(planes), shades(planes), vectors)

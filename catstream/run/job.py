@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
+from shlex import quote
 from typing import Any, get_type_hints
 
 import msgspec
@@ -152,7 +153,7 @@ class Job:
         """
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
-            raise ServiceError(f"{str(path)!r} contains no run: start one with --state {path}")
+            raise ServiceError(f"{str(path)!r} contains no run: start one with --state {quote(str(path))}")
         metadata = storage.read(file)[1]
         metadata.setdefault("network", "")  # which an older job lacks
         try:

@@ -18,6 +18,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
@@ -121,7 +122,8 @@ def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None
     with locked(folder):
         if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
             raise ServiceError(
-                f"{str(folder)!r} already contains a run: continue it (--resume {folder}), or give another folder"
+                f"{str(folder)!r} already contains a run: continue it (--resume {quote(str(folder))}), or give another "
+                "folder"
             )
         if job != resumed:
             job.save(folder)

@@ -68,10 +68,12 @@ def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
 
 
 def read_database(path: Path) -> Iterator[TrackedFrame]:
-    """Yield the frames of a database that may grow meanwhile, in their order; none if there is no file."""
+    """Yield the frames of a database that may grow meanwhile, in their order; none if there is no file or no table."""
     if not path.exists():
         return
     with _errors(path, "read"), closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
+        if not database.execute("SELECT 1 FROM sqlite_master").fetchone():  # killed before it made the table
+            return
         found = database.execute(f"SELECT {_NAMES} FROM tracks ORDER BY frame, rowid")  # nosec B608
         for _, each in groupby(map(_track, found), lambda track: track.frame):
             yield TrackedFrame([*each])

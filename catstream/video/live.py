@@ -315,7 +315,7 @@ def _open_container(text: str, form: str | None, timeouts: tuple[float, float], 
     has_end = container.duration if kind in ("hls", "dash") else (container.size or 0) > 0
     if video_stream(container) is None:
         problem = "it has no video"
-    elif _is_http(text) and has_end and not kind.endswith(("_pipe", "mjpeg", "mpjpeg")):
+    elif _is_http(text) and has_end and not kind.endswith(("_pipe", "image2", "mjpeg", "mpjpeg")):
         problem = "it is a recording: download it, and give the file"
     if problem:
         container.close()

@@ -275,12 +275,12 @@ class ChannelSocket(Generic[Message]):
         self._listens = False
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
+        self._pid = os.getpid()
         try:
             self._socket: zmq.Socket[bytes] = context().socket(kind)
         except zmq.ZMQError as error:
             raise _too_many(error) from None
         _OPEN.add(self)
-        self._pid = os.getpid()
         for option, value in _OPTIONS.items():
             self._socket.set(option, value)
         self._socket.set(zmq.IPV6, int(endpoint.is_ipv6))

@@ -1,7 +1,5 @@
 """What the tests of the command line share."""
 
-import subprocess
-
 import pytest
 
 
@@ -20,7 +18,7 @@ def long_video(demo_video):
 
 
 @pytest.fixture(scope="session")
-def whole_run(video, once, program):
+def whole_run(video, once, succeed):
     """The folder of a run in lockstep that nothing disturbed.
 
     out     its results, with a video
@@ -32,8 +30,8 @@ def whole_run(video, once, program):
     def run(folder):
         source, box = video
         files = ["--output", "out", "--video", "--save-model", "model", "--write", "-"]
-        with (folder / "stdout").open("w") as output, (folder / "stderr").open("w") as errors:
-            command = [*program, "track", source, "--box", box, *files, "--lockstep"]
-            subprocess.run(command, cwd=folder, stdout=output, stderr=errors, check=True)
+        output, errors = succeed("track", source, "--box", box, *files, "--lockstep", cwd=folder)
+        (folder / "stdout").write_text(output)
+        (folder / "stderr").write_text(errors)
 
     return once("whole-run", run)

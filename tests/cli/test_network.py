@@ -41,6 +41,10 @@ def test_a_layer_or_a_folder_that_does_not_do_is_one_line_of_error(said, walk, t
     assert not (tmp_path / "net.onnx").exists()
 
 
+def test_only_a_file_that_exists_is_measured(fail, tmp_path):
+    assert "does not exist" in fail("network", "check", tmp_path / "none.onnx")
+
+
 def test_a_network_that_cannot_be_used_is_an_error_before_a_run(said, demo_video, tmp_path):
     (tmp_path / "net.onnx").write_bytes(b"no network")
     path, boxes = demo_video(32)

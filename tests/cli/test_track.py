@@ -3,8 +3,10 @@
 import csv
 import errno
 import json
+import os
 import signal
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import cv2
@@ -13,7 +15,6 @@ import psutil
 import pytest
 
 from catstream.cli.track import RunProgress
-from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.run.learned import Learned
@@ -60,10 +61,10 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
             assert np.median(difference) < 8
 
 
-def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, catstream, tmp_path):
+def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, succeed, tmp_path):
     source, box = video
     results = ["--output", tmp_path / "out", "--write", "-", "--save-model", tmp_path / "model"]
-    output, _ = catstream("track", source, "--box", box, *results, "--lockstep").communicate(timeout=60)
+    output, _ = succeed("track", source, "--box", box, *results, "--lockstep")
     assert output == (whole_run / "stdout").read_text()
     assert [json.loads(line)["frame"] for line in output.splitlines()] == list(range(32))
     for file in ("model", "out/demo.ndjson"):
@@ -83,16 +84,21 @@ def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_stopped_run_keeps_its_results(long_video, catstream, until, tmp_path, number):
+def test_a_stopped_run_keeps_its_results(long_video, said, until, tmp_path, number):
     source, box = long_video  # it is not over before the signal comes
     more = ["--video", "--save-model", tmp_path / "model", "--set", "run.unstored_frames=1", "--lockstep"]
-    heeded = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
-    process = catstream("track", source, "--box", box, "--output", tmp_path, *more, preexec_fn=heeded)
-    until(lambda: len(frames_of(tmp_path)) > 8 or process.poll() is not None)
-    children = [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
-    process.send_signal(number)
-    errors = process.communicate(timeout=60)[1]
-    assert process.returncode == 128 + number
+
+    def stop():
+        until(lambda: len(frames_of(tmp_path)) > 8)
+        found = running()
+        os.kill(os.getpid(), number)
+        return found
+
+    with ExitStack() as stack:
+        stack.callback(signal.signal, number, signal.signal(number, lambda *_: None))  # it is not ignored
+        children = stack.enter_context(ThreadPoolExecutor(1)).submit(stop)
+        code, _, errors = said("track", source, "--box", box, "--output", tmp_path, *more)
+    assert code == 128 + number
     assert "the results so far are kept" in errors
     rows = frames_of(tmp_path)
     assert rows == list(range(len(rows)))
@@ -100,7 +106,16 @@ def test_a_stopped_run_keeps_its_results(long_video, catstream, until, tmp_path,
     with open_source(tmp_path / "demo.mp4") as film:  # it may be short of the frame at which the signal came
         assert len(rows) - sum(1 for _ in film) in (0, 1)
     assert Learned.load(tmp_path / "model").model.version >= 1
-    assert not any(map(psutil.pid_exists, children))
+    assert (len(children.result()), running()) == (3, [])
+
+
+def running():
+    """The processes of pipelines of this process."""
+    found = []
+    for each in (each for server in psutil.Process().children() for each in server.children()):
+        with suppress(psutil.NoSuchProcess):  # it ends meanwhile
+            found += [each] * (each.status() != psutil.STATUS_ZOMBIE)
+    return found
 
 
 def test_a_damaged_video_is_followed_up_to_the_break_or_over_it_if_requested(video, fail, succeed, tmp_path):
@@ -183,22 +198,13 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     assert (tmp_path / "file").read_text() == "mine\n"
 
 
-def test_a_second_start_at_the_same_place_and_under_nohup_a_lost_terminal_end_nothing(
-    video, catstream, fail, until, tmp_path
-):
+def test_a_second_start_at_the_same_place_is_rejected_and_writes_nothing(video, fail, tmp_path):
     source, box = video
-    place, slowly = ["--set", f"run.endpoint={tmp_path / 'run'}"], ["--set", "run.unstored_frames=1", "--lockstep"]
-    nohup = partial(signal.signal, signal.SIGHUP, signal.SIG_IGN)
-    results = ["--output", tmp_path / "one", "--video"]
-    first = catstream("track", source, "--box", box, *results, *slowly, *place, preexec_fn=nohup)
-    until(lambda: frames_of(tmp_path / "one") or first.poll() is not None)
-    first.send_signal(signal.SIGHUP)
-    assert "already running" in fail("track", source, "--box", box, "--output", tmp_path / "two", *place)
+    place = tmp_path / "run"
+    with Pipeline(source, box, {"run.endpoint": str(place)}):
+        words = ["--output", tmp_path / "two", "--set", f"run.endpoint={place}"]
+        assert "already running" in fail("track", source, "--box", box, *words)
     assert not (tmp_path / "two").exists()
-    assert first.wait(120) == 0
-    assert frames_of(tmp_path / "one") == list(range(32))
-    with open_source(tmp_path / "one" / "demo.mp4") as film:
-        assert sum(1 for _ in film) == 32
 
 
 def encoded(source, path):
@@ -244,8 +250,7 @@ def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, s
     tracking, close = [], LineSink.close
 
     def closed(sink):
-        servers = psutil.Process().children()
-        tracking.extend(each for server in servers for each in server.children() if each.status() != "zombie")
+        tracking.extend(running())
         close(sink)
 
     monkeypatch.setattr(RunProgress, "show", lambda *_: signal.raise_signal(signal.SIGINT))
@@ -272,11 +277,29 @@ def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_
     assert "there is no object" not in errors, "without a name, the only one is meant"
 
 
-def test_a_paused_run_waits_for_resume_and_its_subscribers_get_every_frame(video, catstream, succeed, endpoint):
+def test_a_run_that_starts_paused_says_how_to_resume_it(video, succeed, monkeypatch):
+    by_frame = Pipeline.by_frame
+
+    def until_it_reports(run, seconds):
+        for tracks in by_frame(run, seconds):
+            yield tracks
+            if "detector" in run.health:
+                break
+
+    monkeypatch.setattr(Pipeline, "by_frame", until_it_reports)
     source, box = video
-    run = catstream("track", source, "--box", box, "--paused", "--set", f"run.endpoint={endpoint}")
-    assert "paused: to continue, catstream resume --endpoint" in run.stderr.readline()
-    with subscribe(endpoint, "tracks", timeout=60) as tracks:
-        succeed("resume", "--endpoint", endpoint)
-        assert [track.frame for track in tracks] == list(range(32))
-    assert run.wait(60) == 0
+    _, errors = succeed("track", source, "--box", box, "--paused")
+    assert errors.startswith("paused: to continue, catstream resume --endpoint")
+    assert errors.count("\n") == 1, "no frame was tracked"
+
+
+def test_results_that_another_run_wrote_while_this_one_waited_are_not_replaced(video, catstream, succeed, tmp_path):
+    source, box = video
+    place = str(tmp_path / "my run")
+    run = catstream("track", source, "--box", box, "--output", tmp_path, "--paused", "--set", f"run.endpoint={place}")
+    assert f"paused: to continue, catstream resume --endpoint '{place}'" in run.stderr.readline()
+    log = tmp_path / "demo.ndjson"
+    log.write_text("of another run")
+    succeed("resume", "--endpoint", place)
+    assert f"{log} exists already: replace it with --overwrite" in run.communicate(timeout=60)[1]
+    assert (run.returncode, log.read_text()) == (1, "of another run")

@@ -172,7 +172,7 @@ def test_a_complete_run_gets_no_further_rows_but_files_that_it_lacks_and_that_is
 
 
 def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_it(
-    video, whole_run, program, until, tmp_path
+    video, whole_run, program, succeed, until, tmp_path
 ):
     (source, box), kept, out = video, tmp_path / "state", tmp_path / "tracks"
     (line,) = (
@@ -181,18 +181,18 @@ def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_i
     options = shlex.join(["--box", box, "--write", "-", *OFTEN])
     for name, value in {"%t": tmp_path, "%i": "gate", "$OPTIONS": options, "${SOURCE}": source}.items():
         line = line.replace(name, str(value))
-    command = [*program, *shlex.split(line)[1:]]
+    _, *words = shlex.split(line)
     # Nobody reads the standard output, as above.
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=tmp_path, pipesize=4096, **pipes) as process:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "pipesize": 4096}
+    with subprocess.Popen([*program, *words], cwd=tmp_path, **pipes) as process:
         until(lambda: process.poll() is not None or (checkpoints(kept) and len(frames(out)) >= 3))
         assert process.poll() is None, process.stderr.read()
         kill_everything(process)
     before = len(frames(out))
     for says in ("present in", "is complete: to track the source again"):
-        ended = subprocess.run(command, cwd=tmp_path, check=True, **pipes)
-        assert "the run in state continues with the objects that it had" in ended.stderr
-        assert says in ended.stderr
+        _, errors = succeed(*words, cwd=tmp_path)
+        assert "the run in state continues with the objects that it had" in errors
+        assert says in errors
         assert_goes_on(out / "demo.ndjson", before, whole_run / "out" / "demo.ndjson")
 
 

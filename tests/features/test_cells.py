@@ -1,14 +1,12 @@
 """Cells: HOG, mean colours and histograms of colours; rows and scores of every window; and their kernels."""
 
-import os
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 
 import cv2
 import numpy as np
 import pytest
+from numba import config
 
 from catstream.features import cells as features
 from catstream.features import kernels, layout
@@ -182,33 +180,39 @@ def test_no_root_is_so_near_to_a_half_that_a_processor_could_round_it_otherwise(
     np.testing.assert_array_less(np.abs(root - kernels._ROOTS), 0.5 - 1e-6)
 
 
-START = "import catstream.features.cells as cells, numpy; print(cells.lab(numpy.zeros((1, 3), numpy.uint8)).tolist())"
+def doubled(array):
+    for place in range(len(array)):
+        array[place] *= 2
 
 
-def start(folder):
-    """Use a kernel in a process with this folder as the only one for a cache: what it logs."""
-    folders = dict.fromkeys(("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME"), str(folder))
-    process = subprocess.run(
-        [sys.executable, "-W", "error", "-c", START],
-        env=os.environ | folders | {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert process.stdout == "[[0, 128, 128]]\n"
-    return process.stderr.splitlines()
+@pytest.fixture
+def compiles(monkeypatch, caplog):
+    """Makes a kernel, with this folder as the only one for a cache: whether it is compiled, as a first start says."""
+
+    def make(folder):
+        monkeypatch.setattr(config, "CACHE_DIR", str(folder))
+        monkeypatch.setattr(config, "CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
+        kernels._announce.cache_clear()
+        caplog.clear()
+        numbers = np.arange(3, dtype=np.uint8)
+        kernels._kernel("void(uint8[:])")(doubled)(numbers)
+        assert numbers.tolist() == [0, 2, 4]
+        assert caplog.messages in ([], [COMPILING])
+        return bool(caplog.messages)
+
+    return make
 
 
-def test_a_first_start_reports_that_it_compiles_and_a_damaged_cache_hinders_no_start(tmp_path):
-    assert [start(tmp_path) for _ in range(2)] == [[COMPILING], []]
-    (file,) = tmp_path.rglob("kernels.convert_to_lab*.nbi")
+def test_a_first_start_reports_that_it_compiles_and_a_damaged_cache_hinders_no_start(compiles, tmp_path):
+    assert [compiles(tmp_path) for _ in range(2)] == [True, False]
+    (file,) = tmp_path.rglob("*doubled*.nbi")
     file.write_bytes(b"")
-    assert start(tmp_path) == [COMPILING]
+    assert compiles(tmp_path)
 
 
-def test_kernels_are_compiled_in_memory_if_no_folder_can_be_written(tmp_path):
+def test_kernels_are_compiled_in_memory_if_no_folder_can_be_written(compiles, tmp_path):
     (tmp_path / "file").touch()
-    assert start(tmp_path / "file" / "folder") == [COMPILING]
+    assert compiles(tmp_path / "file" / "folder")
 
 
 def test_the_numbers_that_the_kernels_repeat_are_those_of_the_layout():

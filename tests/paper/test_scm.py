@@ -60,7 +60,7 @@ def test_warnings_have_the_same_filters_after_several_threads_have_trained(rng):
     cuts = rng.integers(0, 256, (2, 20, 32, 32), np.uint8)
     before = list(warnings.filters)
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: scm._Discriminative.trained(*cuts), range(200)))
+        list(pool.map(lambda _: scm._Discriminative.trained(*cuts), range(20)))
     assert warnings.filters == before
 
 

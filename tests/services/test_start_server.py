@@ -20,15 +20,15 @@ from catstream.services.supervisor import Child, ProcessLog
 
 
 @pytest.fixture
-def server(monkeypatch):
-    """A start server of the test's own, the one that `start_server` returns."""
+def own_server(monkeypatch):
+    """The next start server is the test's own."""
     monkeypatch.setattr(module, "_server", None)
-    yield start_server()
+    yield
     module.close_start_server()
 
 
 @pytest.fixture
-def start(server, folder, tmp_path, until):  # noqa: ARG001  its processes end before the server
+def start(folder, tmp_path, until):
     """Starts a trainer, which takes turns until it is ended; its process, its watchdog and its log."""
     started = []
 
@@ -62,12 +62,10 @@ def has_ended(process):
     return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
-def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_server(
-    server, start, tmp_path, monkeypatch
-):
+def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_server(start, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     started, _, log = start()
-    process = psutil.Process(started.pid)
+    process, server = psutil.Process(started.pid), start_server()
     assert process.ppid() == server.pid
     assert process.cwd() == str(tmp_path)
     assert os.getsid(process.pid) == server.pid != os.getsid(0), "Ctrl-C is for the program"
@@ -102,9 +100,10 @@ def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_
     assert "job" in log.last_line()
 
 
-def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(server, start, until):
+@pytest.mark.usefixtures("own_server")
+def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(start, until):
     process, *_ = start()
-    running = psutil.Process(process.pid)
+    running, server = psutil.Process(process.pid), start_server()
     os.kill(server.pid, signal.SIGKILL)
     assert until(process.poll) == -signal.SIGKILL
     until(lambda: has_ended(running))
@@ -125,7 +124,7 @@ def test_nothing_outlives_a_program_that_is_killed(until):
 def test_a_program_without_standard_streams_has_processes_that_run(tmp_path, folder, closed):
     job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"
     program = f"""
-import os
+import os, time
 from pathlib import Path
 {closed}
 from catstream.services.start_server import start_server
@@ -134,7 +133,7 @@ with open({str(log)!r}, "w+b") as log:
     watchdog = Watchdog.opened()
     process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), watchdog.handle, restarted=False)
     while watchdog.turns < 3 and process.poll() is None:
-        pass
+        time.sleep(0.01)
     code = process.poll()
     process.close()
 os._exit(0 if code is None else 1)
@@ -143,8 +142,8 @@ os._exit(0 if code is None else 1)
     assert subprocess.run([sys.executable, "-c", program], check=False, preexec_fn=before).returncode == 0
 
 
+@pytest.mark.usefixtures("own_server")
 def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_have(start, until):
-    module.close_start_server()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
@@ -169,7 +168,8 @@ def test_a_server_that_cannot_run_is_an_error_that_names_it(monkeypatch, until):
     assert module._server is None
 
 
-def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own(server):
+def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own():
+    server = start_server()
     reading, writing = os.pipe()
     if not (pid := os.fork()):
         copy = start_server()

@@ -69,6 +69,20 @@ def test_a_database_alone_is_continued_after_the_last_frame_of_a_run_that_was_ki
     assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS]
 
 
+@pytest.mark.parametrize("begun", ["", "PRAGMA journal_mode = WAL"])
+def test_a_run_that_was_killed_before_its_database_had_a_table_continues(tmp_path, begun):
+    path = tmp_path / "t.sqlite"
+    path.touch()
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(begun)
+    run = RunFiles(Origin(), None, [str(path)])
+    run.check(overwrite=False, earlier=run.places)
+    assert run.position() == 0
+    with run.opened("", resume=True) as write:
+        write(TrackedFrame(TRACKS[:1]))
+    assert read(path) == [TRACKS[:1]]
+
+
 def test_a_new_run_replaces_a_database_with_all_its_files(tmp_path):
     for name in ("t.sqlite", "t.sqlite-wal", "t.sqlite-shm"):
         (tmp_path / name).write_text("of another program")

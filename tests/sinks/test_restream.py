@@ -3,9 +3,12 @@
 import os
 import shutil
 import signal
+import socket
+import socketserver
 import subprocess
 import time
-from contextlib import ExitStack, closing, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, suppress
 
 import numpy as np
 import psutil
@@ -48,18 +51,45 @@ class Pipeline:
         return TrackedFrame([track])
 
 
+def pump(source, destination):
+    with suppress(OSError):
+        while data := source.recv(1 << 16):
+            destination.sendall(data)
+        destination.shutdown(socket.SHUT_WR)
+
+
+class Relay(socketserver.BaseRequestHandler):
+    """Passes a connection on to the next port once something comes: FFmpeg takes one, which may only be a probe."""
+
+    def handle(self):
+        host, port = self.server.server_address
+        with suppress(OSError):
+            if self.request.recv(1, socket.MSG_PEEK):
+                with socket.create_connection((host, port + 1)) as server, ThreadPoolExecutor(1) as back:
+                    back.submit(pump, server, self.request)
+                    pump(self.request, server)
+
+
+class Server(socketserver.ThreadingTCPServer):
+    daemon_threads = allow_reuse_address = True
+
+
 @contextmanager
 def rtmp_server(path, port):
     """FFmpeg as a server, which takes one connection after the other."""
-    words = f"ffmpeg -loglevel error -listen 1 -i rtmp://127.0.0.1:{port}/live/one -c copy -flush_packets 1 -y {path}"
+    place = f"rtmp://127.0.0.1:{port + 1}/live/one"
+    words = f"ffmpeg -loglevel error -listen 1 -i {place} -c copy -flush_packets 1 -y {path}"
     loop = subprocess.Popen(
         ["sh", "-c", f"while :; do {words}; done"], start_new_session=True, stderr=subprocess.DEVNULL
     )
-    try:
-        yield
-    finally:
-        os.killpg(loop.pid, signal.SIGKILL)
-        loop.wait()
+    with Server(("127.0.0.1", port), Relay) as relay, ThreadPoolExecutor(1) as pool:
+        pool.submit(relay.serve_forever, 0.02)
+        try:
+            yield
+        finally:
+            os.killpg(loop.pid, signal.SIGKILL)
+            loop.wait()
+            relay.shutdown()
 
 
 def test_pictures_are_made_and_sent_only_while_the_server_is_there(endpoint, tcp, tmp_path, until, caplog):
@@ -80,7 +110,8 @@ def test_pictures_are_made_and_sent_only_while_the_server_is_there(endpoint, tcp
             missed = sink.missed
             with open_source(path) as frames:
                 image = next(iter(frames)).image
-            (pushing,) = psutil.Process().children()[:-1]  # the other one is the server
+            children = psutil.Process().children()  # the server, and those of other tests, are too
+            (pushing,) = (child for child in children if "catstream.sinks.restream" in child.cmdline())
             pushing.kill()
             until(lambda: not pipeline.looked_at, lambda: sink.write(pipeline.next()))
             until(lambda: pipeline.looked_at, lambda: sink.write(pipeline.next()))

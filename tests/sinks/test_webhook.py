@@ -254,4 +254,5 @@ def test_options_that_no_destination_has_are_an_error(demo_video, fail, tmp_path
     assert "are for mqtt:// and http://: add one" in fail(
         "track", video, "--box", boxes[0], "--output", tmp_path / "out", "--when", "lost=10"
     )
-    assert "are for mqtt:// and http://: add one" in fail("sink", tmp_path / "t.csv", "--picture")
+    for place in (tmp_path / "t.csv", "rtsp://127.0.0.1:9/yard"):
+        assert "are for mqtt:// and http://: add one" in fail("sink", place, "--picture")

@@ -324,15 +324,19 @@ def test_a_text_part_is_no_loss_also_long_after_the_beginning(served, caplog):
     assert not caplog.records
 
 
+@pytest.mark.parametrize("states_length", [True, False])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
-def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix):
+def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, states_length):
     fetched = []
 
     def send(request):
         fetched.append(1)
+        picture = cv2.imencode(suffix, numbered(len(fetched), width=4096))[1].tobytes()
         request.send_response(200)
+        if states_length:  # as most cameras do
+            request.send_header("Content-Length", str(len(picture)))
         request.end_headers()
-        request.wfile.write(cv2.imencode(suffix, numbered(len(fetched)))[1].tobytes())
+        request.wfile.write(picture)
 
     with open_source(f"{served(send)}/now{suffix}", poll_seconds=0.05) as source:
         seen = [number_of(next(source).image) for _ in range(5)]

@@ -62,9 +62,18 @@ def test_each_tracker_starts_with_the_given_box_and_has_a_row_for_every_frame(se
     np.testing.assert_allclose(run.boxes[0], sequence.boxes[8], atol=1e-3)
 
 
-def test_processes_give_the_same_runs_as_one(sequence, tmp_path):
+@pytest.fixture
+def longer(sequence) -> Sequence:
+    """It has more boxes than frames."""
+    return Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
+
+
+def test_processes_give_the_same_runs_as_one_and_name_a_sequence_that_fails(sequence, longer, tmp_path):
+    errors: list[CatstreamError] = []
+    given = {"starts": temporal(2), "output": tmp_path, "failed": errors.append}
     alone = evaluate([sequence], ["catstream"], SETTINGS, starts=temporal(2))
-    pooled = evaluate([sequence], ["catstream"], SETTINGS, starts=temporal(2), jobs=2, output=tmp_path)
+    pooled = evaluate([longer, sequence], ["catstream"], SETTINGS, jobs=2, **given)
+    assert {str(error).partition(":")[0] for error in errors} == {"catstream on longer", "catstream on longer@8"}
     for one, other in zip(alone, pooled, strict=True):
         assert one.name == other.name
         np.testing.assert_array_equal(one.boxes, other.boxes)
@@ -166,11 +175,9 @@ def test_unknown_trackers_and_equal_names_are_errors_before_the_first_run(sequen
     assert not counted
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_failing_sequence_is_named_and_the_others_run(tmp_path, sequence, jobs):
-    longer = Sequence("longer", sequence.path, np.vstack([sequence.boxes, sequence.boxes[:1]]))
+def test_a_failing_sequence_is_named_and_the_others_run(tmp_path, sequence, longer):
     errors: list[CatstreamError] = []
-    found = evaluate([longer, sequence], ["mil"], SETTINGS, jobs=jobs, output=tmp_path, failed=errors.append)
+    found = evaluate([longer, sequence], ["mil"], SETTINGS, output=tmp_path, failed=errors.append)
     assert [run.name for run in found] == ["walk"]
     assert load(tmp_path, "mil", sequence, FIRST) is not None
     (error,) = errors
@@ -240,13 +247,13 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
     assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}
 
 
-def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, tmp_path):
+def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, catstream, until, tmp_path):
     """The terminal sends it to all of them, of which the workers are at their imports."""
     runs = ["--starts", 4, "--jobs", 2, "--output", tmp_path / "out"]
     process = catstream("evaluate", walk, *runs, process_group=0)
     family = psutil.Process(process.pid)
-    while len(family.children()) < 3 and process.poll() is None:  # two workers, and the tracker of their resources
-        pass
+    # Two workers, and the tracker of their resources.
+    until(lambda: len(family.children()) >= 3 or process.poll() is not None)
     children = family.children()
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate()
