@@ -158,14 +158,6 @@ class Detector:
         training = teacher.training_at(frame, window, seq, self.model, self.settings)
         return self._result(seq, time, score, training)
 
-    def miss(self, seq: int, time: float) -> Result:
-        """Let a frame pass without a search: the object counts as absent."""
-        if self.state is not None:
-            self.state = replace(self.state, level="lost")
-        began = self.state.first_frame if self.state is not None else seq - 1
-        track = Track(seq, seq - 1, time, "absent", None, 0.0, self.model.version, object=self.name, began=began)
-        return track, ObjectFeatures(None, {}, self.state)
-
     def adopt(self, model: Model) -> None:
         """Use a model from now on, unless it is older than the newest that arrived, or of an object before this one."""
         if model.version <= self.newest_version:
@@ -179,17 +171,10 @@ class Detector:
     def resume(self, state: DetectorState, model: Model) -> None:
         """Continue after a frame of a stream that another detector began, with the state after it and the newest model.
 
-        With the model that the other one had by then, it continues as that would have, bit for bit. `state_at` is for
-        an object of which only the last box is known.
+        With the model that the other one had by then, it continues as that would have, bit for bit.
         """
         self.model, self.newest_version = model, model.version
         self.state = state if model.motion is None else replace(state, motion=model.motion)
-
-    def state_at(self, box: Box, first: Box, began: int) -> DetectorState:
-        """The state if nothing is known but the boxes of the object in the last frame and in its first one, `began`."""
-        context = self.settings.search.context
-        window = Window.around(box, context)
-        return DetectorState(began, "confident", window, window, Window.around(first, context))
 
     def _known(self) -> DetectorState:
         if self.state is None:

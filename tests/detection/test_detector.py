@@ -141,17 +141,6 @@ def test_older_models_are_ignored(scene):
     assert detector.model is new
 
 
-def test_another_detector_continues_from_the_state_of_a_stopped_one(scene):
-    detector, other = started(scene), Follower()
-    model = dataclasses.replace(detector.model, version=1)
-    detector.adopt(model)
-    track, _ = detector.step(scene((64, 52)))
-    other.go_on(track.seq, other.state_at(track.box, START, 0), model)
-    track, _ = other.step(scene((68, 54)))
-    assert (track.seq, track.state) == (3, "present")
-    assert track.box.overlap(Box(68, 54, 48, 40)) > 0.8
-
-
 @pytest.mark.parametrize("absent", [False, True])
 def test_another_detector_continues_bit_for_bit_from_the_state_after_a_frame(scene, absent):
     detector, other = started(scene), Follower()
