@@ -4,7 +4,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv/bin/python}
-unset OPENBLAS_NUM_THREADS OMP_NUM_THREADS  # as in a process of a user
+unset OPENBLAS_NUM_THREADS OMP_NUM_THREADS PYTHONDONTWRITEBYTECODE  # as in a process of a user
 catstream=$(dirname "$python")/catstream
 
 measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json

@@ -251,7 +251,7 @@ def said():
         with (
             pytest.MonkeyPatch.context() as patch,
             mock.patch.dict(os.environ, env or {}),  # the command sets variables, too
-            tempfile.TemporaryFile("w+", errors="surrogateescape") as output,  # it has a descriptor
+            tempfile.TemporaryFile("w+") as output,  # it has a descriptor
             redirect_stdout(output),
             redirect_stderr(errors),
             ExitStack() as stack,

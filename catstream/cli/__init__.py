@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
 from importlib import import_module
+from typing import cast
 
 import click
 
@@ -87,6 +89,7 @@ def main() -> None:
     os.environ["no_proxy"] = ",".join(filter(None, ("127.0.0.1,localhost", os.environ.get("no_proxy"))))
     if sys.stdout is None:  # it was closed before the start (>&-): what is printed is dropped
         sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+    cast(io.TextIOWrapper, sys.stdout).reconfigure(errors="surrogateescape")  # names of files need not be UTF-8
     try:
         group(prog_name="catstream")
     except CatstreamError as error:
