@@ -59,8 +59,10 @@ class Watchdog(ctypes.Structure):
     """
 
     _fields_ = (
-        *(("turns", ctypes.c_double), ("patience", ctypes.c_double)),
-        *(("after", ctypes.c_int64), ("read", ctypes.c_double)),
+        ("turns", ctypes.c_double),
+        ("patience", ctypes.c_double),
+        ("after", ctypes.c_int64),
+        ("read", ctypes.c_double),
     )
     turns: float
     patience: float

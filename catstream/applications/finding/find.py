@@ -95,7 +95,7 @@ class Sighting:
 
 @dataclass(slots=True, kw_only=True)
 class Reading:
-    """What is noted of a file while it is read.
+    """The length and the problems of a file, which become known while it is read.
 
     frames    number of its frames, None if unknown
     problems  reasons for what could not be read: each image, or at the end of a video the frames that were skipped
