@@ -13,8 +13,8 @@ from typing import Any
 from accuracy import MEANS, accuracy_command, changed, compared, described, difference, means, spread, videos
 from table import Table, benchmark
 
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.settings import Settings
+from catstream.base.settings import Settings
+from catstream.evaluation.runs import EvaluationRun
 
 COLUMNS = ("variant", *MEANS, "spread of AUC", "AUC lost", "± standard error", "runs changed")
 _NEVER = -100.0  # lower than any score

@@ -14,13 +14,13 @@ import numpy as np
 from sequences import CHECK, sequences
 from table import command, mean_and_error
 
-from catstream.applications.evaluation.accuracy import rows_of
-from catstream.applications.evaluation.datasets import Sequence, Starts, choose_starts
-from catstream.applications.evaluation.onepass import evaluate
-from catstream.applications.evaluation.peers import PEERS, Peer
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.errors import SettingsError
-from catstream.settings import Settings
+from catstream.base.errors import SettingsError
+from catstream.base.settings import Settings
+from catstream.evaluation.accuracy import rows_of
+from catstream.evaluation.datasets import Sequence, Starts, choose_starts
+from catstream.evaluation.onepass import evaluate
+from catstream.evaluation.peers import PEERS, Peer
+from catstream.evaluation.runs import EvaluationRun
 
 #: Headings for the values of `means`.
 MEANS = ("AUC", "success", "precision")

@@ -10,7 +10,7 @@ from typing import Any
 from sequences import CHECK, TUNED
 from table import Cell, Table
 
-from catstream.applications.evaluation.accuracy import COUNTS
+from catstream.evaluation.accuracy import COUNTS
 
 Record = Mapping[str, Any]
 

@@ -32,19 +32,19 @@ import numpy as np
 from sequences import FIRST, named, objects, scratch
 from table import Table, benchmark, command
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.scores import score
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import ServiceError
+from catstream.base.settings import Settings
 from catstream.client.control import Control, control
 from catstream.compression.forest import Forest
-from catstream.errors import ServiceError
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.scores import score
+from catstream.jobs.job import Job
 from catstream.messages.kinds import Answer, End, Track, Tracks
 from catstream.multi import MultiTracker
-from catstream.run.job import Job
-from catstream.services.process import PERMANENT_FAILURE
-from catstream.services.start_server import NAMES, close_start_server, start_server
-from catstream.services.supervisor import Child
-from catstream.settings import Settings
+from catstream.processes.process import PERMANENT_FAILURE
+from catstream.processes.start_server import NAMES, close_start_server, start_server
+from catstream.processes.supervisor import Child
 from catstream.video.source import open_source
 from catstream.wire.channels import MODELS
 from catstream.wire.endpoint import Endpoint
@@ -58,7 +58,7 @@ _DISK = 128  # megabytes of the small disk for each object: three checkpoints, a
 #: belong into the trees of each object, counted without the trees: `Arena.rows_due` adds them up.
 _MODULE = """
 import json, os, time
-from catstream.numerics.threads import limit_process
+from catstream.base.threads import limit_process
 limit_process()  # before anything imports numpy
 from catstream.compression.forest import Forest
 from catstream.messages.heads import TREES

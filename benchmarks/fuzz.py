@@ -26,14 +26,14 @@ from table import Table, benchmark, command
 COMPILED = ["catstream.features.kernels"]  # by numba: no bytecode
 
 with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
-    from catstream.box import Box
+    from catstream.base.box import Box
+    from catstream.base.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
+    from catstream.base.settings import Settings
     from catstream.compression.forest import Forest
-    from catstream.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
+    from catstream.jobs.saved_model import Learned
     from catstream.messages import storage
     from catstream.messages.heads import GROUPS
     from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
-    from catstream.run.learned import Learned
-    from catstream.settings import Settings
     from catstream.wire.codec import KINDS, decode, encode, topic_of
     from catstream.wire.keys import Keys, create
 
@@ -122,7 +122,7 @@ def grown() -> Forest:
 
 def narrow(path: Path) -> Learned:
     """Return a saved model whose rows have `WIDTH` columns."""
-    with patch("catstream.run.learned.row_length", lambda: WIDTH):
+    with patch("catstream.jobs.saved_model.row_length", lambda: WIDTH):
         return Learned.load(path)
 
 

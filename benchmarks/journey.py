@@ -13,10 +13,10 @@ import numpy as np
 import psutil
 from table import plots
 
+from catstream.base.names import Boxes
+from catstream.base.settings import Settings
 from catstream.messages.kinds import Track
-from catstream.messages.names import Boxes
 from catstream.pipeline import Pipeline
-from catstream.settings import Settings
 from catstream.video.source import ALL_FRAMES
 
 

@@ -13,16 +13,16 @@ import numpy as np
 from sequences import CHECK, sequences
 from table import command
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.workers import SPAWN
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.settings import Settings
+from catstream.base.threads import one_thread
+from catstream.base.workers import SPAWN
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
+from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
+from catstream.jobs.saved_model import Learned
 from catstream.messages.kinds import ObjectFeatures, Track
-from catstream.numerics.threads import one_thread
-from catstream.run.learned import Learned
-from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
 _LEAST, _MOST = 20, 250  # frames that a model is learned from

@@ -16,13 +16,13 @@ import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked
 from table import Table, benchmark, mean_and_error
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
+from catstream.base.settings import Settings
 from catstream.compression.reduce import energy
+from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
-from catstream.run.learned import Learned, merge
-from catstream.settings import Settings
+from catstream.jobs.saved_model import Learned, merge
 
 _EVERY = 5  # frames from one to the next in which the best window is looked up
 

@@ -14,8 +14,8 @@ from accuracy import accuracy_command, compared, described, videos
 from sequences import CHECK
 from table import Cell, Table, benchmark, mean_and_error
 
-from catstream.applications.evaluation.accuracy import Row, rows_of
-from catstream.settings import Settings
+from catstream.base.settings import Settings
+from catstream.evaluation.accuracy import Row, rows_of
 
 MEASURES = ("auc", "success")
 COLUMNS = ("sequences", "", "features", *(word for measure in ("AUC", "success") for word in (measure, "gained", "±")))

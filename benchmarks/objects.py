@@ -17,10 +17,10 @@ from journey import travel
 from sequences import scratch
 from table import Cell, Table, benchmark, command
 
-from catstream.applications.loadtest import crowd
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.settings import Settings
+from catstream.loadtest import crowd
 from catstream.multi import MultiTracker
-from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 

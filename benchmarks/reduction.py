@@ -16,15 +16,15 @@ from accuracy import MEANS, accuracy_command, compared, described, difference, m
 from sequences import TUNED, named
 from table import Cell, Table, benchmark
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.compression.tree import REDUCTIONS
 from catstream.detection.objects import Detectors
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.runs import EvaluationRun
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Features, Model
-from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
 COLUMNS = ("coreset.reduction", *MEANS, "AUC above svd", "± standard error", "frames/s")

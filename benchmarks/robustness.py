@@ -21,8 +21,9 @@ from accuracy import available, many_sequences, videos
 from sequences import CHECK
 from table import Cell, Table, benchmark, command, mean_and_error
 
-from catstream.applications.evaluation.accuracy import Row, rows_of
-from catstream.applications.evaluation.datasets import (
+from catstream.base.settings import Settings
+from catstream.evaluation.accuracy import Row, rows_of
+from catstream.evaluation.datasets import (
     Sequence,
     Start,
     Starts,
@@ -32,9 +33,8 @@ from catstream.applications.evaluation.datasets import (
     spatial,
     temporal,
 )
-from catstream.applications.evaluation.onepass import TRACKERS, evaluate
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.settings import Settings
+from catstream.evaluation.onepass import TRACKERS, evaluate
+from catstream.evaluation.runs import EvaluationRun
 
 PARTS = ("ope", "tre", "sre", "jitter")
 ATTRIBUTES = Path(__file__).with_name("attributes.json")

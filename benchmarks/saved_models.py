@@ -14,8 +14,8 @@ import numpy as np
 from learning import chosen, each, features, hits, learning_command, model_of, tracked, training_frames
 from table import Table, benchmark, mean_and_error
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.settings import Settings
+from catstream.base.settings import Settings
+from catstream.evaluation.datasets import Sequence
 
 _STEPS = (1, 4, 7, 10, 13, 16, 19, 22)  # distances, in the list, of the other sequences that a model is tried in
 

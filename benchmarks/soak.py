@@ -24,14 +24,14 @@ from learning import features as learned
 from sequences import named, scratch
 from table import Table, benchmark, command, plots
 
-from catstream.applications.evaluation.datasets import Sequence
+from catstream.base.errors import ServiceError
+from catstream.base.names import UNNAMED
+from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.compression.tree import CoresetTree
-from catstream.errors import ServiceError
+from catstream.evaluation.datasets import Sequence
 from catstream.messages.heads import APPEARANCE, GROUPS
 from catstream.messages.kinds import End, Features, ObjectFeatures, TrainingRows
-from catstream.messages.names import UNNAMED
-from catstream.settings import Settings
 from catstream.wire.acknowledged import Sender
 from catstream.wire.channels import FEATURES
 from catstream.wire.endpoint import Endpoint
@@ -146,7 +146,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
     """Measure the compressor process: a row for each fifth of the messages."""
     rows = []
     with TemporaryDirectory(prefix="catstream-") as folder:
-        command = [sys.executable, "-m", "catstream.services", "compressor"]
+        command = [sys.executable, "-m", "catstream.processes", "compressor"]
         options = ["--set", f"run.endpoint={folder}", "--state", f"{folder}/state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,

@@ -23,15 +23,15 @@ from journey import Journey, travel
 from sequences import named, rendered
 from table import Table, benchmark, command
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.onepass import evaluate, follow
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED
+from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.onepass import evaluate, follow
+from catstream.evaluation.runs import EvaluationRun
 from catstream.features.pyramid import Pyramid
-from catstream.messages.names import UNNAMED
-from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
 TRACKERS = ("catstream", "csrt", "kcf")

@@ -18,8 +18,8 @@ from statistics import median
 from sequences import named
 from table import Table, benchmark, command
 
-from catstream.box import Box
-from catstream.errors import ServiceError
+from catstream.base.box import Box
+from catstream.base.errors import ServiceError
 
 CACHE = "NUMBA_CACHE_DIR"  # folder of the compiled kernels
 

@@ -19,10 +19,10 @@ from sequences import rendered
 from table import Table, benchmark, command
 
 import catstream
-from catstream.applications.loadtest.load import Subscribers
-from catstream.errors import SilenceError
+from catstream.base.errors import SilenceError
+from catstream.base.settings import Settings
+from catstream.loadtest.load import Subscribers
 from catstream.messages.kinds import Track
-from catstream.settings import Settings
 
 SIZE = (320, 240)
 PAUSE_SECONDS = 2.0  # between two late joiners

@@ -16,10 +16,10 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from catstream.applications.provenance import provenance
-from catstream.errors import CatstreamError
-from catstream.numerics.threads import one_thread
-from catstream.settings import Settings
+from catstream.base.errors import CatstreamError
+from catstream.base.settings import Settings
+from catstream.base.threads import one_thread
+from catstream.reports.provenance import provenance
 
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")

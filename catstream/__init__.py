@@ -17,17 +17,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from catstream.applications.finding.find import Sighting, find
-    from catstream.box import Box
+    from catstream.base.box import Box
+    from catstream.base.errors import CatstreamError
+    from catstream.base.settings import Settings
     from catstream.client.control import Control, control
     from catstream.client.subscription import Subscription, subscribe
-    from catstream.errors import CatstreamError
+    from catstream.finding.find import Sighting, find
     from catstream.fleet.fleet import Fleet
+    from catstream.jobs.saved_model import Learned, merge
     from catstream.messages.kinds import Track
     from catstream.multi import MultiTracker
     from catstream.pipeline import Pipeline
-    from catstream.run.learned import Learned, merge
-    from catstream.settings import Settings
     from catstream.tracker import Tracker
 
 __all__ = [
@@ -53,21 +53,21 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Box": "box",
-    "CatstreamError": "errors",
+    "Box": "base.box",
+    "CatstreamError": "base.errors",
     "Control": "client.control",
     "Fleet": "fleet.fleet",
-    "Learned": "run.learned",
+    "Learned": "jobs.saved_model",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
-    "Settings": "settings",
-    "Sighting": "applications.finding.find",
+    "Settings": "base.settings",
+    "Sighting": "finding.find",
     "Subscription": "client.subscription",
     "Track": "messages.kinds",
     "Tracker": "tracker",
     "control": "client.control",
-    "find": "applications.finding.find",
-    "merge": "run.learned",
+    "find": "finding.find",
+    "merge": "jobs.saved_model",
     "subscribe": "client.subscription",
 }
 

@@ -14,17 +14,18 @@ from types import MappingProxyType
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import BoxError, FrameError, ObjectError
+from catstream.base.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.base.threads import one_thread
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
-from catstream.errors import BoxError, FrameError, ObjectError
 from catstream.features.descriptor import descriptor_of
+from catstream.jobs.saved_model import Learned
 from catstream.messages.kinds import Features, Track, Tracks
-from catstream.messages.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name, listed
-from catstream.numerics.threads import one_thread
-from catstream.run.learned import Learned
-from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
 
@@ -45,7 +46,7 @@ class MultiTracker:
 
     Examples
     --------
-    >>> from catstream.box import Box
+    >>> from catstream.base.box import Box
     >>> frame = np.random.default_rng(0).integers(0, 256, (120, 160, 3), np.uint8)
     >>> tracker = MultiTracker()
     >>> tracker.init(frame, {"anna": (60, 40, 40, 40), "ben": (10, 70, 30, 30)})

@@ -18,18 +18,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from catstream.addresses import without_password
-from catstream.errors import ServiceError, SettingsError
+from catstream.base.addresses import without_password
+from catstream.base.errors import ServiceError, SettingsError
+from catstream.base.files import check_file
+from catstream.base.names import Boxes, boxes_by_name, check_boxes
+from catstream.base.settings import Settings
 from catstream.features.descriptor import descriptor_of, digest_of
+from catstream.jobs.job import Job, Models, Results, files_by_name
+from catstream.jobs.saved_model import check_files
+from catstream.jobs.state import last_seq, last_time, locked_for_run, saved
 from catstream.messages.kinds import RunState, Track, run_state
-from catstream.messages.names import Boxes, boxes_by_name, check_boxes
-from catstream.messages.storage import check_file
-from catstream.run.job import Job, Models, Results, files_by_name
-from catstream.run.learned import check_files
-from catstream.run.state import last_seq, last_time, locked_for_run, saved
-from catstream.services.start_server import start_server
-from catstream.services.supervisor import Supervisor
-from catstream.settings import Settings
+from catstream.processes.start_server import start_server
+from catstream.processes.supervisor import Supervisor
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import meeting_place, private_folder
 from catstream.wire.socket import check_owner

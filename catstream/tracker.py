@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED
+from catstream.base.settings import Settings
+from catstream.jobs.saved_model import Learned
 from catstream.messages.kinds import Track
-from catstream.messages.names import UNNAMED
 from catstream.multi import MultiTracker
-from catstream.run.learned import Learned
-from catstream.settings import Settings
 
 
 class Tracker:

@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
+from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
-from catstream.settings import PRESETS, describe
 
 RECORDS = sorted((Path(__file__).parent / "decisions").glob("0*.md"))
 

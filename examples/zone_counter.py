@@ -13,7 +13,7 @@ import sys
 from collections import defaultdict
 
 import catstream
-from catstream.run.job import SinkOptions
+from catstream.jobs.job import SinkOptions
 from catstream.sinks.events import Event, Events
 
 

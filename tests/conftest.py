@@ -25,12 +25,12 @@ import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own, to be limited too
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.threads import one_thread
 from catstream.cli import main
 from catstream.cli.common import INTERRUPTS
 from catstream.client.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
-from catstream.numerics.threads import one_thread
 from catstream.video.rendered import render, write
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
 from catstream.features.layout import row_length
 from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import DetectorState, ObjectFeatures, TrainingRows

@@ -9,43 +9,44 @@ from pathlib import Path
 
 import pytest
 
-from catstream.errors import EXTRAS
+from catstream.base.errors import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 
 #: From the lowest. A module imports only from lower levels than its own, and from its own folder.
 LEVELS = [
-    {"errors", "addresses", "numerics"},
-    {"box", "settings"},
+    {"base"},
+    {"numerics"},
     {"messages"},
     {"features"},
     {"paper"},
     {"detection", "compression", "training", "wire", "video"},
-    {"run"},
+    {"jobs"},
     {"multi", "client"},
     {"sinks"},
-    {"tracker", "services", "web"},
+    {"tracker", "processes", "web"},
     {"pipeline"},
-    {"applications", "fleet"},
+    {"reports"},
+    {"evaluation", "finding", "loadtest", "fleet"},
     {"cli"},
 ]
 
 #: The files or folders that may import a foreign library.
 IMPORTERS = {
-    "numpy": ["catstream", "services"],
+    "numpy": ["catstream"],
     "scipy": [
         *("catstream/numerics/ridge.py", "catstream/compression/reduce.py"),
-        "catstream/numerics/threads.py",  # its BLAS is limited, too
+        "catstream/base/threads.py",  # its BLAS is limited, too
     ],
     "cv2": [
         "catstream/features",
         "catstream/detection",
         "catstream/paper",
         "catstream/video",
-        "catstream/applications/loadtest/crowd.py",
-        "catstream/numerics/threads.py",
-        "catstream/applications/evaluation/peers.py",
-        "services/detector_process.py",
+        "catstream/loadtest/crowd.py",
+        "catstream/base/threads.py",
+        "catstream/evaluation/peers.py",
+        "catstream/processes/detector.py",
         "catstream/sinks/events.py",
     ],
     "filterpy": ["catstream/numerics/kalman.py"],
@@ -56,7 +57,7 @@ IMPORTERS = {
     "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
-    "av": ["catstream/video", "catstream/applications/loadtest/camera.py", "catstream/applications/loadtest/rtsp.py"],
+    "av": ["catstream/video", "catstream/loadtest/camera.py", "catstream/loadtest/rtsp.py"],
     "zmq": [
         "catstream/wire/socket.py",
         "catstream/wire/acknowledged.py",
@@ -69,22 +70,22 @@ IMPORTERS = {
     "paho": ["catstream/sinks/mqtt_sink.py"],
     "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
-        *("catstream/wire/codec.py", "catstream/settings.py", "catstream/fleet/spec.py"),
+        *("catstream/wire/codec.py", "catstream/base/settings.py", "catstream/fleet/spec.py"),
         "catstream/client/registry.py",
-        *("catstream/box.py", "catstream/messages"),
-        *("services/decisions.py", "catstream/compression/forest.py"),
-        *("catstream/run/job.py", "catstream/applications/evaluation/datasets.py"),
-        *("catstream/applications/finding/found.py", "catstream/cli/attach.py"),
+        *("catstream/base/box.py", "catstream/messages"),
+        *("catstream/processes/decisions.py", "catstream/compression/forest.py"),
+        *("catstream/jobs/job.py", "catstream/evaluation/datasets.py"),
+        *("catstream/finding/found.py", "catstream/cli/attach.py"),
     ],
-    "threadpoolctl": ["catstream/numerics/threads.py", "catstream/applications/provenance.py"],
-    "psutil": ["catstream/applications/loadtest/latency.py"],
-    "click": ["catstream/cli", "services/__main__.py", "services/options.py"],
+    "threadpoolctl": ["catstream/base/threads.py", "catstream/reports/provenance.py"],
+    "psutil": ["catstream/loadtest/latency.py"],
+    "click": ["catstream/cli", "catstream/processes/__main__.py", "catstream/processes/options.py"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py"],
     "prometheus_client": ["catstream/web/prometheus.py"],
     "rich": ["catstream/cli"],
     "onnxruntime": ["catstream/features/network.py"],
-    "onnx": ["catstream/applications/backbone.py"],
+    "onnx": ["catstream/features/backbone.py"],
 }
 
 #: Libraries that take long to import: inside the function that needs them.
@@ -95,17 +96,16 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 
 #: State machines with the same rule: bytes, events and the time are arguments.
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/life.py", "catstream/sinks/events.py"),
-    *("services/decisions.py", "services/control_commands.py"),
+    *("catstream/wire/go_back_n.py", "catstream/fleet/lifecycle.py", "catstream/sinks/events.py"),
+    *("catstream/processes/decisions.py", "catstream/processes/control_commands.py"),
 ]
 
-FILES = sorted([*ROOT.glob("catstream/**/*.py"), *ROOT.glob("services/**/*.py")])
+FILES = sorted(ROOT.glob("catstream/**/*.py"))
 
 
 def dotted(path: Path) -> str:
-    """The name a file is imported by: services/ installs as catstream.services."""
-    parts = path.relative_to(ROOT).with_suffix("").parts
-    return ".".join(part for part in (("catstream", *parts) if parts[0] == "services" else parts) if part != "__init__")
+    """The name a file is imported by."""
+    return ".".join(part for part in path.relative_to(ROOT).with_suffix("").parts if part != "__init__")
 
 
 NAMES = {dotted(path) for path in FILES}
@@ -189,7 +189,7 @@ def test_slow_libraries_are_imported_by_the_functions_that_use_them():
 @pytest.mark.parametrize("name", ["compressor", "trainer"])
 def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
     unused = SLOW | {"asyncio", "cv2", "numba", "sklearn"}
-    check = f"import sys, catstream.services.{name}_process; sys.exit({unused!r} & sys.modules.keys() or 0)"
+    check = f"import sys, catstream.processes.{name}_process; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")
 
@@ -212,9 +212,9 @@ def test_a_stage_imports_no_io_threads_clocks_or_randomness():
     [
         (upward, "catstream/wire/codec.py", "from catstream.pipeline import Pipeline"),
         (upward, "catstream/wire/codec.py", "from catstream import Pipeline"),
-        (misplaced, "catstream/box.py", "import an_unknown_library"),
-        (misplaced, "catstream/box.py", "import zmq"),
-        (slow_at_the_top, "catstream/box.py", f"import {min(SLOW)}"),
+        (misplaced, "catstream/base/box.py", "import an_unknown_library"),
+        (misplaced, "catstream/base/box.py", "import zmq"),
+        (slow_at_the_top, "catstream/base/box.py", f"import {min(SLOW)}"),
         (impure, "catstream/training/trainer.py", "def f():\n    import socket"),
         (impure, "catstream/wire/go_back_n.py", "from time import monotonic"),
     ],

@@ -12,13 +12,13 @@ from urllib.parse import urlsplit
 import pytest
 import yaml
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.settings import Settings
 from catstream.cli import group
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Health
-from catstream.services.__main__ import main
-from catstream.services.start_server import NAMES
-from catstream.settings import Settings
+from catstream.processes.__main__ import main
+from catstream.processes.start_server import NAMES
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server
 from catstream.wire import keys
@@ -50,8 +50,8 @@ def words(name):
 
 
 def parsed(name):
-    """What the command line of a service says, read by the parser of `catstream.services`."""
-    with main.make_context("catstream.services", words(name)) as context:
+    """What the command line of a service says, read by the parser of `catstream.processes`."""
+    with main.make_context("catstream.processes", words(name)) as context:
         verb, command, rest = main.resolve_command(context, words(name))
         return verb, command.make_context(verb, rest, parent=context).params
 
@@ -164,7 +164,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
             for there, place in here.items():
                 variables = {key: value.replace(there, place) for key, value in variables.items()}
                 line = [word.replace(there, place) for word in line]
-            service = [sys.executable, "-m", "catstream.services", *line]
+            service = [sys.executable, "-m", "catstream.processes", *line]
             process = stack.enter_context(subprocess.Popen(service, env=os.environ | variables))
             stack.callback(process.kill)
         with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
@@ -178,7 +178,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
 
 def test_the_image_is_pinned_runs_the_processes_and_is_nobody_in_particular():
     assert "pip install --require-hashes -r requirements.lock" in IMAGE
-    assert 'ENTRYPOINT ["python", "-P", "-m", "catstream.services"]' in IMAGE
+    assert 'ENTRYPOINT ["python", "-P", "-m", "catstream.processes"]' in IMAGE
     last = IMAGE.rpartition("FROM ")[2]
     assert re.search(r"^USER (?!root)\w+$", last, re.MULTILINE)
     assert last.index("USER ") < last.index("import catstream"), "the kernels belong to who runs them"

@@ -18,9 +18,9 @@ import click
 import pytest
 
 import catstream
+from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
-from catstream.run.job import Results
-from catstream.settings import PRESETS, describe
+from catstream.jobs.job import Results
 from catstream.sinks.destinations import EXPORTS, SINKS
 from catstream.sinks.track_log import places_of
 

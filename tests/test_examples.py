@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 
 import catstream
-from catstream.box import Box
-from catstream.errors import SilenceError
+from catstream.base.box import Box
+from catstream.base.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source

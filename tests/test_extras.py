@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.errors import EXTRAS, MissingExtraError, install_command, require_extra
+from catstream.base.errors import EXTRAS, MissingExtraError, install_command, require_extra
 from catstream.sinks.destinations import export_of, sink_of
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
@@ -22,8 +22,8 @@ for module in {[module for _, modules in EXTRAS.values() for module in modules]}
 import catstream
 catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
 from catstream.cli import COMMANDS, load_command
-from catstream.services.__main__ import main
-import catstream.applications.evaluation.runs, catstream.applications.evaluation.accuracy
+from catstream.processes.__main__ import main
+import catstream.evaluation.runs, catstream.evaluation.accuracy
 for name in COMMANDS:
     load_command(name)
 """
@@ -33,9 +33,7 @@ def test_tracking_and_the_help_of_every_command_need_no_extra():
     subprocess.run([sys.executable, "-P", "-c", BASE], check=True)
 
 
-@pytest.mark.parametrize(
-    ("package", "extra"), [("catstream.web", "view"), ("catstream.applications.loadtest", "loadtest")]
-)
+@pytest.mark.parametrize(("package", "extra"), [("catstream.web", "view"), ("catstream.loadtest", "loadtest")])
 def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch, package, extra):
     monkeypatch.setitem(sys.modules, EXTRAS[extra][1][0], None)
     for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catstream.box import Box
-from catstream.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
+from catstream.base import threads
+from catstream.base.box import Box
+from catstream.base.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
+from catstream.base.settings import Settings
 from catstream.multi import MultiTracker
-from catstream.numerics import threads
-from catstream.settings import Settings
 
 STEPS = {"anna": (4, 1), "ben": (-3, 2), "cleo": (0, -4)}  # pixels a frame
 STARTS = {"anna": (40, 30), "ben": (250, 60), "cleo": (150, 180)}

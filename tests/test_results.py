@@ -14,7 +14,7 @@ sys.path.append(str(BENCHMARKS))
 import page  # noqa: E402
 from sequences import CHECK, TUNED  # noqa: E402
 
-from catstream.applications.evaluation.datasets import read_attributes  # noqa: E402
+from catstream.evaluation.datasets import read_attributes  # noqa: E402
 
 SCRIPTS = {path.relative_to(ROOT).as_posix() for path in BENCHMARKS.rglob("*.py") if "__main__" in path.read_text()}
 SCRIPTS -= {"benchmarks/page.py"}  # it writes the pages

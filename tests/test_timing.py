@@ -8,7 +8,7 @@ import catstream
 from catstream.cli import fleet_commands
 from catstream.client import control, subscription
 from catstream.fleet import actor, controller, fleet, life, store
-from catstream.services import compressor_process, detector_process, process, supervisor
+from catstream.processes import compressor_process, detector_process, process, supervisor
 from catstream.web import app, dashboard, feed, server
 from catstream.wire import commands, go_back_n, newest, socket
 

@@ -27,9 +27,9 @@ from learning import each, features, hits, learning_command, model_of, tracked
 from sequences import CHECK, painted, rendered, scratch, sequences
 from table import Table, mean_and_error, publish
 
-from catstream.applications.evaluation.datasets import Sequence, find_sequences
-from catstream.run.learned import Learned, merge
-from catstream.settings import Settings
+from catstream.base.settings import Settings
+from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.jobs.saved_model import Learned, merge
 from catstream.video.writer import VideoWriter
 
 _CAMERAS = 4

@@ -32,16 +32,16 @@ sys.path.append(str(Path(__file__).parents[1]))  # shared modules of the benchma
 from chaos import fingerprint, quantiles, undisturbed
 from table import Table, benchmark, command
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import CatstreamError, ServiceError
+from catstream.base.settings import Settings
 from catstream.client.registry import REGISTRY_PORT, Registry
 from catstream.compression.forest import Forest
-from catstream.errors import CatstreamError, ServiceError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
+from catstream.jobs.state import restore
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.run.state import restore
-from catstream.settings import Settings
 from catstream.video import rendered
 from catstream.video.live_demo import first_box
 from catstream.wire.keys import allow

@@ -22,13 +22,13 @@ from learning import features, model_of
 from sequences import rendered
 from table import Table, command, publish
 
+from catstream.base.settings import Settings
 from catstream.client.registry import Registry, RegistryServer
-from catstream.fleet.life import Actor, Node, event, order
+from catstream.fleet.lifecycle import Actor, Node, event, order
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Store
+from catstream.jobs.saved_model import merge
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.run.learned import merge
-from catstream.settings import Settings
 
 STREAMS = (10, 100, 1000, 10_000)
 STATUS = StreamStatus(

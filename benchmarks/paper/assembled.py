@@ -12,18 +12,18 @@ from unittest.mock import patch
 import numpy as np
 from accuracy import starts_of
 
-from catstream.applications.evaluation.datasets import Sequence, Start
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.workers import SPAWN
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED
+from catstream.base.settings import Settings
+from catstream.base.threads import one_thread
+from catstream.base.workers import SPAWN
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.objects import Detectors
+from catstream.evaluation.datasets import Sequence, Start
+from catstream.evaluation.runs import EvaluationRun
 from catstream.features.pyramid import Pyramid
-from catstream.messages.names import UNNAMED
-from catstream.numerics.threads import one_thread
 from catstream.paper.scm import SparseCollaborativeModel
-from catstream.settings import Settings
 from catstream.training.trainer import Trainer
 
 

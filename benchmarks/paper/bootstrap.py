@@ -16,8 +16,8 @@ import shared  # noqa: F401
 from accuracy import MEANS, accuracy_command, compared, difference, means, starts_of, videos
 from table import Table, benchmark
 
-from catstream.applications.evaluation.datasets import Sequence, Start
-from catstream.settings import Settings
+from catstream.base.settings import Settings
+from catstream.evaluation.datasets import Sequence, Start
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.
 BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"teaching.bootstrap": "scm", "teaching.copies": 0}}

@@ -15,7 +15,7 @@ from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark
 
-from catstream.settings import PRESETS, Settings
+from catstream.base.settings import PRESETS, Settings
 
 #: Size in percent -> success in the paper: mean of ten videos, and Panda.
 PAPER = {1: (0.49, 0.59), 2.5: (0.51, 0.59), 5: (0.53, 0.61), 10: (0.56, 0.62), 25: (0.66, 0.67)}

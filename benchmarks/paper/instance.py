@@ -29,13 +29,13 @@ import shared  # noqa: F401
 from sequences import CHECK, painted, sequences
 from table import Table, benchmark, command
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.finding.find import Scan
-from catstream.applications.workers import SPAWN
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.threads import one_thread
+from catstream.base.workers import SPAWN
+from catstream.evaluation.datasets import Sequence
 from catstream.features.score_map import non_maximum_suppression
-from catstream.numerics.threads import one_thread
-from catstream.run.learned import Learned
+from catstream.finding.find import Scan
+from catstream.jobs.saved_model import Learned
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 

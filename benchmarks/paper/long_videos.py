@@ -19,9 +19,9 @@ from journey import Journey, draw, travel
 from sequences import named, scratch
 from table import Table, benchmark, command
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.applications.evaluation.scores import score
-from catstream.settings import PRESETS, Settings
+from catstream.base.settings import PRESETS, Settings
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.scores import score
 from catstream.video.writer import VideoWriter
 
 #: Tracker -> mean success of the four longest TLD videos at 10, 20, 50, 75 and 100 thousand frames.

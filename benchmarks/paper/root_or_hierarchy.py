@@ -14,12 +14,12 @@ from accuracy import MEANS, accuracy_command, described, means, spread, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark
 
-from catstream.applications.evaluation.accuracy import rows_of
-from catstream.applications.evaluation.runs import EvaluationRun
+from catstream.base.settings import PRESETS, Settings
 from catstream.compression.node import sample
 from catstream.compression.tree import CoresetTree
+from catstream.evaluation.accuracy import rows_of
+from catstream.evaluation.runs import EvaluationRun
 from catstream.messages.kinds import Summary
-from catstream.settings import PRESETS, Settings
 
 #: Training set -> success and precision in the paper.
 PAPER = {"root": (0.398, 0.434), "hierarchy": (0.524, 0.677)}

@@ -18,9 +18,9 @@ from accuracy import accuracy_command, means, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark
 
+from catstream.base.settings import PRESETS, Settings
 from catstream.compression.tree import CoresetTree
 from catstream.messages.kinds import Summary
-from catstream.settings import PRESETS, Settings
 
 SHARES = (0.25, 0.375, 0.5, 0.625, 0.75)
 

@@ -17,10 +17,10 @@ import shared  # noqa: F401
 from sequences import named
 from table import Table, benchmark, command, plots
 
-from catstream.applications.evaluation.datasets import Sequence
-from catstream.box import Window
+from catstream.base.box import Window
 from catstream.compression.tree import CoresetTree
 from catstream.detection.teacher import affine_copies
+from catstream.evaluation.datasets import Sequence
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.paper.one_class import one_class

@@ -16,10 +16,10 @@ import shared  # noqa: F401
 from accuracy import accuracy_command, compared, videos
 from table import Table, benchmark
 
-from catstream.applications.evaluation.accuracy import rows_of
-from catstream.applications.evaluation.runs import EvaluationRun
-from catstream.applications.evaluation.scores import score
-from catstream.settings import PRESETS, Settings
+from catstream.base.settings import PRESETS, Settings
+from catstream.evaluation.accuracy import rows_of
+from catstream.evaluation.runs import EvaluationRun
+from catstream.evaluation.scores import score
 
 #: Our settings, and presets.
 TRACKERS = ("defaults", "cat25", "cat10")

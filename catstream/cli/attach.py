@@ -18,18 +18,19 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import ServiceError, SilenceError
+from catstream.base.files import check_file
+from catstream.base.names import UNNAMED, check_name, split_name
+from catstream.base.text import counted
 from catstream.cli.common import complain, screen, table
 from catstream.client.control import Control, control
 from catstream.client.registry import address_of, locate
 from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
-from catstream.errors import ServiceError, SilenceError
+from catstream.jobs.job import Job
+from catstream.jobs.state import learned
 from catstream.messages.kinds import Health, run_state
-from catstream.messages.names import UNNAMED, check_name, counted, split_name
-from catstream.messages.storage import check_file
-from catstream.run.job import Job
-from catstream.run.state import learned
-from catstream.services.options import (
+from catstream.processes.options import (
     FOLDER,
     PATH,
     NumberRange,

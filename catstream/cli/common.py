@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
 from rich.table import Column, Table
 
-from catstream.addresses import without_passwords
-from catstream.errors import ServiceError
+from catstream.base.addresses import without_passwords
+from catstream.base.errors import ServiceError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDTH = 140  # columns of a table that is not printed to a terminal
@@ -132,7 +132,7 @@ def stopped(result: str = "") -> NoReturn:
 
 
 def _checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
-    from catstream.messages.storage import check_file
+    from catstream.base.files import check_file
 
     if file is not None:
         if file.is_file() and file.suffix != ".json":
@@ -147,7 +147,7 @@ with_json_file = click.option(
 
 
 def write_json(file: Path | None, figures: dict[str, object]) -> None:
-    from catstream.messages.storage import writing
+    from catstream.base.files import writing
 
     if file is not None:
         with writing(file):

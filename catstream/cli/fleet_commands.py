@@ -18,15 +18,15 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from catstream.base.errors import FleetError
+from catstream.base.files import check_file, write_atomically, writing
+from catstream.base.names import UNNAMED, split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
-from catstream.errors import FleetError
-from catstream.messages import storage
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.messages.names import UNNAMED, split_name
-from catstream.services.options import PATH, with_json, with_keys, with_overwrite
+from catstream.processes.options import PATH, with_json, with_keys, with_overwrite
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet
@@ -253,12 +253,12 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
       catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
     """
     if output is not None:
-        storage.check_file(output, overwrite=overwrite)
+        check_file(output, overwrite=overwrite)
     with Console(stderr=True).status("merging"):
         merged = running.merge(*names, object=object_name)
     if output is not None:
-        with storage.writing(output):
-            storage.write_atomically(output, merged.model)
+        with writing(output):
+            write_atomically(output, merged.model)
     line = f"merged: {', '.join(merged.streams)}"
     if merged.skipped:
         line += f"; the frames of these are in them already, at least in part: {', '.join(merged.skipped)}"

@@ -11,6 +11,10 @@ import click
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from rich.table import Table
 
+from catstream.base.errors import CatstreamError
+from catstream.base.files import writing
+from catstream.base.settings import Settings
+from catstream.base.text import counted
 from catstream.cli.common import (
     INTERRUPTS,
     complain,
@@ -23,15 +27,11 @@ from catstream.cli.common import (
     with_json_file,
     write_json,
 )
-from catstream.errors import CatstreamError
-from catstream.messages.names import counted
-from catstream.messages.storage import writing
-from catstream.services.options import FOLDER, PATH, NumberRange, with_settings
-from catstream.settings import Settings
+from catstream.processes.options import FOLDER, PATH, NumberRange, with_settings
 
 if TYPE_CHECKING:
-    from catstream.applications.evaluation.accuracy import Row
-    from catstream.applications.loadtest.load_test import Limit, Parameter, Result
+    from catstream.evaluation.accuracy import Row
+    from catstream.loadtest.load_test import Limit, Parameter, Result
 
 _FAILED = 1  # exit code if a limit was not met or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
@@ -106,7 +106,7 @@ def evaluate(
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
-        from catstream.applications.evaluation import accuracy, datasets, onepass
+        from catstream.evaluation import accuracy, datasets, onepass
 
     if (starts is not None) + shifts + (jitter is not None) > 1:
         raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
@@ -155,7 +155,7 @@ def evaluate(
 
 
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
-    from catstream.applications.evaluation.accuracy import HEADINGS, cells
+    from catstream.evaluation.accuracy import HEADINGS, cells
 
     numbers = ("frames", *HEADINGS)
     made = table("sequence", "tracker", *numbers, right=numbers)
@@ -243,8 +243,8 @@ def loadtest(
       catstream loadtest --find-streams --rate 25 --size 1920x1080 --source h264
     """
     # Imported here so that --help and the other commands start faster.
-    from catstream.applications.loadtest.load_report import answer, milliseconds, to_json, write_report
-    from catstream.applications.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
+    from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
+    from catstream.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
 
     if find_limit and find_streams:
         raise click.UsageError("--find-limit and --find-streams each search for one number: give one of them")
@@ -290,7 +290,7 @@ def loadtest(
 
 
 def _print_run(result: Result, limits: list[Limit]) -> None:
-    from catstream.applications.loadtest.load_report import milliseconds, tables
+    from catstream.loadtest.load_report import milliseconds, tables
 
     click.echo(
         f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
@@ -345,8 +345,8 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
         return
     import numpy as np
 
-    from catstream.applications.evaluation.scores import score
     from catstream.cli.track import track
+    from catstream.evaluation.scores import score
     from catstream.sinks.track_log import read_frames
     from catstream.video.rendered import write
 

@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING
 
 import click
 
+from catstream.base.errors import CatstreamError, VideoError
+from catstream.base.files import check_file
+from catstream.base.settings import RunSettings
+from catstream.base.text import counted
+from catstream.base.threads import one_thread
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
-from catstream.errors import CatstreamError, VideoError
-from catstream.messages.names import counted
-from catstream.messages.storage import check_file
-from catstream.numerics.threads import one_thread
-from catstream.run.learned import Learned
-from catstream.run.learned import merge as merged
-from catstream.services.options import PATH, NumberRange, with_overwrite, with_skip_damaged
-from catstream.settings import RunSettings
+from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import merge as merged
+from catstream.processes.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 
 if TYPE_CHECKING:
-    from catstream.applications.finding.find import File, Search
-    from catstream.applications.finding.found import FileResult, SearchLog
+    from catstream.finding.find import File, Search
+    from catstream.finding.found import FileResult, SearchLog
 
 _SHOWN = 12  # intervals that are printed
 
@@ -94,8 +94,8 @@ def find(
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
-        from catstream.applications.finding.find import Search, find_files, load_models
-        from catstream.applications.finding.found import SearchLog, write_report, write_tables
+        from catstream.finding.find import Search, find_files, load_models
+        from catstream.finding.found import SearchLog, write_report, write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes, str(network or ""))
@@ -148,7 +148,7 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
 
 
 def _print(results: list[FileResult], report: Path) -> None:
-    from catstream.applications.page import clock
+    from catstream.reports.page import clock
 
     intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)
     numbers = ("from", "to", "sightings", "score")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
+from catstream.base.errors import require_extra
+from catstream.base.files import check_file
 from catstream.cli.common import INTERRUPTS
-from catstream.errors import require_extra
-from catstream.messages.storage import check_file
-from catstream.services.options import PATH, with_overwrite
+from catstream.processes.options import PATH, with_overwrite
 
 _Levels = tuple[float, float, float]
 
@@ -53,7 +53,7 @@ def prepare(
     """
     require_extra("network")
     with INTERRUPTS.leaving():
-        from catstream.applications import backbone as backbones
+        from catstream.features import backbone as backbones
 
     check_file(output, overwrite=overwrite)
     backbones.prepare(backbone, layer, images, output, rgb=rgb, mean=mean, std=std)
@@ -74,7 +74,7 @@ def check(file: Path) -> None:
 
 def _print(file: Path) -> None:
     with INTERRUPTS.leaving():
-        from catstream.applications import backbone as backbones
+        from catstream.features import backbone as backbones
 
     found = backbones.check(file)
     click.echo(f"{file}: {found.network.channels} channels, digest {found.network.digest}")

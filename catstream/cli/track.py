@@ -18,17 +18,18 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.table import Column
 from rich.text import Text
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import require_extra
+from catstream.base.names import UNNAMED
+from catstream.base.text import counted, listed
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.cli.write import check_used, with_sink_options, with_table
-from catstream.errors import require_extra
+from catstream.jobs.job import Results, SinkOptions
+from catstream.jobs.state import contains_run
 from catstream.messages.kinds import Track
-from catstream.messages.names import UNNAMED, counted, listed
 from catstream.pipeline import Pipeline
-from catstream.run.job import Results, SinkOptions
-from catstream.run.state import contains_run
-from catstream.services.options import (
+from catstream.processes.options import (
     FOLDER,
     PATH,
     with_files,

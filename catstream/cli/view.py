@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
+from catstream.base.files import state_home, write_atomically
 from catstream.cli.attach import with_endpoint, with_fleet_address
-from catstream.messages.storage import state_home, write_atomically
-from catstream.services.options import Decorator, combined, with_keys
+from catstream.processes.options import Decorator, combined, with_keys
 
 if TYPE_CHECKING:
     from catstream.web.app import Site

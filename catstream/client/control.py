@@ -17,12 +17,12 @@ from dataclasses import replace
 from time import monotonic
 from uuid import uuid4
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import CommandRejectedError, SilenceError
+from catstream.base.names import UNNAMED, check_name
 from catstream.client.registry import follow
-from catstream.errors import CommandRejectedError, SilenceError
+from catstream.jobs.saved_model import Learned
 from catstream.messages.kinds import Answer, Command, SavedModel, Verb
-from catstream.messages.names import UNNAMED, check_name
-from catstream.run.learned import Learned
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import Place, find, source_at

@@ -19,9 +19,9 @@ from uuid import uuid4
 
 import msgspec
 
-from catstream.errors import ServiceError, SilenceError
+from catstream.base.errors import ServiceError, SilenceError
+from catstream.base.names import UNNAMED
 from catstream.messages.kinds import End, Features, FleetStatus, Listing, Question, StreamStatus, Track
-from catstream.messages.names import UNNAMED
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint, Place, find, fleets, meeting_place, private_folder

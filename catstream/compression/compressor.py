@@ -11,14 +11,14 @@ from hashlib import blake2b
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.base.arrays import Bool, Float32
+from catstream.base.box import Box
+from catstream.base.errors import SettingsError
+from catstream.base.settings import Settings
 from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpack_trees
-from catstream.errors import SettingsError
 from catstream.messages.heads import APPEARANCE, TREES, Tree
 from catstream.messages.kinds import DetectorState, ObjectFeatures, Sample, TrainingRows
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
-from catstream.numerics.arrays import Bool, Float32
-from catstream.settings import Settings
 
 _RIGHT = 0.5  # label of a window that is neither too large nor too small, too wide or too high
 _GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between

@@ -11,12 +11,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from catstream.base.errors import ProtocolError, ServiceError, SettingsError
+from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
-from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.messages.kinds import DetectorState, Features, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix
-from catstream.settings import Settings
 
 _KIND = "forest 3"  # and the version of what a checkpoint holds
 _MOST_STATES = 256  # messages whose detector states are kept: a detector that is restarted continues after one of them

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg.blas import ssyrk
 from scipy.linalg.lapack import ssyevd
 
-from catstream.numerics.arrays import Float32
+from catstream.base.arrays import Float32
 
 _TINY = np.float32(1e-30)  # in place of an energy of 0, which nothing can be divided by
 

@@ -35,10 +35,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from catstream.base.settings import BeliefSettings
 from catstream.messages.kinds import DetectorState, Level, Motion
 from catstream.numerics import kalman
 from catstream.numerics.kalman import TRANSITION
-from catstream.settings import BeliefSettings
 
 _COASTING = TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # of a lost object: 0.8 + 0.8**2 + ... = the way of 4 frames in all
 _JUMP = 6.0  # Mahalanobis distance beyond which a measured centre resets the filter

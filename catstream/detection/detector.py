@@ -12,19 +12,19 @@ from zlib import crc32
 
 import numpy as np
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
+from catstream.base.errors import BoxError, ProtocolError
+from catstream.base.settings import Settings
 from catstream.detection import belief, extent, search, teacher
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
 from catstream.detection.teacher import Training
-from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import Cells
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import WINDOW, row_length
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
-from catstream.settings import Settings
 
 if TYPE_CHECKING:
     from catstream.paper.scm import SparseCollaborativeModel

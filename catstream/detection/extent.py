@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from catstream.box import Window
-from catstream.settings import ExtentSettings
+from catstream.base.box import Window
+from catstream.base.settings import ExtentSettings
 
 _SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect ratio that is tried to the next
 #: Change of the logarithm by a step.

@@ -11,17 +11,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import ObjectError
+from catstream.base.names import check_count, check_name, errors_about
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.base.threads import in_parallel
 from catstream.detection.detector import Detector, Result
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
-from catstream.errors import ObjectError
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks
-from catstream.messages.names import check_count, check_name, errors_about, listed
-from catstream.numerics.threads import in_parallel
-from catstream.settings import Settings
 
 _SAME_PLACE = 0.5  # above this overlap, two boxes are at the same place
 _SHARED = 0.2  # above this overlap of their first boxes, two objects may be at the same place

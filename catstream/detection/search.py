@@ -12,7 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from catstream.box import Window
+from catstream.base.box import Window
+from catstream.base.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 from catstream.detection import belief, extent
 from catstream.detection.likeness import Likeness
 from catstream.features.layout import EDGE, WINDOW
@@ -21,7 +22,6 @@ from catstream.features.score_map import ScoreMap, non_maximum_suppression, vert
 from catstream.features.vectors import VectorMap
 from catstream.messages.heads import ASPECT, EXTENT, SIZE
 from catstream.messages.kinds import DetectorState, Model
-from catstream.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 
 _MOST_CELLS = 16_384  # limit of a search of the whole frame in one frame, over all sizes: about 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best place may be a cell away from that at another size

@@ -15,11 +15,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
+from catstream.base.errors import BoxError
+from catstream.base.settings import Settings, TeachingSettings
 from catstream.detection import extent
 from catstream.detection.likeness import Likeness
 from catstream.detection.search import due
-from catstream.errors import BoxError
 from catstream.features.cells import window_rows
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, COLOURS, EDGE, MARGIN, WINDOW
@@ -29,7 +30,6 @@ from catstream.features.vectors import VectorMap
 from catstream.messages.heads import APPEARANCE, BETWEEN_RIDGE, EXTENT
 from catstream.messages.kinds import Model, TrainingRows
 from catstream.numerics import ridge
-from catstream.settings import Settings, TeachingSettings
 
 #: Training rows by group, as in `Features`; a group without rows is left out.
 Training = dict[str, TrainingRows]

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from catstream.base.arrays import writable
 from catstream.features import kernels
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, PLACES, WINDOW, row_length
 from catstream.features.pyramid import planes_of
 from catstream.features.vectors import VectorMap
-from catstream.numerics.arrays import writable
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _MEAN_COLOUR = slice(CHANNELS - 3, CHANNELS)

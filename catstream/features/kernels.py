@@ -18,8 +18,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy import float32
 
-from catstream.errors import ServiceError
-from catstream.numerics.arrays import Float32, Float64, Int64, UInt8, UInt16
+from catstream.base.arrays import Float32, Float64, Int64, UInt8, UInt16
+from catstream.base.errors import ServiceError
 
 try:
     import numba

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.errors import MissingExtraError, SettingsError, install_command
+from catstream.base.errors import MissingExtraError, SettingsError, install_command
+from catstream.base.threads import one_at_a_time
 from catstream.features.layout import CELL, STRIDE
-from catstream.numerics.threads import one_at_a_time
 
 #: Mean square length of a vector: so much does the HOG of a cell vary.
 ENERGY = 0.39

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from catstream.box import Window
+from catstream.base.box import Window
 from catstream.features.descriptor import Descriptor
 from catstream.features.kernels import sample
 from catstream.features.layout import CELL, MARGIN, WINDOW

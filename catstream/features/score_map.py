@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from catstream.box import Window
+from catstream.base.box import Window
 from catstream.features.cells import Cells
 from catstream.features.layout import EDGE, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid, Region

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from catstream.box import Window
+from catstream.base.box import Window
 from catstream.features import kernels
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, EDGE, PLACES, STRIDE, WINDOW

@@ -19,16 +19,23 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from hashlib import sha256
 
-from catstream.addresses import without_password
+from catstream.base.addresses import without_password
+from catstream.base.errors import (
+    CatstreamError,
+    CommandRejectedError,
+    FencedError,
+    FleetError,
+    ServiceError,
+    StoreError,
+)
 from catstream.client.control import control
-from catstream.errors import CatstreamError, CommandRejectedError, FencedError, FleetError, ServiceError, StoreError
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Generation, Store
+from catstream.jobs.saved_model import Learned
+from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
-from catstream.run.learned import Learned
-from catstream.run.state import files, restore
 from catstream.video.source import is_live
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import private_folder

@@ -1,8 +1,8 @@
 """The controller of a fleet: an actor of Ray that compares the streams that should run with the actors that do.
 
 What should run is in the store, and the streams are actors with names, so a controller that Ray starts again finds
-both, and touches no stream that runs. `catstream.fleet.life` decides what is done, this class only does it. Three kinds
-of threads share its state: one looks at the actors twice a second, one answers the registry, and calls of
+both, and touches no stream that runs. `catstream.fleet.lifecycle` decides what is done, this class only does it. Three
+kinds of threads share its state: one looks at the actors twice a second, one answers the registry, and calls of
 `catstream.fleet.fleet` come in threads of Ray. Only the last ones use the store, so a store that hangs delays nothing
 but the change that waits for it. What is answered as done is stored.
 """
@@ -18,12 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from catstream.addresses import without_password
+from catstream.base.addresses import without_password
+from catstream.base.errors import CatstreamError
 from catstream.client.registry import RegistryServer
-from catstream.errors import CatstreamError
-from catstream.fleet import life
+from catstream.fleet import lifecycle as life
 from catstream.fleet.actor import Stream, given_model
-from catstream.fleet.life import Actor, Node
+from catstream.fleet.lifecycle import Actor, Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus

@@ -35,17 +35,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from catstream.base.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
+from catstream.base.files import is_locked, lock, state_home, write_atomically
+from catstream.base.names import UNNAMED, check_name
 from catstream.client.registry import REGISTRY_PORT
-from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
 from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors, nodes
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
+from catstream.jobs import state
+from catstream.jobs.job import Job
+from catstream.jobs.saved_model import Learned, merge
 from catstream.messages.kinds import FleetStatus
-from catstream.messages.names import UNNAMED, check_name
-from catstream.messages.storage import is_locked, lock, state_home, write_atomically
-from catstream.run import state
-from catstream.run.job import Job
-from catstream.run.learned import Learned, merge
 from catstream.wire.endpoint import private_folder
 
 ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died

@@ -21,11 +21,12 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from catstream.box import Box
-from catstream.errors import CatstreamError, FleetError
-from catstream.messages.names import UNNAMED, boxes_by_name, check_name, listed
-from catstream.run.job import Job, changed_setting
-from catstream.settings import Settings, flat, read_toml
+from catstream.base.box import Box
+from catstream.base.errors import CatstreamError, FleetError
+from catstream.base.names import UNNAMED, boxes_by_name, check_name
+from catstream.base.settings import Settings, flat, read_toml
+from catstream.base.text import listed
+from catstream.jobs.job import Job, changed_setting
 from catstream.video.source import is_live
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")

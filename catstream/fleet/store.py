@@ -48,10 +48,10 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from catstream.errors import FencedError, FleetError, ProtocolError, StoreError, require_extra
+from catstream.base.errors import FencedError, FleetError, ProtocolError, StoreError, require_extra
+from catstream.base.names import UNNAMED, check_name
 from catstream.fleet.spec import check_fleet_name
 from catstream.messages import storage
-from catstream.messages.names import UNNAMED, check_name
 
 STORE_SECONDS = 10.0  # limit of a request to a server
 _CONNECT_SECONDS = 3.0  # limit to connect to it

@@ -7,7 +7,7 @@ The annotations are the schema (see `catstream.messages.schema`), and the docstr
 the files of `catstream.messages.storage`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
 `d` is the length of a feature row (`catstream.features.layout.row_length`), `n` the coreset size, frames count from 0.
-The objects of a stream have names (`catstream.messages.names`); an object that is alone may have the name "".
+The objects of a stream have names (`catstream.base.names`); an object that is alone may have the name "".
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from msgspec import Meta
 
-from catstream.box import Box, Window
-from catstream.errors import ProtocolError
+from catstream.base.box import Box, Window
+from catstream.base.errors import ProtocolError
 from catstream.messages.heads import GROUPS, HEADS, TREES
 from catstream.messages.schema import (
     LARGEST_INTEGER,

@@ -19,9 +19,9 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 from msgspec import Meta
 
-from catstream.errors import ProtocolError
-from catstream.messages.names import PATTERN
-from catstream.numerics.arrays import is_finite
+from catstream.base.arrays import is_finite
+from catstream.base.errors import ProtocolError
+from catstream.base.names import PATTERN
 
 #: The length that each letter of a shape stands for, in one message.
 _Lengths = dict[str, int]

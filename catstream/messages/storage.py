@@ -1,23 +1,16 @@
-"""Atomic file writes, file locks, and files of arrays and metadata in the safetensors format with a checksum.
+"""Files of arrays and metadata in the safetensors format, with a checksum.
 
 A message is kept as arrays and metadata, too: `pack` and `unpack`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import errno
-import fcntl
-import glob
 import json
 import os
-import secrets
-import shutil
 import tempfile
-import time
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +19,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from catstream.errors import CatstreamError, ProtocolError, ServiceError
+from catstream.base.errors import ProtocolError
+from catstream.base.files import remove_parts, sync
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]
@@ -37,143 +31,6 @@ Message = TypeVar("Message")
 
 _KEY = "catstream"  # the only metadata key: with several, their order, and so the bytes of the file, would vary
 _VERSION = 1  # version of the metadata's format
-ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
-
-
-def state_home() -> Path:
-    """The folder of what is kept for this user; RuntimeError if the user has none."""
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream"
-
-
-def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:
-    """Replace a file atomically; the new content then survives a power cut. The umask reduces the permissions `mode`.
-
-    OSError if the file cannot be written; the old one stays unchanged.
-    """
-    path = Path(path)
-    _remove_parts(path)
-    with _written_beside(path, data, mode) as part:
-        part.replace(path)
-
-
-def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
-    """Create a file for its owner only: it exists with its whole content, or not at all, also after a power cut.
-
-    FileExistsError if it exists, also if two processes create it at the same moment; OSError if it cannot be written.
-    """
-    path = Path(path)
-    with _written_beside(path, data, 0o600) as part:
-        os.link(part, path)  # unlike a rename, this fails if the file exists
-
-
-@contextlib.contextmanager
-def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
-    """A new file in the folder of `path` whose content is on disk; what the block does with it is then on disk, too.
-
-    Its name is its own, so that several may write `path` at the same time. It is removed if the block leaves it there.
-    """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    try:
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())  # the content must be on disk before the new name
-        yield part
-        _sync(path.parent)
-    finally:
-        with contextlib.suppress(OSError):  # the disk may have become read-only; a later write removes the file
-            part.unlink(missing_ok=True)
-
-
-def _remove_parts(path: Path) -> None:
-    """Remove the unfinished files for a file that processes left when they were killed while writing it."""
-    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        with contextlib.suppress(OSError):
-            if part.stat().st_mtime < time.time() - ABANDONED_SECONDS:
-                shutil.rmtree(part) if part.is_dir() else part.unlink()
-
-
-@contextlib.contextmanager
-def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceError) -> Iterator[None]:
-    """A block that writes a file, or into a folder: an OSError in it becomes an error of this kind, for a person."""
-    try:
-        yield
-    except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
-        raise
-    except OSError as error:
-        raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
-
-
-def check_file(
-    path: Path, *, overwrite: bool = True, made: Path | None = None, kind: type[CatstreamError] = ServiceError
-) -> None:
-    """Raise an error of this kind if a file exists and may not be replaced, or cannot be written.
-
-    The folder `made` is made before the file, if it does not exist.
-    """
-    if path.exists() and not overwrite:
-        raise kind(f"{path} exists already: replace it with --overwrite, or give another name")
-    folder = path.parent.absolute()
-    if made is not None and folder == made.absolute():
-        folder = next(each for each in (folder, *folder.parents) if each.exists())
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            is_writable = not path.is_dir()
-    except OSError:
-        is_writable = False
-    if not is_writable:
-        raise kind(f"cannot write {path}: give a file in a folder that exists and that you may write to")
-
-
-@contextlib.contextmanager
-def descriptor(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
-    """A descriptor to lock a file or folder with; OSError if it cannot be opened.
-
-    It is closed in a copy of this process that is forked, which would hold the lock for the rest of its own life.
-    """
-    handle, owner = os.open(path, flags, 0o600), os.getpid()
-    _descriptors.add(handle)
-    try:
-        yield handle
-    finally:
-        if owner == os.getpid():
-            _descriptors.remove(handle)
-            _flock(handle, fcntl.LOCK_UN)  # a copy that is just beginning may have it yet
-            os.close(handle)
-
-
-_descriptors: set[int] = set()
-
-
-def _close_descriptors() -> None:
-    for handle in _descriptors:
-        os.close(handle)
-    _descriptors.clear()
-
-
-os.register_at_fork(after_in_child=_close_descriptors)
-
-
-def lock(handle: int, seconds: float = 0.0) -> bool:
-    """Lock an open file or folder until it is closed or this process ends; False if another keeps it for `seconds`."""
-    deadline = time.monotonic() + seconds
-    while not (locked := _flock(handle, fcntl.LOCK_EX)) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return locked
-
-
-def is_locked(handle: int) -> bool:
-    """Whether another process has locked an open file; asked with a shared lock, so that two may ask at once."""
-    return not _flock(handle, fcntl.LOCK_SH)
-
-
-def _flock(handle: int, kind: int) -> bool:
-    """Lock an open file or folder without waiting; returns False if another process has locked it."""
-    try:
-        fcntl.flock(handle, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> None:
@@ -182,7 +39,7 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> N
     OSError if the file cannot be written; the old one stays unchanged.
     """
     path = Path(path)
-    _remove_parts(path)
+    remove_parts(path)
     # In a folder of its own, because safetensors makes a file beside the one that it writes.
     with tempfile.TemporaryDirectory(".part", f".{path.name}.", path.parent, ignore_cleanup_errors=True) as folder:
         part, (contiguous, header) = Path(folder, path.name), _content(arrays, metadata)
@@ -190,9 +47,9 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> N
             safetensors.numpy.save_file(contiguous, part, header)
         except safetensors.SafetensorError as error:
             raise OSError(errno.EIO, str(error)) from None
-        _sync(part)  # the content must be on disk before the new name
+        sync(part)  # the content must be on disk before the new name
         part.replace(path)
-    _sync(path.parent)
+    sync(path.parent)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:
@@ -244,15 +101,6 @@ def _checked(data: bytes, name: str) -> tuple[Arrays, Metadata]:
 def with_prefix(arrays: Arrays, prefix: str) -> Arrays:
     """The arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-
-
-def _sync(path: Path) -> None:
-    """Write the content of a file, or the entries of a folder, to disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _checksum(arrays: Arrays, metadata: Metadata) -> int:

@@ -22,10 +22,10 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import Lasso
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.threads import FILTERS
 from catstream.features.kernels import sparse_codes
 from catstream.features.pyramid import Pyramid
-from catstream.numerics.threads import FILTERS
 
 _SIDE = 32  # of a template, in pixels
 _PENALTY = 0.01  # lambda of all sparse codes

@@ -13,7 +13,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from catstream.box import Box
+from catstream.base.box import Box
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, TrackedFrame
 

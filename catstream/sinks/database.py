@@ -9,8 +9,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, Origin, TrackedFrame
 

@@ -14,11 +14,11 @@ from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
-from catstream.addresses import without_password
-from catstream.errors import VideoError, require_extra
+from catstream.base.addresses import without_password
+from catstream.base.errors import VideoError, require_extra
+from catstream.base.files import check_file, writing
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.messages.storage import check_file, writing
-from catstream.run.job import SinkOptions
 from catstream.video.frames import RATE
 from catstream.video.source import ALL_FRAMES
 

@@ -1,6 +1,6 @@
 """Events: what happens to objects, from their tracks.
 
->>> from catstream.box import Box
+>>> from catstream.base.box import Box
 >>> events = Events(SinkOptions(zones={"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, lost_seconds=1))
 >>> for frame, box in enumerate([Box(0, 40, 20, 20), Box(60, 40, 20, 20), None, None, Box(0, 40, 20, 20)]):
 ...     state = "absent" if box is None else "present"
@@ -22,8 +22,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.run.job import SinkOptions
 
 #: Kind of an event -> when there is one.
 KINDS = {

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.numerics.arrays import Float64
+from catstream.base.arrays import Float64
 from catstream.sinks.database import COLUMNS, rows
 from catstream.sinks.destinations import About, TrackedFrame
 

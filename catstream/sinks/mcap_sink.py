@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from catstream.base.errors import SilenceError, VideoError
+from catstream.base.files import writing
 from catstream.client.subscription import Subscription
-from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Health, Model, Preview
-from catstream.messages.storage import writing
 from catstream.sinks.destinations import Origin, TrackedFrame
 
 _DATA = {"data": {"type": "string", "contentEncoding": "base64"}}

@@ -23,9 +23,9 @@ from urllib.parse import SplitResult, unquote
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
-from catstream.errors import VideoError
-from catstream.messages.names import counted
-from catstream.run.job import SinkOptions
+from catstream.base.errors import VideoError
+from catstream.base.text import counted
+from catstream.jobs.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame, shown
 from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split
 

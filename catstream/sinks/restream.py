@@ -22,11 +22,11 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from catstream.base.errors import CatstreamError, SilenceError, VideoError
+from catstream.base.text import counted
 from catstream.client.subscription import Subscription
-from catstream.errors import CatstreamError, SilenceError, VideoError
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.messages.names import counted
-from catstream.run.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame, shown
 from catstream.sinks.reports import Warnings, split
 from catstream.sinks.video_sink import DrawnPictures

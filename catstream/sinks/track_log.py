@@ -19,13 +19,13 @@ from math import isnan, nan
 from pathlib import Path
 from typing import IO, get_args
 
-from catstream.addresses import without_password
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.addresses import without_password
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.base.files import writing
+from catstream.base.names import UNNAMED, check_name
+from catstream.jobs.job import Results
 from catstream.messages.kinds import State, Track
-from catstream.messages.names import UNNAMED, check_name
-from catstream.messages.storage import writing
-from catstream.run.job import Results
 from catstream.sinks.database import read_database
 from catstream.sinks.destinations import Origin, TrackedFrame, check_result, check_sink, is_file, open_sink, sink_of
 from catstream.video.source import is_live

@@ -6,11 +6,11 @@ from contextlib import suppress
 
 import numpy as np
 
+from catstream.base.errors import SilenceError, VideoError
 from catstream.client.subscription import subscribe
-from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, Sink, TrackedFrame
-from catstream.video.annotate import Colours, draw, drawn_size, preview_image
+from catstream.video.drawing import Colours, draw, drawn_size, preview_image
 from catstream.video.frames import RATE
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter

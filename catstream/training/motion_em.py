@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from catstream.base.arrays import Bool, Float64
 from catstream.messages.kinds import Motion
-from catstream.numerics.arrays import Bool, Float64
 from catstream.numerics.kalman import OBSERVED, TRANSITION, constant_velocity
 
 FEWEST = 8  #: centres that 13 free parameters can be estimated from

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Self
 import cv2
 import numpy as np
 
-from catstream.errors import FrameError, VideoError
-from catstream.numerics.arrays import is_finite
+from catstream.base.arrays import is_finite
+from catstream.base.errors import FrameError, VideoError
 
 if TYPE_CHECKING:
     from av import FFmpegError, VideoFrame

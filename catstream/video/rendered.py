@@ -17,8 +17,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from catstream.box import Box
-from catstream.messages.names import UNNAMED
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED
 from catstream.video.writer import VideoWriter
 
 #: Number of different frames, and frames per second.

@@ -30,9 +30,9 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from catstream.box import Box
-from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
-from catstream.video.annotate import draw_preview
+from catstream.base.box import Box
+from catstream.base.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
+from catstream.video.drawing import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
 from catstream.wire.codec import decode_json

@@ -21,7 +21,7 @@ from catstream.messages.kinds import (
     Track,
     run_state,
 )
-from catstream.video.annotate import Colours
+from catstream.video.drawing import Colours
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")

@@ -19,9 +19,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from catstream.addresses import without_password
-from catstream.errors import ServiceError
-from catstream.messages.storage import descriptor, is_locked, lock, writing
+from catstream.base.addresses import without_password
+from catstream.base.errors import ServiceError
+from catstream.base.files import descriptor, is_locked, lock, writing
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 

@@ -6,9 +6,9 @@ import pytest
 import sequences
 import table
 
-from catstream.applications.evaluation.scores import score
-from catstream.box import Box
-from catstream.settings import Settings
+from catstream.base.box import Box
+from catstream.base.settings import Settings
+from catstream.evaluation.scores import score
 
 pytestmark = pytest.mark.system
 

@@ -14,7 +14,7 @@ from catstream.client.control import control
 from catstream.features.layout import row_length
 from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline
-from catstream.services.start_server import NAMES
+from catstream.processes.start_server import NAMES
 from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.newest import Publisher
 

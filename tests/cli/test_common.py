@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from catstream.box import Box
+from catstream.base.box import Box
 from catstream.cli.common import Interrupts
 from catstream.cli.track import RunProgress
 from catstream.messages.kinds import Track

@@ -14,7 +14,7 @@ CATSTREAM = Path(sys.executable).with_name("catstream")
 TRAPS = [
     *("av", "click", "cv2", "msgspec", "numba", "numpy", "psutil", "rich", "safetensors", "scipy", "zmq"),
     *("asyncio", "json", "logging", "multiprocessing", "random", "select", "signal", "socket", "subprocess", "typing"),
-    *("catstream/__init__", "services/__init__", "sitecustomize", "usercustomize"),
+    *("catstream/__init__", "processes/__init__", "sitecustomize", "usercustomize"),
 ]
 
 EVERY_COMMAND = """

@@ -9,9 +9,9 @@ from pathlib import Path
 import click
 import pytest
 
+from catstream.base.settings import Settings, describe
 from catstream.cli import COMMANDS, load_command
-from catstream.services.start_server import NAMES
-from catstream.settings import Settings, describe
+from catstream.processes.start_server import NAMES
 
 
 @pytest.fixture
@@ -59,10 +59,10 @@ def test_nan_is_within_no_bounds(fail, name, option):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_process_has_a_help_text(name):
-    command = [sys.executable, "-P", "-m", "catstream.services", name, "--help"]
+    command = [sys.executable, "-P", "-m", "catstream.processes", name, "--help"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (run.returncode, run.stderr) == (0, "")
-    assert run.stdout.startswith(f"Usage: python -P -m catstream.services {name}")
+    assert run.stdout.startswith(f"Usage: python -P -m catstream.processes {name}")
 
 
 #: Commands that take long, and how one sees that they are at it.

@@ -6,7 +6,7 @@ import re
 import psutil
 import pytest
 
-from catstream.applications.loadtest import load_report, load_test
+from catstream.loadtest import load_report, load_test
 
 
 def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):

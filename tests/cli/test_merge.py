@@ -2,8 +2,8 @@
 
 import pytest
 
-from catstream.box import Box
-from catstream.run.learned import Learned
+from catstream.base.box import Box
+from catstream.jobs.saved_model import Learned
 from tests.learning import learned_from
 
 #: A part of the background of the demo video.
@@ -62,7 +62,7 @@ def test_models_of_different_objects_are_merged_only_with_force(fail, succeed, m
 
 
 def test_a_doubt_is_one_line_and_the_models_are_merged(succeed, models, tmp_path, monkeypatch):
-    monkeypatch.setattr("catstream.run.learned._UNLIKE", 0.0)
+    monkeypatch.setattr("catstream.jobs.saved_model._UNLIKE", 0.0)
     door, _, lake = models
     output, errors = succeed("merge", door, lake, "-o", tmp_path / "both")
     assert errors.count("\n") == 1

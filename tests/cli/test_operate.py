@@ -7,8 +7,8 @@ from threading import Event
 
 import pytest
 
+from catstream.jobs.saved_model import Learned
 from catstream.pipeline import Pipeline
-from catstream.run.learned import Learned
 from catstream.video.source import open_source
 
 NEED_A_PIPELINE = [["set-box", "1,2,3,4"], ["search", "one"], ["save", "one"], ["watch", "tracks"]]

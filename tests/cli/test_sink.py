@@ -11,8 +11,8 @@ from dataclasses import replace
 import pytest
 from mcap.reader import make_reader
 
+from catstream.base.text import counted
 from catstream.messages.kinds import Health, Track
-from catstream.messages.names import counted
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS

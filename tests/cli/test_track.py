@@ -14,10 +14,10 @@ import numpy as np
 import psutil
 import pytest
 
+from catstream.base.errors import VideoError
 from catstream.cli.track import RunProgress
-from catstream.errors import VideoError
+from catstream.jobs.saved_model import Learned
 from catstream.pipeline import Pipeline
-from catstream.run.learned import Learned
 from catstream.sinks.track_log import LineSink, read_frames
 from catstream.video.source import open_source
 

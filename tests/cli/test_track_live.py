@@ -11,7 +11,7 @@ import cv2
 import psutil
 import pytest
 
-from catstream.box import Box
+from catstream.base.box import Box
 from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
 from catstream.video.rendered import render

@@ -10,13 +10,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.jobs.job import Job
+from catstream.jobs.saved_model import Learned
+from catstream.jobs.state import TREES
 from catstream.pipeline import Pipeline
-from catstream.run.job import Job
-from catstream.run.learned import Learned
-from catstream.run.state import TREES
-from catstream.settings import Settings
 from catstream.video.source import open_source
 
 UNIT = Path(__file__).parents[2] / "deploy" / "catstream@.service"

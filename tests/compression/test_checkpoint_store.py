@@ -6,11 +6,11 @@ import os
 import numpy as np
 import pytest
 
+from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.messages.heads import GROUPS
 from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
-from catstream.settings import Settings
 
 SETTINGS = Settings(coreset={"size": 8})
 

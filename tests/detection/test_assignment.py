@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
+from catstream.base.settings import SearchSettings
 from catstream.detection.objects import assigned
 from catstream.detection.search import Detection, local
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model
-from catstream.settings import SearchSettings
 
 CONTEXT = 1.25
 

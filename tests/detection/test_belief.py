@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Window
+from catstream.base.box import Window
+from catstream.base.settings import Settings
 from catstream.detection import belief
 from catstream.detection.belief import at_rest, measured, predicted
 from catstream.messages.kinds import DetectorState, Motion
-from catstream.settings import Settings
 
 SETTINGS = Settings()
 BELIEF, TABLE = SETTINGS.belief, belief.policies(SETTINGS.search.whole_interval)

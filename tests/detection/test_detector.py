@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import BoxError, ProtocolError
+from catstream.base.settings import Settings
 from catstream.detection.detector import Detector
 from catstream.detection.likeness import Likeness
 from catstream.detection.objects import Detectors
-from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import APPEARANCE, GROUPS
 from catstream.messages.kinds import Model, Motion
-from catstream.settings import Settings
 
 START = Box(60, 50, 48, 40)
 

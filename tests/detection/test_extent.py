@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
+from catstream.base.settings import Settings
 from catstream.detection import extent, teacher
 from catstream.features.cells import Cells
 from catstream.features.layout import WINDOW as WINDOW_CELLS
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import ASPECT, EXTENT, HEADS, SIZE
 from catstream.numerics import ridge
-from catstream.settings import Settings
 from catstream.tracker import Tracker
 
 WINDOW = Window(60, 50, 48, 40)

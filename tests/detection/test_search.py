@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Window
+from catstream.base.box import Window
 from catstream.detection import search
 from catstream.detection.search import due
 from catstream.features.cells import Cells

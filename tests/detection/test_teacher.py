@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from catstream.box import Window
+from catstream.base.box import Window
+from catstream.base.settings import Settings
 from catstream.detection import teacher
 from catstream.detection.teacher import affine_copies
 from catstream.features.cells import Cells
@@ -12,7 +13,6 @@ from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import Model
-from catstream.settings import Settings
 
 OBJECT = Window(120, 80, 64, 64)
 SETTINGS = Settings(teaching={"near_misses": 200})

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from onnx import helper
 
-from catstream.box import Window
-from catstream.errors import MissingExtraError, SettingsError
+from catstream.base.box import Window
+from catstream.base.errors import MissingExtraError, SettingsError
+from catstream.base.settings import Settings
 from catstream.features.cells import Cells
 from catstream.features.descriptor import descriptor_of
 from catstream.features.layout import EDGE, PLACES, WINDOW, row_length
@@ -15,7 +16,6 @@ from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.features.vectors import VectorMap
 from catstream.messages.kinds import Model
-from catstream.settings import Settings
 from tests.networks import save
 
 OBJECT = Window(100.0, 60.0, 64.0, 64.0)
@@ -77,7 +77,7 @@ def test_without_onnxruntime_opencv_computes_the_same_or_the_error_names_the_ext
 
 
 def test_vectors_are_centred_and_vary_as_much_as_four_cells(descriptor, walk):
-    from catstream.applications.backbone import _crops
+    from catstream.features.backbone import _crops
 
     vectors = np.concatenate([descriptor(each)[2:-2, 2:-2].reshape(-1, 32) for each in _crops(walk)])
     assert vectors.shape[1] == descriptor.channels == 32

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Window
+from catstream.base.box import Window
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region, planes_of
 

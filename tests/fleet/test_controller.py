@@ -9,12 +9,12 @@ from importlib.machinery import ModuleSpec
 
 import pytest
 
+from catstream.base.errors import FleetError, SilenceError, StoreError
 from catstream.client.registry import Registry
-from catstream.errors import FleetError, SilenceError, StoreError
 from catstream.fleet import controller as module
-from catstream.fleet import life
+from catstream.fleet import lifecycle as life
 from catstream.fleet.controller import Controller
-from catstream.fleet.life import Node
+from catstream.fleet.lifecycle import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
 from catstream.fleet.store import States, Store
 from catstream.messages.kinds import StreamStatus

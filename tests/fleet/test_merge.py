@@ -5,20 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from catstream.base.errors import FleetError
+from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.compression.reduce import energy
-from catstream.errors import FleetError
 from catstream.features.layout import row_length
 from catstream.fleet.fleet import disjoint, merge_streams
 from catstream.fleet.store import Store
+from catstream.jobs.job import Job
+from catstream.jobs.saved_model import Learned
+from catstream.jobs.state import files
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features
-from catstream.run.job import Job
-from catstream.run.learned import Learned
-from catstream.run.state import files
-from catstream.settings import Settings
 from tests.learning import features, rows_of
 
 SETTINGS = Settings(coreset={"size": 4})

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from catstream.errors import ProtocolError
+from catstream.base.errors import ProtocolError
+from catstream.base.files import is_locked, lock, write_atomically
 from catstream.messages import storage
 
 ARRAYS = {"rows": np.arange(-30, 30, dtype=np.float32).reshape(10, 6), "sum": np.linspace(0, 1, 6)}
@@ -22,7 +23,7 @@ WHOLE = storage.encode(ARRAYS, METADATA)
 def test_a_file_without_a_secret_has_the_permissions_of_the_umask(tmp_path):
     before = os.umask(0o027)
     try:
-        storage.write_atomically(tmp_path / "tree", WHOLE)
+        write_atomically(tmp_path / "tree", WHOLE)
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "tree").stat().st_mode) == 0o640
@@ -83,22 +84,22 @@ def test_two_processes_that_ask_whether_a_file_is_locked_do_not_see_each_other(t
     path = tmp_path / "note"
     path.touch()
     with path.open() as one, path.open() as other, path.open() as owner:
-        assert not storage.is_locked(one.fileno())
-        assert not storage.is_locked(other.fileno()), "the first one still holds its shared lock"
+        assert not is_locked(one.fileno())
+        assert not is_locked(other.fileno()), "the first one still holds its shared lock"
         for asking in (one, other):
             fcntl.flock(asking, fcntl.LOCK_UN)
-        assert storage.lock(owner.fileno())
-        assert storage.is_locked(one.fileno())
+        assert lock(owner.fileno())
+        assert is_locked(one.fileno())
 
 
 def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
     """Each reader sees what one of them wrote, whole."""
     contents = [bytes([value]) * 200_000 for value in (1, 2)]
-    storage.write_atomically(tmp_path / "file", contents[0])
+    write_atomically(tmp_path / "file", contents[0])
 
     def write(content):
         for _ in range(60):
-            storage.write_atomically(tmp_path / "file", content)
+            write_atomically(tmp_path / "file", content)
 
     with ThreadPoolExecutor(2) as pool:
         writers = [pool.submit(write, content) for content in contents]

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.decomposition import sparse_encode
 from sklearn.svm import OneClassSVM
 
-from catstream.box import Box
-from catstream.errors import ProtocolError
+from catstream.base.box import Box
+from catstream.base.errors import ProtocolError
 from catstream.paper import scm
 from catstream.paper.one_class import one_class
 from catstream.paper.scm import SparseCollaborativeModel

@@ -61,11 +61,11 @@ def alive():
 
 @pytest.fixture
 def service():
-    """Starts `python -P -m catstream.services ...`; what still runs after the test is killed."""
+    """Starts `python -P -m catstream.processes ...`; what still runs after the test is killed."""
     with ExitStack() as stack:
 
         def start(*arguments):
-            words = [sys.executable, "-P", "-m", "catstream.services", *map(str, arguments)]
+            words = [sys.executable, "-P", "-m", "catstream.processes", *map(str, arguments)]
             process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
             stack.callback(process.communicate)
             stack.callback(process.kill)

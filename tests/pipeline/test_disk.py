@@ -5,11 +5,11 @@ import subprocess
 
 import pytest
 
+from catstream.base.settings import Settings
 from catstream.client.subscription import subscribe
 from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.jobs.state import TREES
 from catstream.pipeline import Pipeline
-from catstream.run.state import TREES
-from catstream.settings import Settings
 
 #: A small window is soon full, a short pause soon over: the disk is noticed within this video.
 SETTINGS = Settings(run={"unstored_frames": 16, "checkpoint_seconds": 0.2})

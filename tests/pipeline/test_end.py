@@ -8,12 +8,12 @@ from itertools import islice
 import cv2
 import pytest
 
+from catstream.base.errors import VideoError
+from catstream.base.settings import Settings
 from catstream.client.subscription import subscribe
-from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
-from catstream.services.start_server import NAMES
-from catstream.services.supervisor import Child
-from catstream.settings import Settings
+from catstream.processes.start_server import NAMES
+from catstream.processes.supervisor import Child
 from catstream.video.source import open_source
 
 

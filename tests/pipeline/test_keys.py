@@ -4,11 +4,11 @@ from contextlib import suppress
 
 import pytest
 
+from catstream.base.errors import ServiceError, SilenceError
+from catstream.base.settings import Settings
 from catstream.client.subscription import subscribe
-from catstream.errors import ServiceError, SilenceError
 from catstream.pipeline import Pipeline
-from catstream.services.start_server import NAMES
-from catstream.settings import Settings
+from catstream.processes.start_server import NAMES
 
 
 def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video, folder, keys, tcp):

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from catstream.base.errors import CommandRejectedError
+from catstream.base.settings import Settings
 from catstream.client.control import control
-from catstream.errors import CommandRejectedError
+from catstream.jobs.saved_model import Learned
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
-from catstream.run.learned import Learned
-from catstream.settings import Settings
 from catstream.video.source import open_source
 from catstream.wire.keys import create
 

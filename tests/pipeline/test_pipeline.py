@@ -9,10 +9,10 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.errors import BoxError, ServiceError, VideoError
+from catstream.base.errors import BoxError, ServiceError, VideoError
+from catstream.base.settings import Settings
 from catstream.pipeline import Pipeline
-from catstream.services.start_server import NAMES
-from catstream.settings import Settings
+from catstream.processes.start_server import NAMES
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber

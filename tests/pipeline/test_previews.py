@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import SilenceError
 from catstream.client.subscription import subscribe
-from catstream.errors import SilenceError
-from catstream.services.outputs import Previews
+from catstream.processes.outputs import Previews
 from catstream.video.frames import Frame
 from catstream.video.rendered import render
 
@@ -44,7 +44,7 @@ def test_a_preview_shows_the_frame_small_and_contains_its_size(previews, looks):
 
 
 def test_none_is_made_while_nobody_looks(previews, monkeypatch):
-    monkeypatch.setattr("catstream.services.outputs.jpeg", None)  # to call it is an error
+    monkeypatch.setattr("catstream.processes.outputs.jpeg", None)  # to call it is an error
     for frame in range(5):
         previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
 
@@ -84,7 +84,7 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
 
 
 def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_looks(endpoint, until, monkeypatch):
-    monkeypatch.setattr("catstream.services.outputs._PREVIEW_SECONDS", 0.0)
+    monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
     with Previews(endpoint, keeps=True) as previews:
         with subscribe(str(endpoint), "previews", timeout=60):
             until(lambda: previews.has_subscribers, previews.turn)
@@ -92,7 +92,7 @@ def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_look
                 previews.show(3, Frame(number, number / 10, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(3.0)] == list(range(30, 80))
             assert [previews.since(time) for time in (2.8, 3.05, 9.0)] == [[]] * 3
-            monkeypatch.setattr("catstream.services.outputs._KEPT_BYTES", 3 * 48 * 64 * 3)
+            monkeypatch.setattr("catstream.processes.outputs._KEPT_BYTES", 3 * 48 * 64 * 3)
             previews.show(3, Frame(80, 8.0, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(7.8)] == [78, 79, 80]
         until(lambda: not previews.since(7.8), previews.turn)

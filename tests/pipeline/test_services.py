@@ -13,17 +13,17 @@ import cv2
 import psutil
 import pytest
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.base.errors import CatstreamError, ServiceError
+from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.errors import CatstreamError, ServiceError
+from catstream.jobs.job import Job
+from catstream.jobs.state import TREES
 from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
-from catstream.run.job import Job
-from catstream.run.state import TREES
-from catstream.services.process import RUNNING_SECONDS
-from catstream.services.start_server import NAMES
-from catstream.services.supervisor import Child, Supervisor
-from catstream.settings import Settings
+from catstream.processes.process import RUNNING_SECONDS
+from catstream.processes.start_server import NAMES
+from catstream.processes.supervisor import Child, Supervisor
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS
 from catstream.wire.endpoint import Endpoint

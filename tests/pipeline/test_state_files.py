@@ -5,11 +5,11 @@ from itertools import islice
 
 import pytest
 
-from catstream.errors import ServiceError
+from catstream.base.errors import ServiceError
+from catstream.base.settings import Settings
+from catstream.jobs.state import files, last_seq, restore
 from catstream.pipeline import Pipeline
-from catstream.run.state import files, last_seq, restore
-from catstream.services.decisions import DESIRED, DesiredState
-from catstream.settings import Settings
+from catstream.processes.decisions import DESIRED, DesiredState
 from tests.pipeline.conftest import share_found
 
 

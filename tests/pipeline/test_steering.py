@@ -10,14 +10,21 @@ import cv2
 import pytest
 import zmq
 
+from catstream.base.errors import (
+    CommandRejectedError,
+    ObjectError,
+    ProtocolError,
+    ServiceError,
+    SettingsError,
+    SilenceError,
+)
+from catstream.base.settings import Settings
 from catstream.client.control import control
 from catstream.client.subscription import subscribe
-from catstream.errors import CommandRejectedError, ObjectError, ProtocolError, ServiceError, SettingsError, SilenceError
+from catstream.jobs.saved_model import Learned
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
-from catstream.run.learned import Learned
-from catstream.services.decisions import DesiredState
-from catstream.settings import Settings
+from catstream.processes.decisions import DesiredState
 from catstream.video.source import open_source
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint

@@ -5,13 +5,13 @@ from contextlib import ExitStack, closing
 
 import numpy as np
 
+from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
+from catstream.jobs.job import Job
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
-from catstream.run.job import Job
-from catstream.services.compressor_process import CompressorLoop
-from catstream.services.process import LONG_SECONDS, RUNNING_SECONDS, Process, Watchdog
-from catstream.settings import Settings
+from catstream.processes.compressor import CompressorLoop
+from catstream.processes.process import LONG_SECONDS, RUNNING_SECONDS, Process, Watchdog
 
 
 def test_a_watchdog_counts_turns_and_only_an_announced_long_step_may_take_long():

@@ -7,11 +7,11 @@ import signal
 import onnx
 import pytest
 
-from catstream.applications.finding.find import find
-from catstream.errors import SettingsError
+from catstream.base.errors import SettingsError
+from catstream.finding.find import find
+from catstream.jobs.saved_model import Learned, merge
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
-from catstream.run.learned import Learned, merge
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from catstream.applications.evaluation.datasets import Sequence, find_sequences
-from catstream.applications.evaluation.onepass import evaluate
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.base.settings import Settings
+from catstream.evaluation.datasets import Sequence, find_sequences
+from catstream.evaluation.onepass import evaluate
 from catstream.paper.scm import SparseCollaborativeModel
-from catstream.settings import Settings
 from catstream.video.source import open_source
 
 DATA = Path(os.environ.get("TRACKING_DATA") or Path(__file__).parents[3] / "shared" / "data")

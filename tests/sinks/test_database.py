@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
 from catstream.sinks.track_log import RunFiles, read_frames

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.box import Box
+from catstream.base.box import Box
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.run.job import SinkOptions
 from catstream.sinks.events import Events
 
 #: A square of x and y from 40 to 60.

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, Origin, TrackedFrame, export, export_of, open_sink
 

@@ -14,10 +14,10 @@ from dataclasses import replace
 import paho.mqtt.client as mqtt
 import pytest
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.run.job import SinkOptions
 from catstream.sinks import mqtt_sink
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
 

@@ -14,10 +14,10 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
-from catstream.run.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
 from catstream.video.frames import jpeg
 from catstream.video.source import open_source

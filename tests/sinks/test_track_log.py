@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.jobs.job import Results
 from catstream.messages.kinds import Track
-from catstream.run.job import Results
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
 from catstream.sinks.track_log import RunFiles, places_of, read_frames
 from catstream.video.rendered import write

@@ -11,10 +11,10 @@ from threading import Event, Thread
 
 import pytest
 
-from catstream.box import Box
-from catstream.errors import VideoError
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
-from catstream.run.job import SinkOptions
 from catstream.sinks import webhook
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
 from catstream.wire.channels import PREVIEWS

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.addresses import without_password
-from catstream.errors import VideoError
+from catstream.base.addresses import without_password
+from catstream.base.errors import VideoError
 from catstream.video import live
 from catstream.video.source import open_source
 

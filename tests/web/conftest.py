@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
-from catstream.box import Box
+from catstream.base.box import Box
 from catstream.messages.kinds import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.web.app import fleet_site, pipeline_site
 from catstream.web.server import Server

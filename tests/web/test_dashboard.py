@@ -11,7 +11,7 @@ from hypothesis import strategies as some
 
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Health
-from catstream.video.annotate import PALETTE
+from catstream.video.drawing import PALETTE
 from catstream.web.dashboard import Dashboard, FleetDashboard
 from catstream.web.feed import SILENCE_SECONDS, PipelineFeed
 

@@ -7,9 +7,9 @@ from time import sleep
 import httpx
 import pytest
 
+from catstream.base.settings import Settings
 from catstream.client.subscription import subscribe
 from catstream.pipeline import Pipeline
-from catstream.settings import Settings
 from catstream.video.rendered import RATE, Demo
 from catstream.video.writer import VideoWriter
 from catstream.web.app import pipeline_site

@@ -4,7 +4,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
 from catstream.messages.kinds import Command, Model, Preview, Track
 from catstream.messages.schema import Field, Named, fields
 from catstream.wire.socket import rejects

@@ -12,9 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
+from catstream.base.errors import ProtocolError
+from catstream.base.settings import RunSettings, Settings
 from catstream.detection.objects import Detectors
-from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import (
     LARGEST_GIVEN_MODELS,
@@ -28,7 +29,6 @@ from catstream.messages.kinds import (
     TrainingRows,
 )
 from catstream.messages.schema import LARGEST_INTEGER, LONGEST_TEXT, Array, Field, fields
-from catstream.settings import RunSettings, Settings
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode

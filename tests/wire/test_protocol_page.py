@@ -15,7 +15,7 @@ from typing import Literal, get_args, get_origin
 import msgpack
 import pytest
 
-from catstream.box import Box, Window
+from catstream.base.box import Box, Window
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import (
     DetectorState,

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import zmq
 
+from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, Position, TrainingRows
-from catstream.settings import Settings
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES, RESULTS
 from catstream.wire.codec import VERSION, encode

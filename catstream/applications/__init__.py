@@ -1,1 +1,0 @@
-"""Applications of the tracker: evaluation, finding and load tests, and the HTML of their reports."""

@@ -1,0 +1,1 @@
+"""What every part uses: boxes, settings, errors, names, files, threads."""

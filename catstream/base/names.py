@@ -1,0 +1,93 @@
+"""Names of objects: each object of a stream has its own. A single object may have none; its name is then ""."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+
+from catstream.base.box import Box
+from catstream.base.errors import BoxError, ObjectError
+
+#: The name of an object that has none.
+UNNAMED = ""
+
+#: The boxes of objects: of one object without a name, or by name.
+Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
+
+_LONGEST = 64
+#: Regular expression of the name of an object.
+PATTERN = rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?"
+
+
+def is_name(text: str) -> bool:
+    """Whether a text may be the name of an object."""
+    return re.fullmatch(PATTERN, text) is not None
+
+
+def check_name(name: str) -> str:
+    """Return the name of an object; raise ObjectError if it is not valid.
+
+    >>> check_name("anna-2")
+    'anna-2'
+    """
+    if not isinstance(name, str) or not is_name(name):
+        raise ObjectError(
+            f"{name!r:.80} is not a name: expected text of 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
+            "the first of them a letter, a digit or '_'"
+        )
+    return str(name)  # of a text of numpy, too
+
+
+def split_name(text: str) -> tuple[str, str]:
+    """Split the text NAME=VALUE; the name is "" if there is only a value.
+
+    >>> split_name("anna=120,80,64,48"), split_name("120,80,64,48")
+    (('anna', '120,80,64,48'), ('', '120,80,64,48'))
+    """
+    name, equals, value = text.partition("=")
+    if not equals:
+        return UNNAMED, text
+    if not name:
+        raise ObjectError(f"{text[:80]!r} has no name before the '=': write NAME={value[:60]}, or only the value")
+    return check_name(name), value
+
+
+def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
+    """The boxes of objects by name; BoxError or ObjectError if one is not valid.
+
+    >>> boxes_by_name("120,80,64,48")
+    {'': Box(x=120.0, y=80.0, w=64.0, h=48.0)}
+    """
+    if not isinstance(boxes, Mapping):
+        return {UNNAMED: Box.parse(boxes)}
+    parsed = {}
+    for name, box in boxes.items():
+        with errors_about(check_name(name)):
+            parsed[name] = Box.parse(box)
+    return parsed
+
+
+def check_boxes(boxes: Mapping[str, Box], width: int, height: int) -> None:
+    """Raise BoxError, with the name of the object, if tracking cannot start with one of the boxes in such a frame."""
+    for name, box in boxes.items():
+        with errors_about(name):
+            box.validated(width, height)
+
+
+@contextmanager
+def errors_about(name: str) -> Iterator[None]:
+    """Add the name of an object to a BoxError."""
+    try:
+        yield
+    except BoxError as error:
+        raise BoxError(f"{name}: {error}" if name else str(error)) from None
+
+
+def check_count(count: int, most: int) -> None:
+    """Raise ObjectError if there are more objects than allowed."""
+    if count > most:
+        raise ObjectError(
+            f"{count} objects are more than {most}: follow fewer, or raise the limit "
+            f"(--set run.objects_most={count}, up to 64)"
+        )

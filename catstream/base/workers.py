@@ -1,0 +1,91 @@
+"""Processes that run a function of this program: the workers of an evaluation, and those of a load test.
+
+They end with their parent. SIGINT stays blocked in them, because on Ctrl-C their parent ends them in order: a worker
+that ended first would be reported as killed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import TypeVar
+
+from catstream.base.errors import ServiceError
+
+_Result = TypeVar("_Result")
+
+_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
+
+#: The start method of all of them.
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def die_with(parent: int) -> None:
+    """Let the kernel kill this process when its parent ends, so that no orphan is left."""
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # the parent ended before the call of prctl
+        raise SystemExit(0)
+
+
+@contextmanager
+def sigint_blocked() -> Iterator[None]:
+    """Block SIGINT in the processes that are started inside a `with`; a Ctrl-C that arrives inside is handled after it.
+
+    The mask alone does not hold it back: the signal arrives in another thread, and Python handles it in the main one. A
+    process whose start is interrupted would wait for its arguments.
+    """
+    resource_tracker.ensure_running()  # its start would unblock the signal
+    received: list[int] = []
+    is_main = threading.current_thread() is threading.main_thread()  # the thread in which Python handles signals
+    handler = signal.signal(signal.SIGINT, lambda number, _: received.append(number)) if is_main else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a child inherits it
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+            if received:
+                signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def sharing() -> Iterator[None]:
+    """A block in which memory or locks for other processes are made: ServiceError if this machine has no place."""
+    try:
+        yield
+    except OSError as error:
+        raise ServiceError(
+            f"processes cannot share memory ({error.strerror}): let /dev/shm be writable; catstream track and "
+            "catstream evaluate --jobs 1 do without"
+        ) from None
+
+
+def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Generator[_Result]:
+    """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
+
+    If the caller stops early, for example on Ctrl-C, all workers are killed.
+    """
+    others = set(multiprocessing.active_children())
+    with sharing():
+        made = ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),))
+    with made as pool:
+        try:
+            with sigint_blocked():  # the workers are started here
+                futures = [pool.submit(work, *task) for task in tasks]
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool:
+            raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
+        except BaseException:
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.kill()
+            raise

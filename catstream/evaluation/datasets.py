@@ -1,0 +1,373 @@
+"""Annotated sequences in the layouts of OTB, TLD, VOT and Princeton, and the frames and boxes that runs start with.
+
+A sequence is a folder with frames, in any form that `catstream.video.source`
+opens, and one of these files:
+
+    groundtruth_rect.txt   OTB: x,y,w,h (comma, semicolon, blank or tab); two objects, groundtruth_rect.1.txt and
+                           .2.txt, are two sequences
+    gt.txt                 TLD: x1,y1,x2,y2
+    groundtruth.txt        VOT: polygons x1,y1,x2,y2 ... (their bounding box is taken), or x,y,w,h
+    FOLDER.txt             Princeton: x,y,w,h,occluded, and the frames in rgb/
+
+Each file has one line for each frame; NaN, or a box without area, means that
+the object is absent. Numbers may have a decimal comma, if commas do not also
+separate them. Boxes are used as published; OTB's pixel coordinates, which start
+at 1, are not shifted.
+
+A run starts from one of these:
+
+    one_pass  one-pass evaluation (OPE): the first box of the ground truth
+    temporal  temporal robustness (TRE): several frames
+    spatial   spatial robustness (SRE) of the CVPR2013 benchmark: 12 first boxes, shifted or scaled
+    jittered  several first boxes that differ by at most 2 %: dependence of a result on chance
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Generator
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from catstream.base.arrays import Float64, UInt8
+from catstream.base.box import Box
+from catstream.base.errors import BoxError, SettingsError, VideoError
+from catstream.base.text import counted
+from catstream.video.images import natural_order
+from catstream.video.source import open_source
+
+#: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
+#: boxes.
+_FIRST_FRAMES = {("david", 471): 299}
+_RECT = re.compile(r"groundtruth_rect(\.\d+)?")  # others beside it, such as groundtruth_rect_old, are of no sequence
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sequence:
+    """An annotated sequence.
+
+    name   name of its folder
+    path   the folder
+    boxes  ground truth, float64 (frames, 4), x, y, w, h in pixels; NaN if the object is absent
+    begin  frame of the source that the first box belongs to
+    """
+
+    name: str
+    path: Path
+    boxes: Float64
+    begin: int = 0
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def frames(self, start: int = 0) -> Generator[UInt8]:
+        """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box; VideoError if there are too few."""
+        left = len(self.boxes) - start
+        with open_source(self.path, self.begin + start) as source:
+            for frame in source:
+                yield frame.image
+                left -= 1
+                if not left:
+                    return
+        raise VideoError(
+            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {counted(left, 'frame')} too few: "
+            "each line of the ground truth needs a frame"
+        )
+
+    def size(self, start: int = 0) -> tuple[int, int]:
+        """Read the frame of boxes[start], and return its width and height."""
+        with closing(self.frames(start)) as frames:
+            height, width = next(frames).shape[:2]
+        return width, height
+
+
+def find_sequences(path: str | Path, failed: Callable[[VideoError], None] | None = None) -> list[Sequence]:
+    """Return the sequence in a folder, or the sequences in its subfolders, in natural order.
+
+    failed : function that is called with the error of each sequence whose ground truth is malformed, while the others
+        are read; if None, the error is raised
+    """
+    path = Path(path)
+    folders = [path]
+    if not _truths(path) and path.is_dir():
+        folders = sorted((inner for inner in path.iterdir() if inner.is_dir()), key=natural_order)
+    truths = [truth for folder in folders for truth in _truths(folder)]
+    if not truths:
+        raise VideoError(
+            f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with groundtruth_rect.txt "
+            "(x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT) or FOLDER.txt (Princeton), or a folder of such folders"
+        )
+    sequences = []
+    for truth in truths:
+        try:
+            sequences.append(_sequence(*truth))
+        except VideoError as error:
+            if failed is None:
+                raise
+            failed(error)
+    return sequences
+
+
+class _Layout(NamedTuple):
+    """The layout of a ground truth: a line in words, the possible numbers of columns, and the way to boxes."""
+
+    line: str
+    columns: Collection[int]
+    boxes: Callable[[Float64], Float64]
+
+
+def _rectangles(table: Float64) -> Float64:
+    return table[:, :4].copy()
+
+
+def _corners(table: Float64) -> Float64:
+    return np.hstack([table[:, :2], table[:, 2:] - table[:, :2]])
+
+
+def _polygons(table: Float64) -> Float64:
+    if table.shape[1] == 4:
+        return _rectangles(table)
+    low, high = (np.stack([pick(table[:, axis::2], axis=1) for axis in (0, 1)], axis=1) for pick in (np.min, np.max))
+    return np.hstack([low, high - low])
+
+
+_OTB = _Layout("x,y,w,h", (4,), _rectangles)
+_TLD = _Layout("x1,y1,x2,y2", (4,), _corners)
+_VOT = _Layout("x,y,w,h or the corners of a polygon, x1,y1,x2,y2 ...", range(4, 1000, 2), _polygons)
+_PRINCETON = _Layout("x,y,w,h or x,y,w,h,occluded", (4, 5), _rectangles)
+
+
+def _truths(folder: Path) -> list[tuple[str, Path, Path, _Layout]]:
+    """Return the name, the folder, the ground truth and its layout of each sequence in a folder."""
+    target = folder.resolve()
+    name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
+    rects = [file for file in sorted(folder.glob("*.txt"), key=natural_order) if _RECT.fullmatch(file.stem)]
+    # One of the two files of an OTB sequence with two objects is empty.
+    rects = [file for file in rects if not file.exists() or file.stat().st_size] or rects
+    if rects:
+        ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
+        return [(name + end, folder, file, _OTB) for file, end in zip(rects, ends, strict=True)]
+    others = {"gt.txt": _TLD, "groundtruth.txt": _VOT, f"{target.name}.txt": _PRINCETON}
+    found = [(name, folder, folder / file, layout) for file, layout in others.items() if (folder / file).is_file()]
+    return found[:1]
+
+
+def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
+    boxes = layout.boxes(_numbers(file, layout))
+    boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
+    present = np.isfinite(boxes).all(axis=1).sum()
+    if present < 2:  # a run starts with the first box
+        raise VideoError(
+            f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
+            "frame, and the object in at least two frames"
+        )
+    return Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
+
+
+def _numbers(file: Path, layout: _Layout) -> Float64:
+    """Read the table in a text file, float64 (lines, columns)."""
+    rows: list[list[float]] = []
+    try:
+        lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise VideoError(
+            f"{str(file)!r} cannot be read ({error}): expected a text file with one line for each frame"
+        ) from None
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():  # skipping the line would shift all later boxes by one frame
+            raise VideoError(f"{str(file)!r}, line {number} is blank: if the object is absent, write nan,nan,nan,nan")
+        columns = [len(rows[0])] if rows else layout.columns
+        readings = [row for row in _readings(line) if len(row) in columns]
+        if len(readings) != 1:
+            expected = f"{len(rows[0])} numbers as in line 1" if rows else layout.line
+            raise VideoError(
+                f"{str(file)!r}, line {number}: expected {expected}, with decimal points, got {line.strip()[:60]!r}"
+            )
+        rows += readings
+    if not rows:
+        raise VideoError(f"{str(file)!r} is empty: expected one line for each frame")
+    return np.array(rows)
+
+
+def _readings(line: str) -> list[list[float]]:
+    """Return the numbers of a line, with its commas as separators, and as decimal commas if there are other separators.
+
+    >>> _readings("215,90 61,18 50,02 50")
+    [[215.9, 61.18, 50.02, 50.0]]
+    >>> _readings("215,90 61,18 50,20 50,30")
+    [[215.0, 90.0, 61.0, 18.0, 50.0, 20.0, 50.0, 30.0], [215.9, 61.18, 50.2, 50.3]]
+    """
+    readings: list[list[float]] = []
+    line = line.strip(" \t,;")
+    separated, words = re.split(r"\s*[,;]\s*|\s+", line), re.split(r",?[;\s]+", line)
+    if not any(re.match(r"[-+]?0\d", field) for field in separated):  # 02 has been the decimals of a number
+        with suppress(ValueError):
+            readings.append([float(field) for field in separated])
+    if "," in "".join(words) and all(re.fullmatch(r"[-+]?\d+(,\d+)?|nan", word, re.IGNORECASE) for word in words):
+        readings.append([float(word.replace(",", ".")) for word in words])
+    return readings
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """A change of the first box: shifts of its centre in widths and heights, and factors of its sides.
+
+    name  part of the name of the run; empty for the box of the ground truth, which is not changed
+
+    >>> Variation("right", right=0.1).applied(Box(10, 20, 30, 40))
+    Box(x=13.0, y=20.0, w=30.0, h=40.0)
+    """
+
+    name: str = ""
+    right: float = 0.0
+    down: float = 0.0
+    wider: float = 1.0
+    higher: float = 1.0
+
+    def applied(self, box: Box) -> Box:
+        x, y = box.centre
+        return box.scaled(self.wider, self.higher).centred(x + self.right * box.w, y + self.down * box.h)
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """The frame and the box that a run starts with: a row of the ground truth, and a change of its box."""
+
+    frame: int = 0
+    variation: Variation = Variation()
+
+    @property
+    def suffix(self) -> str:
+        """The end of the name of a run, after the name of its sequence: `@120`, `@left`, `@120-left`, or empty."""
+        parts = [str(self.frame)] if self.frame else []
+        parts += [self.variation.name] if self.variation.name else []
+        return "@" + "-".join(parts) if parts else ""
+
+    def box(self, sequence: Sequence, size: tuple[int, int] | None = None) -> Box:
+        """Return the first box.
+
+        size : width and height of the frame; a changed box that tracking cannot start with there is moved until its
+            centre is in the frame, and gets sides from 2 pixels to twice those of the frame; None: the box is not moved
+        """
+        box = Box(*map(float, sequence.boxes[self.frame]))
+        if not self.variation.name:
+            return box
+        changed = self.variation.applied(box)
+        return changed if size is None else _startable(changed, *size)
+
+
+FIRST = Start()
+#: Chooses the starts of a sequence.
+Starts = Callable[[Sequence], list[Start]]
+
+_DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, -1), "down": (0, 1)}
+_CORNERS = {"left-up": (-1, -1), "right-up": (1, -1), "left-down": (-1, 1), "right-down": (1, 1)}
+
+#: The 12 first boxes of the CVPR2013 benchmark: shifts by 10 % of the box, and four sizes.
+SHIFTS = (
+    *(Variation(name, 0.1 * x, 0.1 * y) for name, (x, y) in (_DIRECTIONS | _CORNERS).items()),
+    *(Variation(f"size-{factor}", wider=factor, higher=factor) for factor in (0.8, 0.9, 1.1, 1.2)),
+)
+
+_JITTER = 0.02
+
+
+def choose_starts(frames: int | None = None, boxes: int | None = None, *, shifts: bool = False) -> Starts:
+    """Return the starts for `--starts FRAMES`, `--jitter BOXES` or `--shifts`; without any of them, those of OPE."""
+    if shifts:
+        return spatial
+    if boxes is not None:
+        return jittered(boxes)
+    return one_pass if frames is None else temporal(frames)
+
+
+def one_pass(sequence: Sequence) -> list[Start]:
+    """Return one start: the first frame with the object."""
+    return [Start(_present(sequence)[0])]
+
+
+def temporal(count: int) -> Starts:
+    """Choose `count` evenly spaced start frames.
+
+    If the object is absent in one, or tracking cannot start with its box, the next frame is used. It reads a frame of
+    each sequence.
+    """
+
+    def starts(sequence: Sequence) -> list[Start]:
+        frames = _valid(sequence)
+        places = np.searchsorted(frames, np.arange(count) * len(sequence) // count)
+        return [Start(frame) for frame in sorted({frames[place] for place in places if place < len(frames)})]
+
+    return starts
+
+
+def spatial(sequence: Sequence) -> list[Start]:
+    """Return the first frame with the object, with each of the first boxes in `SHIFTS`."""
+    return [Start(_present(sequence)[0], variation) for variation in SHIFTS]
+
+
+def jittered(count: int) -> Starts:
+    """Choose `count` boxes in the first frame with the object: that of the ground truth, and random changes of it.
+
+    The changes are at most 2 % of the sides, and the same in each sequence and on each machine.
+    """
+    variations = [Variation(), *map(_jitter, range(1, count))]
+
+    def starts(sequence: Sequence) -> list[Start]:
+        return [Start(_present(sequence)[0], variation) for variation in variations]
+
+    return starts
+
+
+def _jitter(seed: int) -> Variation:
+    right, down, wider, higher = np.random.default_rng(seed).uniform(-_JITTER, _JITTER, 4).tolist()
+    return Variation(f"jitter-{seed}", right, down, 1 + wider, 1 + higher)
+
+
+def _present(sequence: Sequence) -> list[int]:
+    """Return the frames with the object."""
+    return [int(frame) for frame in np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))]
+
+
+def _valid(sequence: Sequence) -> list[int]:
+    """Return the frames with a box that `Box.validated` accepts; all with the object if none has one, or none is read.
+
+    The run then raises the error. The last frame with the object is left out: nothing but the given box would be
+    measured.
+    """
+    present = _present(sequence)[:-1]
+    try:
+        size = sequence.size(present[0])
+    except VideoError:
+        return present
+    return [frame for frame in present if _is_valid(Start(frame).box(sequence), *size)] or present
+
+
+def _is_valid(box: Box, width: int, height: int) -> bool:
+    try:
+        box.validated(width, height)
+    except BoxError:
+        return False
+    return True
+
+
+def _startable(box: Box, width: int, height: int) -> Box:
+    """Return the nearest box that `Box.validated` accepts in a frame of this size."""
+    x, y = box.centre
+    w, h = min(max(box.w, 2.0), 2.0 * width), min(max(box.h, 2.0), 2.0 * height)
+    return Box(0.0, 0.0, w, h).centred(x, y).with_centre_in(width, height)
+
+
+def read_attributes(file: Path) -> dict[str, list[str]]:
+    """Read attributes of sequences, for example occlusion, from a JSON file {sequence: [attribute]}."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
+    except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
+        raise SettingsError(
+            f'cannot read the attributes in {str(file)!r} ({error}): give a JSON file {{"sequence": ["occlusion"]}}'
+        ) from None

@@ -1,0 +1,524 @@
+"""The search of files for the objects of saved models: frames in equal distances of time, and what is seen in them.
+
+All models are searched on one grid of sizes and aspect ratios. For each entry of the grid, a frame is resized and its
+cells are computed once, for all models whose objects may have this size and shape.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import os
+from collections import Counter, defaultdict, deque
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from catstream.base.addresses import without_password
+from catstream.base.box import Box, Window
+from catstream.base.errors import SettingsError, VideoError
+from catstream.base.settings import RunSettings, Settings
+from catstream.base.text import counted
+from catstream.base.threads import one_thread
+from catstream.detection.likeness import Likeness
+from catstream.detection.search import SAME_OVERLAP, Detection, fitted
+from catstream.features.cells import Cells
+from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
+from catstream.features.layout import CELL, WINDOW
+from catstream.features.pyramid import Pyramid
+from catstream.features.score_map import ScoreMap, non_maximum_suppression
+from catstream.jobs.saved_model import Learned
+from catstream.messages.kinds import Model
+from catstream.video.frames import Frame, read_ahead
+from catstream.video.images import IMAGES, ImageReader, first_pages, image_files, natural_order, pages_of
+from catstream.video.source import VIDEOS, is_live, open_source
+
+_One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
+#: A frame that is searched, and the name of its file in a folder of images.
+_Searched = tuple[Frame, str]
+
+#: Seconds of a video between two frames that are searched.
+EVERY = 0.2
+#: The least score of a sighting.
+THRESHOLD = 0.5
+#: The smallest and the largest size that is searched, as multiples of the learned size.
+SIZES = (0.4, 2.5)
+
+_SIZE_STEP = 1.25  # ratio of successive sizes of the grid
+_ASPECT_STEP = 1.25  # ratio of successive aspect ratios
+_MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for a tiny object in a large frame
+_WIDEST = 1.25  # of a window, as a multiple of the frame: its object fills the frame
+_SMALLEST = 24  # side of a window in pixels: a smaller one shows too little of its object
+_MOST_MAXIMA = 8  # windows of one size that are examined, and sightings of one object in a frame
+_TIME_STEP = 0.001  # of most containers, in seconds: time stamps are rounded to it
+_FITTED = 0.7  # share of the threshold from which a window is fitted: its score rises by less
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """An object that was found in a frame.
+
+    Attributes
+    ----------
+    object : str
+        Name of the object.
+    file : str
+        The video, the image, or the folder of images.
+    frame : int
+        Number of the frame, or of the image in its folder; the first one is 0.
+    time : float
+        Seconds since the start of the video.
+    box : Box
+        Box of the object in pixels of the frame.
+    score : float
+        About 1 on the object, near 0 elsewhere; at least the threshold of the search.
+    image : str
+        Name of the file in a folder of images, otherwise empty.
+    """
+
+    object: str
+    file: str
+    frame: int
+    time: float
+    box: Box
+    score: float
+    image: str = ""
+
+
+@dataclass(slots=True, kw_only=True)
+class Reading:
+    """The length and the problems of a file, which become known while it is read.
+
+    frames    number of its frames, None if unknown
+    problems  reasons for what could not be read: each image, or at the end of a video the frames that were skipped
+    """
+
+    frames: int | None = None
+    problems: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A video, a folder of images, or a single image.
+
+    path  of the file, or of the folder
+    kind  "video", "images" or "image"
+    """
+
+    path: Path
+    kind: Literal["video", "images", "image"]
+
+    @property
+    def signature(self) -> list[int]:
+        """Number of files, their total size, and the newest time of modification: it differs if the file changed."""
+        states = [path.stat() for path in self.paths() if path.exists()]  # a dead link is a damaged image
+        newest = max((state.st_mtime_ns for state in states), default=0)
+        return [len(states), sum(state.st_size for state in states), newest]
+
+    def paths(self) -> list[Path]:
+        """The video, or the images in order."""
+        return image_files(self.path) if self.kind == "images" else [self.path]
+
+    def frames(self, every: float, settings: RunSettings, reading: Reading) -> Generator[_Searched]:
+        """Yield the frames to search: all images; of a video the first one in each `every` seconds, and the last one.
+
+        A video that is damaged raises VideoError after the frames before the damage.
+        """
+        if self.kind == "video":
+            # Not in equal numbers of frames: the rate of a file may be nominal, and its frames need not be regular.
+            with open_source(self.path, settings=settings, resize=True) as source:
+                reading.frames = source.frames
+                before, last = -1.0, None
+                with closing(read_ahead(source)) as frames:
+                    for frame in frames:
+                        interval = (frame.time + _TIME_STEP) // every if every else frame.number
+                        last = frame if interval == before else None
+                        if last is None:
+                            yield frame, ""
+                        before = interval
+                if last is not None:
+                    yield last, ""
+                if scaled := source.counters.get("scaled"):
+                    _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
+                if skipped := source.counters.get("damaged"):
+                    reading.problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
+            return
+        pages = first_pages(self.paths()) if self.kind == "images" else pages_of(self.path)
+        reading.frames = len(pages)
+        read_image = ImageReader(pages)
+        for number, (path, _) in enumerate(pages):
+            image = read_image(number)
+            if image is None:
+                reading.problems.append(f"cannot read the image {str(path)!r}: it is left out")
+            else:
+                yield Frame(number, number / settings.image_rate, image), path.name if self.kind == "images" else ""
+
+
+def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
+    """Return the files to search, in order and each once; folders are searched with all their subfolders.
+
+    The images of one folder are one file, in natural order (2.png before 10.png).
+    """
+    found: dict[File, None] = {}
+    for path in paths:
+        if is_live(str(path)):
+            raise VideoError(
+                f"{without_password(str(path))} is a live source: record it to a video first, and give the video"
+            )
+        found |= dict.fromkeys(_files(Path(path)))
+    return list(found)
+
+
+def _files(path: Path) -> list[File]:
+    if path.is_file():
+        return [File(path, "image" if pages_of(path) else "video")]
+    if not path.is_dir():
+        raise VideoError(f"there is no file or folder {str(path)!r}: give videos, images, or folders of them")
+    others: Counter[str] = Counter()
+    found = list(_files_below(path, set(), others))
+    left_out = ", ".join(f"{number} {suffix}" for suffix, number in others.most_common())
+    if not found:
+        raise VideoError(
+            f"the folder {str(path)!r} and its subfolders hold neither images nor videos"
+            f"{left_out and f' ({left_out})'}: give another folder, or name the files"
+        )
+    if left_out:
+        _log.warning("left out of %s: %s; a file that is named is searched", path, left_out)
+    return found
+
+
+def _files_below(folder: Path, searched: set[Path], others: Counter[str]) -> Iterator[File]:
+    """Yield the files in a folder and its subfolders, also in linked ones; count the suffixes of all others."""
+    if folder.resolve() in searched:  # a link leads back to it
+        return
+    searched.add(folder.resolve())
+    entries = sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_order)
+    if any(entry.suffix.lower() in IMAGES and entry.is_file() for entry in entries):
+        yield File(folder, "images")
+    for entry in entries:
+        suffix = entry.suffix.lower()
+        if entry.is_dir():
+            try:
+                yield from _files_below(entry, searched, others)
+            except PermissionError as error:
+                _log.warning("%s is left out (%s)", error.filename, error.strerror)
+        elif suffix in VIDEOS and entry.is_file():
+            yield File(entry, "video")
+        elif suffix not in IMAGES:
+            others[suffix or "without a suffix"] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A window that shows an object, the object's box in it, and the score: see `Scan`."""
+
+    window: Window
+    box: Box
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Template:
+    """A model, its measure of likeness, a window of the learned size, and the settings that it was learned with."""
+
+    model: Model
+    likeness: Likeness
+    window: Window
+    settings: Settings
+
+    def seen(self, scores: ScoreMap, row: int, column: int, window: Window) -> Seen:
+        """A window whose features are at (row, column) of a map of appearance scores."""
+        score = min(1.0, float(scores.scores[row, column])) * self.likeness(scores.cells.row(row, column))
+        return Seen(window, window.box(self.settings.search.context), score)
+
+
+class Scan:
+    """Searches frames for the objects of several models.
+
+    The score of a window is its likeness to the object (see `catstream.detection.likeness`) times the score of the
+    appearance model, of which at most 1 counts: about 1 on the object, and near 0 on an unknown background.
+
+    threshold : least score of a sighting
+    sizes : smallest and largest size, as multiples of the learned size
+    descriptor : that the models were learned with, if there is one
+    """
+
+    def __init__(
+        self,
+        learned: Iterable[Learned],
+        threshold: float = THRESHOLD,
+        sizes: tuple[float, float] = SIZES,
+        descriptor: Descriptor | None = None,
+    ) -> None:
+        self._threshold, self._descriptor = threshold, descriptor
+        self._models = [
+            _Template(each.model, each.likeness(), Window.around(each.box, each.settings.search.context), each.settings)
+            for each in learned
+        ]
+        self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
+        for number, searched in enumerate(self._models):
+            for entry in _entries(searched.window, sizes):
+                self._grid[entry].append(number)
+
+    @one_thread()
+    def __call__(self, image: np.ndarray) -> list[list[Seen]]:
+        """Search a frame, uint8 (h, w, 3): for each model, fitted windows that do not overlap, best first."""
+        frame = Pyramid(image, self._descriptor)
+        found = []
+        for searched, windows in zip(self._models, self.windows(frame), strict=True):
+            seen = [_fitted(frame, each.window, searched) for each in windows]
+            found.append(_suppressed(each for each in seen if each.score >= self._threshold))
+        return found
+
+    def windows(self, frame: Pyramid) -> list[list[Seen]]:
+        """For each model, the best windows of the grid, highest score first."""
+        found: list[list[Seen]] = [[] for _ in self._models]
+        for entry, numbers in self._grid.items():
+            window = _window(*entry)
+            if not _is_searchable(window, frame.size):
+                continue
+            image, step = frame.resized(window, averaged=False)
+            cells = Cells.of(image)
+            for number in numbers:
+                found[number] += self._maxima(frame, cells, step, self._models[number])
+        return [_suppressed(each) for each in found]
+
+    def _maxima(self, frame: Pyramid, cells: Cells, step: tuple[float, float], searched: _Template) -> list[Seen]:
+        """The best windows of one size, whose cells are `step` pixels wide and high.
+
+        With a descriptor, HOG and colours choose the windows, and it describes only these.
+        """
+        least = _FITTED * self._threshold
+        model = searched.model
+        if frame.descriptor is None:  # no likeness is above 1 / share
+            appearance = cells.respond_above(model.weights, model.bias, least * searched.likeness.share)
+        else:
+            appearance = cells.respond(model.weights, model.bias)
+        scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
+        places = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
+        found = [searched.seen(*scores.complete(frame, place, model), scores.window(*place)) for place in places]
+        return [each for each in found if each.score >= least]
+
+
+def _fitted(frame: Pyramid, window: Window, searched: _Template) -> Seen:
+    """A window at its best size and aspect ratio; the learned aspect ratio is likelier than others."""
+    size = math.sqrt(window.area / searched.window.area)
+    likely = searched.window.scaled(size).centred(*window.centre)
+    found = fitted(frame, Detection(0.0, window), likely, searched.model, searched.settings.extent)
+    return searched.seen(ScoreMap.around(frame, found.window, WINDOW, searched.model), 0, 0, found.window)
+
+
+def _entries(window: Window, sizes: tuple[float, float]) -> list[tuple[int, int]]:
+    """The entries of the grid, exponents of size and aspect ratio, at which the object of a window is searched."""
+    low, high = (math.log(math.sqrt(window.area) * size, _SIZE_STEP) for size in sizes)
+    aspect = round(math.log(window.w / window.h, _ASPECT_STEP))
+    return [(size, aspect) for size in range(math.ceil(low), math.floor(high) + 1)] or [(round(low), aspect)]
+
+
+def _window(size: int, aspect: int) -> Window:
+    """The window of an entry of the grid."""
+    side, stretch = _SIZE_STEP**size, math.sqrt(_ASPECT_STEP**aspect)
+    return Window(0.0, 0.0, side * stretch, side / stretch)
+
+
+def _is_searchable(window: Window, size: tuple[int, int]) -> bool:
+    """Whether windows of a size are neither too small to show anything nor too large for a frame."""
+    (width, height), side = size, WINDOW * CELL
+    if window.w > _WIDEST * width or window.h > _WIDEST * height or window.area < _SMALLEST**2:
+        return False
+    return width * side / window.w * height * side / window.h <= _MOST_PIXELS
+
+
+def _suppressed(found: Iterable[Seen]) -> list[Seen]:
+    """The windows that overlap no better one, highest score first."""
+    kept: list[Seen] = []
+    for each in sorted(found, key=lambda one: -one.score):
+        if len(kept) < _MOST_MAXIMA and all(each.window.overlap(other.window) < SAME_OVERLAP for other in kept):
+            kept.append(each)
+    return kept
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A frame that was searched, and the objects that were found in it."""
+
+    frame: Frame
+    sightings: list[Sighting]
+
+
+@dataclass(slots=True)
+class Search:
+    """Searches files for the objects of several models, in as many threads as there are cores.
+
+    models      name of each object -> its model
+    settings    for reading files: the frame rate of images, and whether damage is skipped
+    threshold   least score of a sighting
+    every       seconds of a video between two frames that are searched, 0 for every frame
+    sizes       smallest and largest size that is searched, as multiples of the learned size
+    network     file of the network that the models were learned with, empty for none
+    """
+
+    models: Mapping[str, Learned]
+    settings: RunSettings = field(default_factory=RunSettings)
+    threshold: float = THRESHOLD
+    every: float = EVERY
+    sizes: tuple[float, float] = SIZES
+    network: str = ""
+    _scan: Scan = field(init=False)
+
+    def __post_init__(self) -> None:
+        low, high = self.sizes
+        if not 0 < low <= high < 100:
+            raise SettingsError(f"expected two positive sizes, the smaller one first, got {low:g},{high:g}: give 0.5,2")
+        descriptor = descriptor_of(Settings(features={"network": self.network}))
+        for name, learned in self.models.items():
+            learned.check_network(digest_of(descriptor), f"the model of {name!r}", "this search has")
+        self._scan = Scan(self.models.values(), self.threshold, self.sizes, descriptor)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Models and options, as values of JSON: two searches with the same description have the same results."""
+        return {
+            "models": {name: _digest(learned) for name, learned in self.models.items()},
+            "threshold": self.threshold,
+            "every": self.every,
+            "sizes": list(self.sizes),
+            "image_rate": self.settings.image_rate,
+            "skip_damaged": self.settings.skip_damaged,
+        }
+
+    def file(self, file: File, reading: Reading | None = None) -> Iterator[Step]:
+        """Search a file. At damage of a video, VideoError is raised after the steps before it."""
+        frames = file.frames(self.every, self.settings, reading or Reading())
+        with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
+            for (frame, image), found in scanned:
+                place = str(file.path), frame.number, frame.time
+                sightings = [
+                    Sighting(name, *place, each.box, each.score, image)
+                    for name, seen in zip(self.models, found, strict=True)
+                    for each in seen
+                ]
+                yield Step(frame, sightings)
+
+
+def find(
+    models: str | os.PathLike[str] | Learned | Iterable[str | os.PathLike[str] | Learned],
+    paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    *,
+    threshold: float = THRESHOLD,
+    every: float = EVERY,
+    sizes: tuple[float, float] = SIZES,
+    skip_damaged: bool = False,
+    network: str | os.PathLike[str] = "",
+) -> Iterator[Sighting]:
+    """Find the objects of saved models in videos, folders and images.
+
+    Parameters
+    ----------
+    models : path, or iterable of paths
+        Files that `catstream save` wrote. An object without a name gets that of its file.
+    paths : path, or iterable of paths
+        Videos, images, and folders, which are searched with all their subfolders.
+    threshold : float
+        Least score of a sighting; the score is about 1 on the object.
+    every : float
+        Seconds of a video between two frames that are searched, 0 for every frame.
+    sizes : two floats
+        Smallest and largest size that is searched, as multiples of the size that was learned.
+    skip_damaged : bool
+        Continue after a damaged place in a video.
+    network : path
+        The file `features.network` that the models were learned with, if there was one.
+
+    Yields
+    ------
+    Sighting
+        Files in the order of `paths`, frames in order, objects in the order of `models`, highest score first.
+
+    Raises
+    ------
+    ServiceError, ProtocolError
+        If a model does not exist, or is damaged or of other features.
+    SettingsError
+        If two models have one name, the sizes are not positive, the smaller one first, or a model was learned with
+        another network.
+    VideoError
+        If a path does not exist or has nothing to search; after all other files, for the first file that is damaged.
+
+    Examples
+    --------
+    >>> for sighting in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
+    ...     print(sighting.file, sighting.time, sighting.box, sighting.score)
+    """
+    reading = RunSettings(skip_damaged=skip_damaged)
+    search = Search(load_models(_several(models)), reading, threshold, every, sizes, os.fspath(network))
+    return _sightings(search, find_files(_several(paths)))
+
+
+def load_models(models: Iterable[str | os.PathLike[str] | Learned]) -> dict[str, Learned]:
+    """Load models; return each by the name of its object, or of its file."""
+    named: dict[str, Learned] = {}
+    for number, each in enumerate(models, 1):
+        learned = each if isinstance(each, Learned) else Learned.load(each)
+        name = learned.object or (f"object-{number}" if isinstance(each, Learned) else Path(each).stem)
+        if name in named:
+            raise SettingsError(f"two models are named {name!r}: rename the file of one, or save it under another name")
+        named[name] = learned
+    if not named:
+        raise SettingsError("a search needs at least one model: `catstream save` and `track --save-model` write one")
+    return named
+
+
+def _digest(learned: Learned) -> str:
+    """Identifies what is searched with: weights, bias and size."""
+    digest = hashlib.sha256(learned.model.weights.tobytes())
+    digest.update(np.array([learned.model.bias, *learned.box[2:]]).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _sightings(search: Search, files: list[File]) -> Iterator[Sighting]:
+    problems: list[VideoError] = []
+    for file in files:
+        reading = Reading()
+        try:
+            for step in search.file(file, reading):
+                yield from step.sightings
+        except VideoError as error:
+            problems.append(error)
+        if file.kind != "video":  # of a video, the caller asked to skip them
+            problems += map(VideoError, reading.problems)
+    if problems:
+        raise problems[0]
+
+
+def _several(given: _One | Iterable[_One]) -> Iterable[_One]:
+    """One value or several, as several."""
+    return [given] if isinstance(given, str | os.PathLike | Learned) else given
+
+
+def _scanned(scan: Scan, frames: Iterator[_Searched]) -> Generator[tuple[_Searched, list[list[Seen]]]]:
+    """Scan frames in several threads, and yield the results in order; an error of the source comes after them."""
+    workers = len(os.sched_getaffinity(0))
+    pending: deque[tuple[_Searched, Future[list[list[Seen]]]]] = deque()
+    problem: VideoError | None = None
+    with ThreadPoolExecutor(workers, "scan") as pool:
+        try:
+            for searched in frames:
+                pending.append((searched, pool.submit(scan, searched[0].image)))
+                if len(pending) > workers:
+                    first, found = pending.popleft()
+                    yield first, found.result()
+        except VideoError as error:
+            problem = error
+        for searched, found in pending:
+            yield searched, found.result()
+    if problem is not None:
+        raise problem

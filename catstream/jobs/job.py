@@ -1,0 +1,221 @@
+"""The job of a run: its source, objects, settings and files.
+
+Whoever starts a run writes its job to one file, and every process of the run reads it there. A run with a state
+folder keeps a copy of the job in that folder, from which it is resumed.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from pathlib import Path
+from shlex import quote
+from typing import Any, get_type_hints
+
+import msgspec
+
+from catstream.base.box import Box
+from catstream.base.errors import ProtocolError, ServiceError, SettingsError
+from catstream.base.files import writing
+from catstream.base.names import UNNAMED, check_count, check_name
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.messages import storage
+
+#: Files of saved models: of one object without a name, or by name.
+Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
+
+_NAME = "job.safetensors"
+
+#: Settings that do not affect the training: a run can be resumed with other values.
+_FREE = {
+    *("run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"),
+    *("run.open_seconds", "run.silent_seconds", "run.poll_seconds"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SinkOptions:
+    """Options of destinations beside their addresses, and of the events that some of them send.
+
+    zones         corners x, y of each zone, a polygon, in pixels of the frame, by name
+    margin        pixels by which the centre of a box has to be outside a zone that it was in to leave it
+    events        kinds of events that are sent, see `catstream.sinks.events`
+    lost_seconds  time without a box after which an object is lost
+    rate          messages per second at most about each object, in between its events
+    picture       whether each event has the newest picture of the pipeline
+    key           file of the key that signs what is sent, None to sign nothing
+    """
+
+    zones: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    margin: float = 10.0
+    events: tuple[str, ...] = ("found", "lost", "returned", "entered", "left", "ended")
+    lost_seconds: float = 2.0
+    rate: float = 1.0
+    picture: bool = False
+    key: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """The files that `catstream track` writes for a run; a resumed run continues the same files.
+
+    output      folder of the results files, None for none
+    video       whether an annotated video is among the results files
+    write       further destinations of tracks, see `catstream.sinks.destinations`
+    models      files for what was learned of each object, by name; a file without a name is for the only object
+    options     options of the further destinations
+    """
+
+    output: Path | None = None
+    video: bool = False
+    write: tuple[str, ...] = field(default=(), repr=False)  # an address may contain a password
+    models: dict[str, Path] = field(default_factory=dict)
+    options: SinkOptions = field(default_factory=SinkOptions)
+
+    def after(self, earlier: Results) -> Results:
+        """These files, and of a kind of which there is none those of the earlier part of the run."""
+        return Results(
+            output=self.output or earlier.output,
+            video=self.video or earlier.video,
+            write=self.write or earlier.write,
+            models=self.models or earlier.models,
+            options=self.options if self.options != SinkOptions() else earlier.options,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Everything that the processes of a run have to agree on.
+
+    source    the text that `catstream.video.source.open_source` takes
+    boxes     the objects in the first frame, by name; without a box or a model, the run waits for the box of a command
+    models    file that `catstream save` wrote of each object that is searched for, by name
+    part      the frames of the source that are followed
+    settings  all settings
+    size      width and height of a frame, None if that is not known yet
+    started   seconds since 1970 at which the run first started
+    results   files that `catstream track` writes
+    paused    whether the run starts paused, until the command `resume`
+    network   digest of the file `features.network`, empty if there is none, or the processes were started by hand
+
+    The others hold for one start of the run, and are not in the copy that is kept:
+
+    endpoint  where the processes meet; the setting of the same name if this is empty
+    state     folder of the checkpoints and of the desired state; None if nothing is kept
+    resume    whether the processes continue from that state
+    run       id of this start of the run, which its messages carry, and whose program receives every track on the
+              channel `results`; empty if the processes were started by hand
+    since     value of `time.monotonic` from which the times of a live source count; None for its first frame
+    """
+
+    source: str = field(default="", repr=False)  # it may contain a password
+    boxes: dict[str, Box] = field(default_factory=dict)
+    models: dict[str, Path] = field(default_factory=dict)
+    part: slice = field(default_factory=lambda: slice(None))
+    settings: Settings = field(default_factory=Settings)
+    size: tuple[int, int] | None = None
+    started: float = 0.0
+    results: Results = Results()
+    paused: bool = False
+    network: str = ""
+    endpoint: str = ""
+    state: Path | None = None
+    resume: bool = False
+    run: str = ""
+    since: float | None = None
+
+    def __post_init__(self) -> None:
+        if both := self.boxes.keys() & self.models.keys():
+            raise SettingsError(
+                f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: "
+                "give one of them"
+            )
+        check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
+
+    def save(self, folder: Path) -> Path:
+        """Write the job to a folder, readable by its owner only: the source may contain a password. Returns the file.
+
+        ServiceError if it cannot be written.
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        metadata = msgspec.to_builtins(values | {"settings": self.settings.values()}, enc_hook=_plain)
+        with writing(folder):
+            storage.write(folder / _NAME, {}, metadata)
+        return folder / _NAME
+
+    @classmethod
+    def load(cls, path: Path) -> Job:
+        """Read the job from the file that `save` wrote, or from the folder that it is in.
+
+        ServiceError if there is no such file; ProtocolError or SettingsError if it is damaged, or was written by
+        another version of catstream.
+        """
+        file = path / _NAME if path.is_dir() else path
+        if not file.is_file():
+            raise ServiceError(f"{str(path)!r} contains no run: start one with --state {quote(str(path))}")
+        metadata = storage.read(file)[1]
+        metadata.setdefault("network", "")  # which an older job lacks
+        try:
+            settings = Settings.from_values(metadata.pop("settings"))
+            read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}
+            return cls(**read, settings=settings)
+        except (AttributeError, KeyError, TypeError, msgspec.ValidationError) as error:
+            raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
+
+    def check_fits(self, other: Job, folder: Path) -> None:
+        """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
+        if other._frames() != self._frames():
+            raise SettingsError(
+                f"the run in {str(folder)!r} has {self._frames()}, and this one has {other._frames()}: "
+                "continue with the same frames, or start a new run in another folder"
+            )
+        if changed := changed_setting(self.settings, other.settings):
+            raise SettingsError(
+                f"the run in {str(folder)!r} was started with {changed}: continue without settings (they are stored "
+                "too), or start a new run in another folder"
+            )
+
+    def _frames(self) -> str:
+        """The size and the numbers of the frames, for an error."""
+        size = "" if self.size is None else f"{self.size[0]}x{self.size[1]} pixels, "
+        first, stop, stride = self.part.start or 0, self.part.stop, self.part.step or 1
+        numbers = f"frames {first} to {'the last' if stop is None else stop - 1}"
+        return f"{size}{numbers}{f' in steps of {stride}' * (stride > 1)}"
+
+
+def changed_setting(before: Settings, after: Settings) -> str:
+    """The first setting that differs and may not while a run continues, with its values; empty if there is none.
+
+    >>> changed_setting(Settings(), Settings(coreset={"size": 32}, run={"lag_frames": 25}))
+    'coreset.size=64, not 32'
+    """
+    ours, theirs = before.values(), after.values()
+    changed = (name for name in sorted(ours.keys() - _FREE) if ours[name] != theirs[name])
+    return next((f"{name}={ours[name]}, not {theirs[name]}" for name in changed), "")
+
+
+def files_by_name(files: Models | None) -> dict[str, Path]:
+    """Files by the names of their objects; a file without a name is for the only object."""
+    named = files if isinstance(files, Mapping) else {} if files is None else {UNNAMED: files}
+    return {check_name(name): Path(file) for name, file in named.items()}
+
+
+def _plain(value: object) -> object:
+    """A value in the types of JSON, if it is of a type that `msgspec` does not know."""
+    if isinstance(value, slice):
+        return [None if each is None else int(each) for each in (value.start, value.stop, value.step)]
+    return str(value)
+
+
+def _typed(kind: type, value: Any) -> object:
+    """The reverse of `_plain`."""
+    return slice(*value) if kind is slice else kind(value)
+
+
+@cache
+def _kinds() -> dict[str, Any]:
+    """The types of the fields of a job, by name, without its settings, which check themselves."""
+    return {name: kind for name, kind in get_type_hints(Job).items() if name != "settings"}

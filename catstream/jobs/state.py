@@ -1,0 +1,155 @@
+"""The state of a pipeline on disk: what it needs to continue after a power cut.
+
+    DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.jobs.job`
+    DIR/desired_state.json  what was commanded: see `catstream.processes.decisions`
+    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.processes.outputs`
+    DIR/trees/              the compressor's checkpoints: see `catstream.compression.checkpoint_store`
+
+A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that
+happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from shlex import quote
+
+from catstream.base.errors import CatstreamError, ObjectError, ServiceError
+from catstream.base.files import descriptor, lock, write_atomically, writing
+from catstream.base.names import UNNAMED
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.compression.compressor import Compressor
+from catstream.jobs.job import Job
+from catstream.jobs.saved_model import Learned
+
+#: Folder of the checkpoints, in that of the state.
+TREES = "trees"
+#: Folder of the saved models that objects are searched for by, in that of the state.
+SEARCHED = "searched_models"
+
+_SMALL = ("job.safetensors", "desired_state.json")
+_NAMES = re.compile(
+    rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
+)
+_ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
+
+_log = logging.getLogger(__name__)
+
+
+def contains_run(folder: Path) -> bool:
+    """Whether a folder contains a run that can be resumed, whether or not that is complete."""
+    return (folder / _SMALL[0]).exists()
+
+
+def last_seq(folder: Path) -> int:
+    """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
+    return CheckpointStore(folder / TREES).position()[0]
+
+
+def last_time(folder: Path) -> float:
+    """Time of the frame of that message, in seconds."""
+    return CheckpointStore(folder / TREES).position()[1]
+
+
+def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
+    """Everything that was learned of an object up to the newest valid checkpoint; "" is also the only object.
+
+    ObjectError if there is no such object; ServiceError if nothing was learned before a checkpoint.
+    """
+    forest = CheckpointStore(folder / TREES).load(settings)
+    if name == UNNAMED and len(forest.compressors) == 1:
+        (name,) = forest.compressors
+    if forest.compressors and name not in forest.compressors:
+        wanted = repr(name) if name else "without a name"
+        raise ObjectError(f"there is no object {wanted}: the objects are {listed(forest.compressors)}")
+    return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """The content of the files that a pipeline needs to continue from its newest checkpoint, by their names.
+
+    Empty if there is no checkpoint yet. The pipeline may be running.
+    """
+    for _ in range(_ATTEMPTS):
+        with contextlib.suppress(FileNotFoundError):  # a newer file has just taken its place
+            # The desired state is read before the folder of the saved models that it names: they are stored before it.
+            content = {name: (folder / name).read_bytes() for name in _SMALL if (folder / name).exists()}
+            checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
+            for path in [*(folder / SEARCHED).glob("[0-9a-f]*.safetensors"), *checkpoints[-1:]]:
+                content[f"{path.parent.name}/{path.name}"] = path.read_bytes()
+            return content if checkpoints else {}
+    raise ServiceError(f"the state in {str(folder)!r} changes too quickly to be read: try again")
+
+
+def restore(folder: Path, content: Mapping[str, bytes]) -> None:
+    """Write what `files` returned to a new folder, from which a pipeline can be resumed.
+
+    ServiceError if a name is not one that `files` returns, or a file cannot be written.
+    """
+    for name, data in content.items():
+        if not _NAMES.fullmatch(name):
+            raise ServiceError(f"{name!r} is not a file of the state of a pipeline")
+        with writing(folder):
+            (folder / name).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            write_atomically(folder / name, data, mode=0o600)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
+    """Lock a folder for this process alone, and make it if it does not exist; wait so many seconds for another process.
+
+    ServiceError if another process keeps it locked, or it cannot be made.
+    """
+    with contextlib.ExitStack() as stack:
+        with writing(folder):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
+        if not lock(handle, seconds):
+            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or give another folder")
+        yield folder
+
+
+@contextlib.contextmanager
+def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
+    """Lock the state folder, and store the job there if it is new or has changed."""
+    with locked(folder):
+        if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
+            raise ServiceError(
+                f"{str(folder)!r} already contains a run: continue it (--resume {quote(str(folder))}), or give another "
+                "folder"
+            )
+        if job != resumed:
+            job.save(folder)
+        yield
+
+
+@contextlib.contextmanager
+def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[list[Path]]:
+    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving.
+
+    Yields the list of the files that were saved, filled afterwards.
+    """
+    done: list[Path] = []
+    errors: list[CatstreamError] = []
+    owner = os.getpid()
+    try:
+        yield done
+    finally:
+        for name, file in files.items() if owner == os.getpid() else ():  # not in a copy that was forked during the run
+            try:
+                learned(state, settings, name).save(file)
+                done.append(file)
+            except CatstreamError as error:
+                errors.append(error)
+        for problem in errors[0 if sys.exception() else 1 :]:
+            _log.warning("%s", problem)
+    if errors:
+        raise errors[0]

@@ -1,0 +1,505 @@
+"""A load test: its plan, its limits, a single run, and the search for the highest rate or number of streams."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from os import getpid
+from time import monotonic
+from typing import Literal
+
+import numpy as np
+
+from catstream.base.arrays import Float64
+from catstream.base.errors import ServiceError, SettingsError
+from catstream.base.names import check_count
+from catstream.base.settings import Settings
+from catstream.base.text import counted
+from catstream.loadtest.camera import Camera, Schedule
+from catstream.loadtest.latency import (
+    PERCENTILES,
+    REST,
+    Measures,
+    Observations,
+    Usage,
+    measure,
+    observed,
+    percentiles,
+    proportional_memory,
+    summary,
+)
+from catstream.loadtest.load import Stream, Subscribers, Video, render
+from catstream.loadtest.rtsp import encode
+from catstream.video import rendered
+
+#: Parameters that a search may find, by their names in `Plan`.
+Parameter = Literal["rate", "streams"]
+
+MOST_STREAMS = 64  # of a load test
+_LEAST, _MOST = 0.5, 1000.0  # frames per second
+_PRECISION = 0.05  # maximum relative error of the highest rate
+_START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
+_LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
+_GRACE_SECONDS = 3.0  # to wait for the track of the last frame
+_READING_SECONDS = 0.5  # between two readings of processor and memory use
+_LOOP_SECONDS = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The parameters of one run.
+
+    streams           number of pipelines, each of three processes
+    objects           number of objects that each pipeline tracks
+    subscribers       number of subscribers to the tracks of each stream
+    slow_subscribers  number of those that are slow; half of these are frozen instead
+    rate              frames per second of each stream, whether or not the pipeline keeps up
+    duration          seconds
+    size              (width, height) of a frame in pixels
+    source            what the camera sends: mjpeg, over HTTP, or h264, over RTSP
+    settings          settings of all pipelines
+    """
+
+    streams: int = 1
+    objects: int = 1
+    subscribers: int = 0
+    slow_subscribers: int = 0
+    rate: float = 25.0
+    duration: float = 10.0
+    size: tuple[int, int] = rendered.SIZE
+    source: str = "mjpeg"
+    settings: Settings = field(default_factory=Settings)
+
+    def __post_init__(self) -> None:
+        if self.slow_subscribers > self.subscribers:
+            raise SettingsError(
+                f"{self.slow_subscribers} of {self.subscribers} subscribers cannot be slow: "
+                "give more, or fewer slow ones"
+            )
+        if self.frames < 1:
+            raise SettingsError(
+                f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
+            )
+        if self.source == "h264" and any(side % 2 for side in self.size):
+            raise SettingsError("a frame of H.264 has an even width and an even height: give another size")
+        check_count(self.objects, self.settings.run.objects_most)
+        if self.settings.run.lockstep:
+            raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
+        if self.settings.run.endpoint:
+            raise SettingsError("each stream of a load test has an endpoint of its own: leave out endpoint")
+
+    def __str__(self) -> str:
+        objects = f", {self.objects} objects" if self.objects > 1 else ""
+        size = f"{self.size[0]}x{self.size[1]} pixels{', H.264' * (self.source == 'h264')}"
+        return f"{counted(self.streams, 'stream')} of {size}{objects}, {self.rate:g} frames/s due in each"
+
+    @property
+    def frozen(self) -> int:
+        """Number of the slow subscribers that are frozen."""
+        return self.slow_subscribers // 2
+
+    @property
+    def frames(self) -> int:
+        return round(self.rate * self.duration)
+
+
+@dataclass(frozen=True, slots=True)
+class _Quantity:
+    """A quantity that can have a limit: its description, its value in a result, and whether the limit is a minimum.
+
+    Limits of a time are given in seconds; people read milliseconds, as in the tables.
+    """
+
+    about: str
+    measure: Callable[[Result], float]
+    minimum: bool = False
+    is_time: bool = False
+
+    def in_words(self, value: float) -> str:
+        return f"{1000 * value:.4g} ms" if self.is_time else f"{value:.4g}"
+
+
+def _worst(name: str, kind: str) -> Callable[[Result], float]:
+    return lambda result: max(percentiles(getattr(stream, kind))[name] for stream in result.streams)
+
+
+#: All quantities that can have a limit, by name. If there are several streams, the worst one counts.
+KINDS: dict[str, _Quantity] = {
+    **{name: _Quantity("from a frame to its track", _worst(name, "track"), is_time=True) for name in PERCENTILES},
+    **{
+        f"model-{name}": _Quantity("from a frame to the model trained on it", _worst(name, "model"), is_time=True)
+        for name in PERCENTILES
+    },
+    "skipped": _Quantity(
+        "share of frames that were not tracked", lambda result: max(stream.skipped_share for stream in result.streams)
+    ),
+    "missed": _Quantity("share of frames whose tracks fast subscribers missed", lambda result: result.missed_share),
+    "success": _Quantity(
+        "share of frames with an overlap above 0.5",
+        lambda result: min(stream.success or 0.0 for stream in result.streams),
+        minimum=True,
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """A limit on one of the quantities in `KINDS`.
+
+    >>> Limit.parse("p99=0.1")
+    Limit(name='p99', value=0.1)
+    """
+
+    name: str
+    value: float
+
+    @classmethod
+    def parse(cls, text: str) -> Limit:
+        """Read `NAME=VALUE`."""
+        name, _, number = text.partition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = float("nan")
+        if name not in KINDS or not 0 <= value < float("inf"):
+            raise SettingsError(
+                f"a limit is NAME=VALUE with one of {', '.join(KINDS)}, got {text!r}: for example p99=0.1"
+            )
+        return cls(name, value)
+
+    def __str__(self) -> str:
+        return f"{self.name}={self.value:g}"
+
+    def is_met(self, result: Result) -> bool:
+        kind = KINDS[self.name]
+        value = kind.measure(result)
+        return value >= self.value if kind.minimum else value <= self.value
+
+    def describe(self, result: Result) -> str:
+        kind = KINDS[self.name]
+        sense = "least" if kind.minimum else "most"
+        value, limit = kind.in_words(kind.measure(result)), kind.in_words(self.value)
+        return f"{self.name} is {value}, limit at {sense} {limit} ({kind.about})"
+
+
+def violations(limits: list[Limit], result: Result) -> list[str]:
+    """Return a line for each stream that failed and each limit that was not met."""
+    return [*result.errors, *(limit.describe(result) for limit in limits if not limit.is_met(result))]
+
+
+#: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
+Report = Callable[[str, float, str], None]
+
+
+@dataclass(slots=True)
+class Result:
+    """The results of one run.
+
+    plan         parameters of the run
+    seconds      duration of the measured frames: less than planned if the run was interrupted
+    streams      measures of each stream
+    usage        readings of each process, and of the load by processes outside the load test
+    received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
+    frozen       seconds for which the frozen subscribers were stopped
+    camera_late  largest delay in seconds of a frame that the camera itself caused
+    memory       bytes of the processes of each stream, in which a shared page counts in proportion (PSS)
+    errors       errors of failed streams
+    interrupted  whether the run was interrupted
+    """
+
+    plan: Plan
+    seconds: float
+    streams: list[Measures]
+    usage: dict[str, list[tuple[float, int]]]
+    received: list[int]
+    missed: list[int]
+    frozen: float
+    camera_late: float
+    memory: list[int] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def followed(self) -> float:
+        """Frames per second that were tracked in the worst stream."""
+        return min(stream.rate(self.plan.rate) for stream in self.streams)
+
+    @property
+    def track(self) -> Float64:
+        return np.concatenate([stream.track for stream in self.streams])
+
+    @property
+    def model(self) -> Float64:
+        return np.concatenate([stream.model for stream in self.streams])
+
+    def cores(self, number: int) -> float:
+        """Return the processor seconds per second of the processes of a stream."""
+        return sum(summary(each)["cores"] for name, each in self.usage.items() if name.endswith(f" {number}"))
+
+    @property
+    def cost(self) -> tuple[float, float]:
+        """Mean of the streams: processor seconds per second, and bytes of memory."""
+        count = len(self.streams)
+        return sum(map(self.cores, range(count))) / count, sum(self.memory) / count
+
+    @property
+    def other_load(self) -> float:
+        """Mean number of cores that were busy with processes outside the load test."""
+        return summary(self.usage[REST])["cores"] if REST in self.usage else 0.0
+
+    @property
+    def missed_share(self) -> float:
+        """Share of the frames whose tracks fast subscribers missed."""
+        return sum(self.missed) / max(1, sum(self.missed) + sum(self.received))
+
+
+def run(plan: Plan, video: Video, camera: Camera, report: Report) -> Result:
+    """Run pipelines on the streams of a running camera, and measure; after Ctrl-C, return the measurements so far."""
+    camera.show_still()
+    streams = [Stream(number, url, video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
+    usage, interrupted, next_reading = Usage(), False, 0.0
+    with ExitStack() as stack:
+        seen, groups = _started(plan, streams, next(iter(video.boxes)), stack, report)
+        schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate, plan.frames))
+        try:
+            for now in _until_the_last_track(plan, streams, seen, schedules):
+                if now >= next_reading:
+                    next_reading = now + _READING_SECONDS
+                    usage.read(_pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]})
+                report(*_progress(plan, seen, now - schedules[0].start))
+        except KeyboardInterrupt:
+            interrupted = True
+        end, late = monotonic(), camera.late
+        memory = [proportional_memory(stream.pids.values()) for stream in streams]
+        frozen = max((group.frozen_seconds for group in groups), default=0.0)
+        report("ending", 1.0, "")
+        _stop(streams)
+        for group in groups:
+            group.wait()
+    due = [min(plan.frames, schedule.following(end)) if interrupted else plan.frames for schedule in schedules]
+    if not all(number > 0 for number in due):
+        raise KeyboardInterrupt
+    return Result(
+        plan=plan,
+        seconds=min(due) / plan.rate,
+        streams=[
+            measure(each, schedule, number, video.truth, end, stream.totals)
+            for each, schedule, number, stream in zip(seen, schedules, due, streams, strict=True)
+        ],
+        usage=usage.readings,
+        received=[count for group in groups for count in group.received()],
+        missed=[count for group in groups for count in group.missed()],
+        frozen=frozen,
+        camera_late=late,
+        memory=memory,
+        errors=[f"stream {number}: {stream.error}" for number, stream in enumerate(streams) if stream.error],
+        interrupted=interrupted,
+    )
+
+
+def _started(
+    plan: Plan, streams: list[Stream], name: str, stack: ExitStack, report: Report
+) -> tuple[list[Observations], list[Subscribers]]:
+    """Start the pipelines, wait for their first models, then connect the subscribers; the stack ends all of them."""
+
+    def wait_until(condition: Callable[[], bool], activity: str) -> None:
+        deadline = monotonic() + _START_TIMEOUT_SECONDS
+        while not condition():
+            for stream in streams:
+                if stream.error is not None:
+                    raise stream.error
+            if monotonic() > deadline:
+                raise ServiceError(
+                    f"{activity} took more than {_START_TIMEOUT_SECONDS:.0f} s: this machine is too slow or too busy, "
+                    "give fewer streams, subscribers or frames a second"
+                )
+            report(activity, 0.0, "")
+            time.sleep(_LOOP_SECONDS)
+
+    stack.callback(_stop, streams)
+    for stream in streams:
+        stream.start()
+    wait_until(lambda: all(stream.ready.is_set() for stream in streams), "starting processes")
+    for stream in streams:
+        if stream.error is not None:  # it has no endpoint to observe
+            raise stream.error
+    keys = plan.settings.run.keys
+    seen = stack.enter_context(observed([stream.endpoint for stream in streams], name, keys))
+    wait_until(lambda: all(each.warmed_up for each in seen), "learning the first models")
+    counts = {"readers": plan.subscribers, "slow": plan.slow_subscribers - plan.frozen, "frozen": plan.frozen}
+    groups = [stack.enter_context(Subscribers(stream.endpoint, keys=keys, **counts)) for stream in streams]
+    wait_until(lambda: all(group.connected for group in groups), "attaching subscribers")
+    for group in groups:
+        group.freeze()
+    return seen, groups
+
+
+def _stop(streams: list[Stream]) -> None:
+    """Stop all pipelines, and wait until they have ended, which they do concurrently."""
+    for stream in streams:
+        stream.stop()
+    for stream in streams:
+        stream.join()
+
+
+def _until_the_last_track(
+    plan: Plan, streams: list[Stream], seen: list[Observations], schedules: list[Schedule]
+) -> Iterator[float]:
+    """Yield the time twenty times a second.
+
+    It ends if the last frame of each stream was tracked, if the grace time for it is over, or if all streams failed.
+    """
+
+    def is_tracked(observations: Observations, schedule: Schedule) -> bool:
+        newest = observations.tracks[-1][1].pts
+        return newest is not None and schedule.number(newest) >= plan.frames - 1
+
+    last = schedules[-1].due(plan.frames - 1)
+    while (now := monotonic()) < last + _GRACE_SECONDS and any(stream.is_alive() for stream in streams):
+        if now > last and all(map(is_tracked, seen, schedules)):
+            break
+        yield now
+        time.sleep(_LOOP_SECONDS)
+
+
+def _progress(plan: Plan, seen: list[Observations], passed: float) -> tuple[str, float, str]:
+    latest = max(each.tracks[-1][0] - (each.tracks[-1][1].pts or 0.0) for each in seen)
+    received = sum(len(each.tracks) for each in seen)
+    figures = f"{received} tracks, the last {1000 * latest:.0f} ms after its frame"
+    return f"{plan.frames * len(seen)} frames", min(max(passed / plan.duration, 0.0), 1.0), figures
+
+
+def _pids(streams: list[Stream], groups: list[Subscribers]) -> dict[str, list[int]]:
+    pids = {f"{name} {number}": [pid] for number, stream in enumerate(streams) for name, pid in stream.pids.items()}
+    readers = [pid for group in groups for pid in group.pids]
+    return pids | ({"subscribers": readers} if readers else {})
+
+
+@dataclass(slots=True)
+class LoadTest:
+    """The runs of a load test.
+
+    limits       the limits of each run
+    find         the parameter whose highest value is searched for; None if there is no search
+    results      all runs, in order; empty if it was interrupted before the first measurement
+    highest      the highest value that meets the limits; None if there was no search, or no such value
+    refused      reasons why so many streams did not start, by their number
+    interrupted  whether it was interrupted
+    """
+
+    limits: list[Limit]
+    find: Parameter | None = None
+    results: list[Result] = field(default_factory=list)
+    highest: float | None = None
+    refused: dict[float, str] = field(default_factory=dict)
+    interrupted: bool = False
+
+    def value(self, result: Result) -> float:
+        return float(getattr(result.plan, self.find or "rate"))
+
+    @property
+    def result(self) -> Result:
+        """The decisive run: the one with the highest value that meets the limits, or the last one if none does."""
+        held = [result for result in self.results if not violations(self.limits, result)]
+        return max(held, key=self.value, default=self.results[-1])
+
+    @property
+    def violations(self) -> list[str]:
+        """The reasons why the load test has failed, one line each."""
+        if self.find is None:
+            return [line for result in self.results for line in violations(self.limits, result)]
+        if self.highest is None and not self.interrupted:
+            what, limits = "rate" if self.find == "rate" else "number of streams", ", ".join(map(str, self.limits))
+            return [f"no {what} meets {limits}: the lowest tried was {self.value(self.results[-1]):g}"]
+        return []
+
+
+def run_load_test(
+    plan: Plan,
+    limits: list[Limit],
+    *,
+    find: Parameter | None = None,
+    report: Report = lambda *_: None,
+    done: Callable[[Result], None] = lambda _: None,
+) -> LoadTest:
+    """Run a load test. After Ctrl-C, the measurements so far are returned.
+
+    find : search for the highest value of this parameter that meets the limits, beginning with that of the plan
+    report, done : functions that are called with the progress, and after each run
+    """
+    load_test = LoadTest(limits, find)
+    images = rendered.FRAMES if find == "rate" else min(plan.frames, rendered.FRAMES)
+
+    def report_frames(activity: str, count: int, total: int) -> None:
+        report(activity, count / total, f"{count} of {total} frames")
+
+    def holds(value: float) -> bool:
+        tried = replace(plan, rate=value) if find != "streams" else replace(plan, streams=int(value))
+        try:
+            with Camera(files, plan.size, tried.streams, plan.source) as camera:
+                result = run(tried, video, camera, report)
+        except ServiceError as error:
+            if find != "streams" or not load_test.results:
+                raise
+            load_test.refused[value] = str(error)
+            return False
+        load_test.results.append(result)
+        done(result)
+        if result.interrupted:
+            raise KeyboardInterrupt
+        return not violations(limits, result)
+
+    try:
+        video = render(plan.objects, images, plan.size, lambda count: report_frames("rendering", count, images))
+        files = video.files
+        if plan.source == "h264":
+            files = encode(files, plan.size, lambda count: report_frames("encoding", count, 2 * images))
+        if find == "rate":
+            load_test.highest = find_highest(plan.rate, holds)
+        elif find == "streams":
+            load_test.highest = find_highest(plan.streams, holds, least=1, most=MOST_STREAMS, digits=0, precision=0)
+        else:
+            holds(plan.rate)
+    except KeyboardInterrupt:
+        load_test.interrupted = True
+    return load_test
+
+
+def find_highest(
+    start: float,
+    holds: Callable[[float], bool],
+    *,
+    least: float = _LEAST,
+    most: float = _MOST,
+    digits: int = 1,
+    precision: float = _PRECISION,
+) -> float | None:
+    """Return the highest value for which `holds` is true, to within 5 %; None if it is false even for the lowest one.
+
+    The value is doubled or halved from `start` until the limit is between two values, and then bisected. `holds` is
+    called once for each value, so random variation of its result affects the answer.
+
+    least, most : range of values
+    digits : number of decimals of a value
+    precision : maximum relative error; it is not less than the last decimal
+
+    >>> find_highest(25.0, lambda rate: rate <= 42)
+    40.6
+    >>> find_highest(1, lambda streams: streams <= 42, least=1, most=64, digits=0, precision=0)
+    42.0
+    """
+    low, high, value = 0.0, float("inf"), min(max(start, least), most)
+    while value not in (low, high) and high - low > precision * low:
+        if holds(value):
+            low = value
+        else:
+            high = value
+        if low == 0.0:
+            value = max(round(high / 2, digits), least)
+        elif high == float("inf"):
+            value = min(round(2 * low, digits), most)
+        else:
+            value = round((low + high) / 2, digits)
+    return low or None

@@ -1,0 +1,129 @@
+"""H.264 over RTSP, as network cameras send it, for the camera of a load test.
+
+The video is encoded before the load test, so that a stream takes little processor time from the pipelines. RTP is sent
+in the connection of RTSP (RFC 2326, section 10.12), in packets of RFC 6184. The answer to PLAY states the due time of
+the first frame as its position. FFmpeg counts from there, so the time stamp of each frame is its due time, up to the
+period of the 32 bits of RTP. Other servers of live streams state no position, so the age of a frame would not be known.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from fractions import Fraction
+from http.client import parse_headers
+from socketserver import StreamRequestHandler
+from struct import pack
+from threading import Thread
+from typing import Any
+
+from catstream.base.errors import ServiceError
+
+_CLOCK = 90_000  # ticks per second of RTP time stamps of video
+_PERIOD = 2**32 / _CLOCK  # seconds
+_PAYLOAD = 1400  # bytes, so that a packet fits into one of Ethernet, as cameras send it
+_FRAGMENT = 28  # type of a packet with a part of a NAL unit (FU-A)
+_DESCRIPTION = (
+    b"v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=load test\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
+    b"a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:video\r\n"
+)
+#: As cameras encode: each frame refers to the one before, in one slice, with a key frame every two seconds at 25/s.
+_ENCODER = {
+    "preset": "veryfast",
+    "tune": "zerolatency",
+    "x264-params": "keyint=50:min-keyint=50:scenecut=0:sliced-threads=0",
+}
+
+
+def encode(pictures: Sequence[bytes], size: tuple[int, int], done: Callable[[int], None]) -> list[bytes]:
+    """Encode JPEG files, forwards, then backwards; return one access unit for each frame, the first is a key frame.
+
+    done : is called with the number of frames so far
+    """
+    import av
+
+    if "libx264" not in av.codecs_available:
+        raise ServiceError("PyAV has no encoder for H.264 here: pip install --force-reinstall av, or --source mjpeg")
+    decoder, encoder = av.CodecContext.create("mjpeg", "r"), av.CodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.options = *size, "yuv420p", _ENCODER
+    encoder.time_base, packets = Fraction(1, 25), []
+    for number, picture in enumerate([*pictures, *pictures[-2:0:-1]]):
+        (decoded,) = decoder.decode(av.Packet(picture))
+        frame = decoded.reformat(format="yuv420p")
+        frame.pts, frame.pict_type = number, 0  # the encoder chooses: each JPEG file is a key frame
+        packets += encoder.encode(frame)
+        done(number + 1)
+    return [bytes(packet) for packet in [*packets, *encoder.encode(None)]]
+
+
+def due_time(pts: float, arrival: float) -> float:
+    """Return the due time of a frame from its time stamp and the arrival of its track: FFmpeg may shift it by periods.
+
+    >>> due_time(pts=1000.0, arrival=1000.1), round(due_time(pts=-1.0, arrival=47721.0), 3)
+    (1000.0, 47720.859)
+    """
+    return pts + _PERIOD * round((arrival - pts) / _PERIOD)
+
+
+def payloads(unit: bytes) -> Iterator[bytes]:
+    """Yield the RTP payloads of an access unit: its NAL units, the large ones in parts.
+
+    >>> [len(part) for part in payloads(b"\\0\\0\\0\\1" + b"a" * 9 + b"\\0\\0\\1" + b"b" * 1500)]
+    [9, 1402, 101]
+    """
+    for nal in re.split(rb"\x00{2,3}\x01", unit)[1:]:
+        if len(nal) <= _PAYLOAD:
+            yield nal
+            continue
+        for begin in range(1, len(nal), _PAYLOAD):
+            is_last = begin + _PAYLOAD >= len(nal)
+            flags = (begin == 1) << 7 | is_last << 6
+            yield bytes([nal[0] & 0xE0 | _FRAGMENT, flags | nal[0] & 0x1F]) + nal[begin : begin + _PAYLOAD]
+
+
+class RtspConnection(StreamRequestHandler):
+    """The connection of one receiver: it answers what FFmpeg asks, and then sends frames until the receiver leaves."""
+
+    disable_nagle_algorithm = True
+
+    def handle(self) -> None:
+        server: Any = self.server
+        with suppress(OSError):  # the receiver has disconnected
+            while line := self.rfile.readline().decode():
+                method, address, _ = line.split()
+                headers = parse_headers(self.rfile)
+                count = f"CSeq: {headers['CSeq']}\r\nSession: 1\r\n"
+                if method == "PLAY":
+                    # What the receiver reports meanwhile is of no interest, but it must not fill up the connection.
+                    Thread(target=self._read_all, daemon=True).start()
+                    self._play(server.frames(int(address.strip("/").split("/")[3])), count)
+                    return
+                status, more, body = "200 OK", "", b""
+                if method == "DESCRIBE":
+                    more, body = "Content-Type: application/sdp\r\n", _DESCRIPTION
+                elif method == "SETUP" and "TCP" in headers["Transport"]:
+                    more = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\n"
+                elif method == "SETUP":
+                    status = "461 Unsupported Transport"
+                more += f"Content-Length: {len(body)}\r\n"
+                self.wfile.write(f"RTSP/1.0 {status}\r\n{count}{more}\r\n".encode() + body)
+
+    def _play(self, frames: Iterator[tuple[float, bytes]], count: str) -> None:
+        number, is_first = 0, True
+        for moment, unit in frames:
+            if is_first:
+                self.wfile.write(f"RTSP/1.0 200 OK\r\n{count}Range: npt={moment:.6f}-\r\n\r\n".encode())
+                is_first = False
+            sent, parts = b"", list(payloads(unit))
+            for part in parts:
+                marker = (part is parts[-1]) << 7
+                stamp = round(moment * _CLOCK) & 0xFFFFFFFF
+                packet = pack("!BBHII", 0x80, marker | 96, number & 0xFFFF, stamp, 1) + part
+                sent, number = sent + b"$" + pack("!BH", 0, len(packet)) + packet, number + 1
+            self.wfile.write(sent)
+
+    def _read_all(self) -> None:
+        with suppress(OSError):
+            while self.connection.recv(4096):
+                pass

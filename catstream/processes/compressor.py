@@ -1,0 +1,169 @@
+"""The process that compresses features in coreset trees, stores the trees on disk, and sends samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from time import monotonic
+
+from catstream.base.errors import ServiceError
+from catstream.base.settings import Settings
+from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.compression.compressor import Compressor
+from catstream.jobs.saved_model import Learned, continued
+from catstream.jobs.state import TREES, locked
+from catstream.messages.kinds import End, Features, Position, SavedModel
+from catstream.processes.decisions import checkpoint_is_due, stored, with_end
+from catstream.processes.process import MESSAGE_SECONDS, Process
+from catstream.wire.acknowledged import Receiver
+from catstream.wire.channels import FEATURES, SAMPLES, SAVED_MODELS
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Publisher
+
+_LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
+_SENDER_SECONDS = 5.0  # limit for the detector to send the end, once this process was asked to end
+_SAVED_MODEL_SECONDS = 1.0  # shortest time between two files of one object, for subscribers that save it
+
+
+def main(process: Process) -> None:
+    """Receive each message once, until the stream ends."""
+    with ExitStack() as stack:
+        loop = CompressorLoop(process, stack)
+        stack.callback(process.watchdog.allow)
+        end: End | None = None
+        while end is None and not loop.must_stop:
+            message = loop.receive()
+            if isinstance(message, End):
+                end = message
+            elif message is not None:
+                loop.insert(message)
+            loop.store_and_acknowledge(message)
+            loop.publish(end)
+        if end is None:
+            loop.stop()
+        else:
+            process.source_failed, process.has_ended = end.failed, True
+
+
+class CompressorLoop:
+    """A forest, its checkpoints, and the sockets that it is connected to."""
+
+    def __init__(self, process: Process, stack: ExitStack) -> None:
+        settings, endpoint = process.settings, process.endpoint
+        self._process = process
+        self._checkpoints = CheckpointStore(stack.enter_context(locked(process.state / TREES, _LOCK_SECONDS)))
+        self._forest = self._checkpoints.load(settings)
+        seq = self._forest.seq
+        self._position = Position(seq, seq, versions=self._forest.versions)
+        self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was written, and for how long
+        check, states, window = self._check, self._forest.states_at, settings.run.unstored_frames
+        self._features = stack.enter_context(Receiver(FEATURES, endpoint, self._position, window, check, states))
+        self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
+        for sample in self._forest.last_samples:
+            self._samples.send(sample)
+        self._saved_models = stack.enter_context(SavedModels(endpoint, settings))
+
+    @property
+    def must_stop(self) -> bool:
+        """Whether the process was asked to end, and a connected detector did not send its end in time."""
+        window = self._features.window
+        return self._process.seconds_since_stop >= (_SENDER_SECONDS if window.connected and not window.ended else 0)
+
+    def receive(self) -> Features | End | None:
+        """The next message, None if none arrives in a tenth of a second."""
+        return self._features.receive(MESSAGE_SECONDS)
+
+    def insert(self, features: Features) -> None:
+        """Insert features into the trees, and send the sample if there is a new one."""
+        before = self._forest.compressors.keys()
+        if any(part.model for part in features.objects.values()):
+            self._process.watchdog.allow()
+        beat = self._process.watchdog.beat  # after each object: all of them together may take long on a slow machine
+        for sample in self._forest.take(features, continued(features, self._process.settings), beat):
+            self._samples.send(sample)
+            beat()
+        if self._forest.compressors.keys() != before:
+            self._samples.keep_only(self._forest.compressors)
+
+    def store_and_acknowledge(self, message: Features | End | None) -> None:
+        """Write a checkpoint if one is due, then acknowledge the message, with the newest samples."""
+        before, seq = self._position, self._forest.seq
+        is_end = isinstance(message, End)
+        features = self._features
+        urgent = is_end or features.window.half_full or bool(features.asking)
+        interval = self._process.settings.run.checkpoint_seconds
+        if seq > self._stored and (urgent or checkpoint_is_due(monotonic() - self._tried, self._took, interval)):
+            self._store(urgent)
+        if message is not None or self._position is not before:
+            # Samples count without a checkpoint, because in lockstep the detector waits for their models.
+            position = replace(self._position, taken=seq, versions=self._forest.versions)
+            features.acknowledge(with_end(position, message.seq) if isinstance(message, End) else position)
+        features.answer()
+
+    @property
+    def _stored(self) -> int:
+        """Number of the newest message that is in a checkpoint."""
+        return self._position.seq - self._position.unsaved
+
+    def _store(self, urgent: bool) -> None:
+        self._process.watchdog.allow()
+        began = monotonic()
+        saved = self._checkpoints.save(self._forest)
+        self._position = stored(self._position, self._forest.seq, saved=saved, urgent=urgent)
+        self._tried = monotonic()
+        self._took = self._tried - began
+
+    def publish(self, end: End | None) -> None:
+        """Serve late joiners, send the trees and the end to subscribers, and publish the health."""
+        if end is not None:
+            self._samples.send(end)
+        self._samples.serve_late_joiners()
+        self._saved_models.turn(self._forest.compressors, self._process.watchdog.beat)
+        self._process.trouble = self._checkpoints.trouble
+        self._process.beat(self._counters, self._forest.object_counters, now=end is not None)
+
+    def stop(self) -> None:
+        """Store all received messages; the sender continues with the next compressor."""
+        if self._forest.seq > self._stored:
+            self._store(urgent=False)
+            self._features.acknowledge(replace(self._position, taken=self._forest.seq, versions=self._forest.versions))
+
+    def _check(self, message: Features | End) -> None:
+        """Raise ProtocolError for features of another stream."""
+        if isinstance(message, Features):
+            self._forest.check_features(message)
+
+    def _counters(self) -> dict[str, float]:
+        return self._forest.counters() | {"stored": self._stored}
+
+
+class SavedModels(Publisher[SavedModel]):
+    """Sends the trees of each object after each new sample, at most once a second; nothing without subscribers."""
+
+    def __init__(self, endpoint: Endpoint, settings: Settings) -> None:
+        super().__init__(SAVED_MODELS, endpoint)
+        self._settings = settings
+        self._sent: dict[str, tuple[int, float]] = {}  # version and time of the last file of each object
+
+    def turn(self, compressors: Mapping[str, Compressor], after_each: Callable[[], object]) -> None:
+        """Send the files that are due, with `after_each` after each; call it in every turn, as subscribers may join."""
+        self.serve_late_joiners()
+        if not self.has_subscribers:
+            if self._sent:  # the next subscriber gets new files only
+                self._sent.clear()
+                self.keep_only(())
+            return
+        for name, compressor in compressors.items():
+            version, moment = self._sent.get(name, (0, 0.0))
+            if compressor.version > version and (not version or monotonic() - moment >= _SAVED_MODEL_SECONDS):
+                self._send(name, compressor)
+                after_each()
+
+    def _send(self, name: str, compressor: Compressor) -> None:
+        try:
+            learned = Learned.of(compressor, self._settings)
+        except ServiceError:  # the object of a saved model has not been found yet
+            return
+        self.send(SavedModel(compressor.version, learned.to_bytes(), name))
+        self._sent[name] = compressor.version, monotonic()

@@ -1,0 +1,199 @@
+"""The decisions of the processes, as pure functions: where a detector continues, and for what it waits; what is stored.
+
+The desired state is what commands have set. It is kept on disk, for a detector that is restarted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, Self
+
+import msgspec
+
+from catstream.base.box import Box
+from catstream.base.errors import ProtocolError
+from catstream.base.files import write_atomically
+from catstream.messages.kinds import DetectorState, Position
+
+#: Name of the file of the desired state, in the folder of the state.
+DESIRED = "desired_state.json"
+
+_REST = 9.0  # from one checkpoint to the next, times the duration of the last one
+
+
+@dataclass(frozen=True, slots=True)
+class DesiredObject:
+    """An object that is to be followed.
+
+    box     the object in its first frame; the last box in the saved model if the object begins with one
+    begins  seq of the message of its first frame
+    model   name of the saved model that it begins with, see `catstream.processes.outputs.ModelFiles`; empty without one
+    size    bytes of the saved model
+    version of the saved model
+    """
+
+    box: Box
+    begins: int
+    model: str = ""
+    size: int = 0
+    version: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class DesiredState:
+    """The state that a detector keeps until a command changes it.
+
+    objects  the objects by name, in the order in which they began; none before a box is set
+    paused   whether tracking is paused
+    stopped  whether the stream is to end
+    """
+
+    objects: dict[str, DesiredObject] = field(default_factory=dict)
+    paused: bool = False
+    stopped: bool = False
+
+    @property
+    def holds(self) -> bool:
+        """Whether no frames are tracked: the run is paused, or waits for a box."""
+        return self.paused or not self.objects
+
+    def begun(self, name: str, each: DesiredObject) -> DesiredState:
+        """The state after an object has begun, in the place of another one of its name."""
+        return replace(self, objects=self.without(name).objects | {name: each})
+
+    def without(self, name: str) -> DesiredState:
+        """The state after an object was forgotten."""
+        return replace(self, objects={other: each for other, each in self.objects.items() if other != name})
+
+    def save(self, path: Path) -> None:
+        """Write the state to a file atomically; OSError if it cannot be written."""
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_atomically(path, msgspec.json.encode(self))
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote; ProtocolError if the file cannot be read."""
+        try:
+            return msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
+            raise ProtocolError(
+                f"the desired state cannot be read from {path} ({error!r}): the run starts with its original boxes, "
+                "repeat later commands"
+            ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a restarted detector continues.
+
+    seq      the last message before it
+    repeats  the last message that an earlier detector has sent: commands and pauses apply after it
+    desired  the objects; those that cannot continue begin again
+    states   the state of each object's detector that continues, with the newest model, by name
+    """
+
+    seq: int
+    repeats: int
+    desired: DesiredState
+    states: dict[str, DetectorState]
+
+
+def resume_at(position: Position, after: int, desired: DesiredState, context: float, *, live: bool) -> Start:
+    """Where a detector continues: after the last frame that both the compressor and the owner have.
+
+    Frames of a live source cannot be read again: the stream continues after the last one that was learned from.
+
+    A first model is kept nowhere. If nothing was learned of any object yet, a file is tracked from the first frame of
+    the first of them again. If nothing was learned of one of several objects, which takes long with the paper's first
+    tracker only, it begins again where it was last. An object of a saved model, of which the compressor has no trees,
+    begins again too.
+
+    Parameters
+    ----------
+    position : answer of the compressor, with the states after message `after`
+    after : number of the last frame that the owner of the run has
+    context : size of a window, in boxes of its object
+    """
+    seq = position.taken if live else min(after, position.taken)
+    repeats = position.taken if live or after == NO_OWNER else max(after, position.taken)
+    begun = {name: each for name, each in desired.objects.items() if each.begins <= seq}
+    if begun and not live and not position.versions:
+        return Start(min(each.begins for each in begun.values()) - 1, repeats, desired, {})
+    states = {name: state for name, state in position.states.items() if name in begun and name in position.versions}
+    for name, each in begun.items():
+        if name not in states:
+            state = None if each.model else position.states.get(name)
+            box = each.box if state is None else state.window.box(context)
+            desired = desired.begun(name, replace(each, box=box, begins=seq + 1))
+    return Start(seq, repeats, desired, states)
+
+
+#: In the place of the owner's last frame if a run has no owner.
+NO_OWNER = 1 << 62
+
+
+def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str, int]) -> bool:
+    """Whether the models have arrived that were trained from the compressor's newest samples, by their versions.
+
+    Either of compressor and trainer may have been restarted too, and then repeats its last steps.
+    """
+    return all(arrived.get(name) == version for name, version in position.versions.items() if name in desired.objects)
+
+
+def awaited(
+    due: int, taken: int, samples: Mapping[str, int], newest: Mapping[str, int]
+) -> Literal["", "features", "models"]:
+    """The channel on which a detector waits before its next frame; empty if it need not wait.
+
+    `due` is the seq of the newest features that the models must include by now, and `taken` that of the newest ones
+    that the compressor has processed. `samples` are the versions of each object's newest sample of the features up to
+    `due`, and `newest` those of the newest models that have arrived, of each object that had begun by then.
+
+    >>> awaited(due=7, taken=6, samples={}, newest={"": 0})
+    'features'
+    >>> awaited(due=7, taken=8, samples={"": 3}, newest={"": 2})
+    'models'
+    >>> awaited(due=7, taken=8, samples={"": 3}, newest={"": 3})
+    ''
+    """
+    if taken < due:
+        return "features"
+    return "models" if any(newest[name] < version for name, version in samples.items() if name in newest) else ""
+
+
+def checkpoint_is_due(since: float, took: float, interval: float) -> bool:
+    """Whether the interval is over `since` seconds after the last attempt to write a checkpoint, which `took` seconds.
+
+    It grows with the trees: at most a tenth of the time is spent.
+
+    >>> checkpoint_is_due(since=1.5, took=0.02, interval=1), checkpoint_is_due(since=1.5, took=0.2, interval=1)
+    (True, False)
+    """
+    return since >= max(interval, _REST * took)
+
+
+def stored(position: Position, seq: int, *, saved: bool, urgent: bool) -> Position:
+    """The position after an attempt to write a checkpoint of message `seq`.
+
+    If the disk is full, one that is urgent, as the sender waits for it, is acknowledged although it is only in memory:
+    training continues.
+
+    >>> stored(Position(8), 12, saved=False, urgent=True).unsaved
+    4
+    """
+    if not saved and not urgent:
+        return position
+    return replace(position, seq=seq, unsaved=0 if saved else seq - position.seq + position.unsaved)
+
+
+def with_end(position: Position, seq: int) -> Position:
+    """The position with the end of the stream, which contains no features: it counts as the message before it.
+
+    >>> with_end(Position(8, 8, 2), 9) == Position(9, 9, 3)
+    True
+    """
+    if seq <= position.seq:
+        return position
+    return replace(position, seq=seq, taken=seq, unsaved=position.unsaved and position.unsaved + 1)

@@ -1,0 +1,140 @@
+"""The parameter types and options that several commands share, each with one help text.
+
+The first part are decorators of one option. Those after it add several options that belong together, and pass them on
+as one argument of the command's function.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import click
+
+from catstream.base.errors import ObjectError
+from catstream.base.names import boxes_by_name, split_name
+from catstream.base.settings import PRESETS, Settings
+
+Command = Callable[..., Any]
+Decorator = Callable[[Command], Command]
+_Converter = Callable[[dict[str, str]], object]
+
+#: Parameter type of a file or folder.
+PATH = click.Path(path_type=Path)
+
+#: Parameter type of a folder, which may not exist.
+FOLDER = click.Path(path_type=Path, file_okay=False)
+
+
+class NumberRange(click.FloatRange):
+    """A number within bounds; NaN is none, although it is neither below nor above any bound."""
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> float:
+        number: float = super().convert(value, parameter, context)
+        if math.isnan(number):
+            self.fail(f"expected a number, got {value!r}", parameter, context)
+        return number
+
+
+with_overwrite = click.option("--overwrite", is_flag=True, help="Replace existing files.")
+with_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+with_keys = click.option(
+    "--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline or fleet requires keys."
+)
+with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
+
+
+def _by_name(flag: str, argument: str, metavar: str, convert: _Converter, help: str) -> Decorator:
+    """An option for objects, which may be repeated; the argument is what `convert` makes of the values by name."""
+
+    def by_name(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> object:
+        values: dict[str, str] = {}
+        for text in texts:
+            name, value = split_name(text)
+            if name in values:
+                earlier = f"{name}={values[name]}" if name else values[name]
+                hint = "its own name" if name else f"a name, NAME={value}"
+                raise ObjectError(f"{flag} {earlier} and {flag} {text}: give each object {hint}")
+            values[name] = value
+        return convert(values)
+
+    return click.option(flag, argument, multiple=True, metavar=metavar, callback=by_name, help=help)
+
+
+def with_files(flag: str, argument: str, help: str) -> Decorator:
+    """Add an option [NAME=]FILE, which may be repeated, as a dict of files by the names of the objects."""
+    return _by_name(flag, argument, "[NAME=]FILE", lambda files: {name: Path(files[name]) for name in files}, help)
+
+
+with_model = with_files("--model", "models", "Model of an object, written by `catstream save`.")
+
+_HELP = "An object in the first frame, in pixels; may be repeated with names."
+_with_box = _by_name("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name, _HELP)
+
+
+def with_object(command: Command) -> Command:
+    """Add `--box` and `--model`, which may be repeated, as the arguments `boxes` and `models`: dicts by name."""
+    return _with_box(with_model(command))
+
+
+def combined(argument: str, value: Callable[..., object], *options: Decorator) -> Decorator:
+    """Add options, and pass on what `value` makes of them as one argument.
+
+    The parameters of `value` are the names of the options; one of them may be an argument that another decorator, above
+    this one or among `options`, passes on.
+    """
+    names = list(signature(value).parameters)
+
+    def decorate(command: Command) -> Command:
+        @wraps(command)
+        def wrapped(**given: object) -> object:
+            made = value(**{name: given.pop(name) for name in names})
+            return command(**{argument: made}, **given)
+
+        whole: Command = wrapped
+        for option in reversed(options):
+            whole = option(whole)
+        return whole
+
+    return decorate
+
+
+#: Adds `--start`, `--end` and `--stride`, as the argument `part`, a slice.
+with_part = combined(
+    "part",
+    lambda start, end, stride: slice(start, end, stride),
+    click.option("--start", type=click.IntRange(0), metavar="N", help="First frame, for a file or folder."),
+    click.option("--end", type=click.IntRange(0), metavar="N", help="Frame before which to stop."),
+    click.option("--stride", type=click.IntRange(1), metavar="N", help="Track only every N-th frame."),
+)
+
+#: Adds `--settings`, `--preset` and `--set`, as the argument `given`: a dict of the settings that were given.
+with_given = combined(
+    "given",
+    lambda file, preset, pairs: Settings.given(preset=preset, file=file, overrides=pairs),
+    click.option("--settings", "file", type=PATH, help="TOML file of settings."),
+    click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings."),
+    click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated."),
+)
+
+#: Adds the same options, as the argument `settings`: those that were given, the others by default.
+with_settings = combined("settings", lambda given: Settings.from_values(given), with_given)
+
+
+def _reading(given: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool) -> dict[str, object]:
+    values = {"run.image_rate": fps, "run.skip_damaged": skip_damaged or None, "run.resize": resize or None}
+    return given | {name: value for name, value in values.items() if value is not None}
+
+
+#: Adds `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `given`.
+with_reading = combined(
+    "given",
+    _reading,
+    click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default."),
+    with_skip_damaged,
+    click.option("--resize", is_flag=True, help="Scale images of another size to that of the first one."),
+)

@@ -1,0 +1,288 @@
+"""The start server: a process that has imported what the processes of a pipeline need, and forks them.
+
+These imports take a process half a second, and a fork some milliseconds. The first pipeline of a program starts the
+server; all pipelines of the program share it, and it ends with the program, however that ended.
+
+    program                      start server                     detector, compressor, trainer
+       │ ─── request ─────────────> │ ─────────────────────── fork ─> │
+       │ <── process id ─────────── │                                 │
+       │ <── exit code ──────────── │ <─────────────────────── exit ─ │
+
+A request is a packet of JSON on a Unix socket, with the descriptors of the log, of the watchdog, and of a socket for
+the two answers: the process id; then the exit code, or minus the number of the signal. The server has one thread: a
+fork copies only the thread that calls it. The kernel kills its processes if the server ends; they are then restarted
+like any that died, by a new server.
+"""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import gc
+import json
+import os
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+
+from catstream.base.errors import ServiceError
+from catstream.base.threads import limit_process
+
+#: The processes that a server can start, in the order in which a pipeline starts and ends them.
+NAMES = ("detector", "compressor", "trainer")
+
+_LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
+_LONGEST = 1 << 16  # bytes of a request
+#: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
+#: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
+_MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
+
+
+def reset_process() -> None:
+    """Let this process begin in a known state, whatever its parent has set before: signals that are delivered, and as
+    many open files as it may have.
+    """
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
+class StartedProcess:
+    """A process that the server starts or has started; `answers` is the socket on which the server reports it.
+
+    lost  whether the server has ended before the process
+    """
+
+    def __init__(self, answers: socket.socket) -> None:
+        self._answers, self._lock = answers, threading.Lock()
+        self._pid = 0
+        self._code: int | None = None
+        self.lost = False
+
+    @property
+    def pid(self) -> int:
+        """Process id; waits until the server has started the process. 0 if it has ended."""
+        while not self._pid and self._code is None:
+            self._receive(_LOOK_SECONDS)
+        return self._pid if self.poll() is None else 0
+
+    def poll(self) -> int | None:
+        """Exit code, negative for the signal that ended the process; None while it runs or is being started."""
+        while self._code is None and self._receive(0):
+            pass
+        return self._code
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the process, unless it has ended."""
+        if pid := self.pid:
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+
+    def _receive(self, seconds: float) -> bool:
+        """Receive the next answer; returns whether one arrived in time."""
+        with self._lock:  # several threads may ask
+            if self._code is not None:  # another thread has received the end, and may have closed the socket
+                return False
+            self._answers.settimeout(seconds)
+            try:
+                data = self._answers.recv(_LONGEST)
+            except (BlockingIOError, TimeoutError):
+                return False
+            except ConnectionError:
+                data = b""
+            if not data:  # the server has ended, and the kernel kills the process
+                self._code, self.lost = -signal.SIGKILL, True
+            elif self._pid:
+                self._code = int(data)
+            else:
+                self._pid = int(data)
+            return True
+
+    def close(self) -> None:
+        """Kill the process if it runs, and wait until it has ended."""
+        self.send_signal(signal.SIGKILL)
+        while self.poll() is None:
+            self._receive(_LOOK_SECONDS)
+        self._answers.close()
+
+
+class StartServer:
+    """A start server, as its program sees it; ServiceError if the program is not one that Python runs."""
+
+    def __init__(self) -> None:
+        if getattr(sys, "frozen", False) or not os.access(sys.executable or "", os.X_OK):
+            raise ServiceError("a frozen program has no Python to start processes with: run it with python")
+        self.program = os.getpid()  # a copy of this process that is forked later has no server
+        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        # If the program has closed its standard output, the socket may have its number.
+        passed = fcntl.fcntl(theirs, fcntl.F_DUPFD_CLOEXEC, 3)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "catstream.processes.start_server", str(passed), str(self.program)],
+                env=os.environ | _MALLOC,
+                cwd="/",  # no entry of PYTHONPATH means the current folder of the program
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the end of the server
+                pass_fds=[passed],
+                start_new_session=True,  # Ctrl-C is for the program, which then ends its processes in order
+            )
+        os.close(passed)
+        self.pid = self._process.pid
+
+    def runs(self) -> bool:
+        """Whether it is of this process, and has not ended; ServiceError if it has ended with an error."""
+        if self.program != os.getpid():
+            return False
+        if (code := self._process.poll()) is not None and code > 0:
+            raise ServiceError(
+                f"{sys.executable} did not start the processes of a pipeline (exit code {code}): its error is above"
+            )
+        return code is None
+
+    def start(self, name: str, job: Path, log: int, watchdog: int, *, restarted: bool) -> StartedProcess:
+        """Request one of the processes `NAMES`, with descriptors of its log and its watchdog; do not wait for it."""
+        try:
+            folder = str(Path.cwd())
+        except FileNotFoundError:  # it was removed
+            folder = "/"
+        request = {"name": name, "job": str(job), "restarted": restarted, "folder": folder}
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs, suppress(ConnectionError):  # the server has just ended: so has the process
+            socket.send_fds(self._requests, [json.dumps(request).encode()], [log, watchdog, theirs.fileno()])
+        return StartedProcess(ours)
+
+    def close(self) -> None:
+        """End the server, and its processes with it."""
+        self._requests.close()
+        self._process.kill()  # it may be in a long import
+        self._process.wait()
+
+
+_server: StartServer | None = None
+_lock = threading.Lock()
+
+
+def start_server() -> StartServer:
+    """The server of this program; a new one if there is none."""
+    global _server
+    with _lock:
+        try:
+            runs = _server is not None and _server.runs()
+        except ServiceError:
+            close_start_server()  # the next call tries it again
+            raise
+        if _server is None or not runs:
+            close_start_server()
+            _server = StartServer()
+        return _server
+
+
+@atexit.register
+def close_start_server() -> None:
+    """End the server of this program, if there is one."""
+    global _server
+    if _server is not None and _server.program == os.getpid():
+        _server.close()
+    _server = None
+
+
+def _unlock() -> None:
+    """Replace the lock in a copy of this process, where another thread of the original may have held it."""
+    global _lock
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_unlock)
+
+
+def main(descriptor: int, program: int) -> None:
+    """Start processes until the program ends, as the requests on a socket say; return in none of them."""
+    if sys.stderr is None:  # the program has closed it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+        sys.stderr = os.fdopen(2, "w")
+    reset_process()
+    limit_process()  # before anything imports numpy
+    gc.disable()  # nothing of what is imported is garbage
+    requests = socket.socket(fileno=descriptor)
+    has_ended, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(wakes)
+    signal.signal(signal.SIGCHLD, lambda *_: None)  # wakes `poll` up
+    poll = select.poll()
+    for each in (requests.fileno(), has_ended, os.pidfd_open(program)):
+        poll.register(each, select.POLLIN)
+    running: dict[int, socket.socket] = {}  # the sockets for the answers, by process id
+    to_import = [*NAMES]
+    while True:
+        ready = [each for each, _ in poll.poll(0 if to_import else None)]
+        if not ready:
+            with suppress(Exception):  # the process imports it again, and reports the error
+                import_module(f"catstream.processes.{to_import.pop(0)}_process")
+        elif has_ended in ready:
+            os.read(has_ended, 4096)
+            while running and (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                with running.pop(ended[0]) as answers, suppress(OSError):  # nobody may wait for it
+                    answers.send(b"%d" % os.waitstatus_to_exitcode(ended[1]))
+        elif requests.fileno() in ready:
+            data, descriptors, _, _ = socket.recv_fds(requests, _LONGEST, 3)
+            if not data:
+                return
+            log, watchdog, answer_to = descriptors
+            request = json.loads(data)
+            with suppress(Exception):  # the process reports it
+                import_module(f"catstream.processes.{request['name']}_process")
+            gc.freeze()  # a later collection leaves the memory alone that all processes share
+            parent = os.getpid()
+            if not (pid := os.fork()):
+                _run(request, parent, log, watchdog)
+            os.close(log)
+            os.close(watchdog)
+            running[pid] = socket.socket(fileno=answer_to)
+            with suppress(OSError):
+                running[pid].send(b"%d" % pid)
+        else:
+            return
+
+
+def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
+    """Run a process that was just forked, and exit with its code."""
+    from catstream.processes.process import run
+
+    code = 1
+    try:
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        os.dup2(log, sys.stderr.fileno())
+        try:
+            descriptors = {int(each.name) for each in Path("/proc/self/fd").iterdir()}
+        except FileNotFoundError:  # there is no /proc
+            descriptors = {*range(1024)}
+        for descriptor in descriptors - {0, 1, 2, watchdog}:
+            with suppress(OSError):  # the one of the listing
+                os.close(descriptor)
+        with suppress(OSError):  # it was removed
+            os.chdir(request["folder"])
+        gc.enable()
+        code = run(request["name"], Path(request["job"]), parent, watchdog, restarted=bool(request["restarted"]))
+        atexit._run_exitfuncs()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)  # without the end of the interpreter, after which the thread of a source that hangs would crash
+
+
+if __name__ == "__main__":
+    try:
+        main(int(sys.argv[1]), int(sys.argv[2]))
+    except OSError as error:  # the limit of processes or of memory
+        sys.exit(f"catstream: cannot start a process: {error.strerror}")

@@ -1,0 +1,338 @@
+"""The processes of a run, in the program that owns it: started, received from, restarted if one dies or hangs, ended.
+
+All of this is done by one thread, however long the program takes with each frame.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import random
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from secrets import token_hex
+from typing import BinaryIO
+
+from catstream.base.errors import ServiceError, VideoError
+from catstream.jobs.job import Job
+from catstream.messages.kinds import End, Health, Track, Tracks
+from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS, Watchdog
+from catstream.processes.start_server import NAMES, StartedProcess, start_server
+from catstream.video.source import is_live
+from catstream.wire.channels import HEALTH
+from catstream.wire.endpoint import Endpoint
+from catstream.wire.newest import Subscriber
+from catstream.wire.results import ResultsReceiver
+
+STEP_SECONDS = 0.5  #: the most that counts between two looks at a process, as the program may have been suspended
+RESTART_SECONDS = 0.1  #: before the second restart in a minute; doubled for each further one
+RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and in which time
+APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is started again
+SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end before they are killed
+EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stream was received
+ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
+
+_LAST_LINE = 2000  # bytes at the end of a log in which the last line is searched for
+_STEP = 65536  # bytes of a log that are read at once; a longer line is left out
+
+_log = logging.getLogger(__name__)
+
+
+class ProcessLog:
+    """The log of a process, whose lines begin with its name: it writes to a file, and this class reads that."""
+
+    def __init__(self, name: str, file: BinaryIO) -> None:
+        self._mark, self._file = f"{name}: ", file
+        self._read = 0  # bytes that `new_lines` has returned
+        self._begin = 0  # of what the process that runs now has logged
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def new_lines(self) -> list[str]:
+        """The lines that the process logged since the last call, without the output of Python itself."""
+        # The process writes at the position of the file, which `pread` leaves alone.
+        data = os.pread(self.fileno(), _STEP, self._read)
+        whole, end, _ = data.rpartition(b"\n")
+        self._read += len(whole) + len(end) if end or len(data) < _STEP else len(data)
+        lines = whole.decode(errors="replace").splitlines()
+        return [line.removeprefix(self._mark) for line in lines if line.startswith(self._mark)]
+
+    def begin(self) -> None:
+        """Forget what an earlier process has logged, for `last_line`."""
+        self._begin = os.fstat(self.fileno()).st_size
+
+    def last_line(self) -> str:
+        """The last line that the process has logged, empty if there is none."""
+        size = os.fstat(self.fileno()).st_size
+        text = os.pread(self.fileno(), _LAST_LINE, max(self._begin, size - _LAST_LINE))
+        lines = text.decode(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix(self._mark) if lines else ""
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class Child:
+    """One process of a run, the file of whose job is `job`.
+
+    process   None if it is to be started when it is `due`
+    silent    seconds since its loop has last turned; or, once it has ended, since then
+    restarts  moments of its restarts
+    """
+
+    def __init__(self, name: str, job: Path, folder: Path) -> None:
+        self.name, self._job = name, job
+        self.due = self.silent = self._turns = 0.0
+        self.restarts: deque[float] = deque()
+        self.process: StartedProcess | None = None
+        self.watchdog = Watchdog.opened()
+        self.log = ProcessLog(name, (folder / f"{name}.log").open("w+b"))
+
+    @property
+    def code(self) -> int | None:
+        """Exit code of the process, None if it runs or is to be started."""
+        return self.process.poll() if self.process is not None else None
+
+    def start(self, after: int) -> None:
+        """Start the process; the owner of the run has the frames up to message `after`."""
+        self.end()
+        self.watchdog.close()
+        self.watchdog, self._turns, self.silent = Watchdog.opened(), 0.0, 0.0
+        self.watchdog.after = self.watchdog.read = after
+        self.log.begin()
+        log, watchdog = self.log.fileno(), self.watchdog.handle
+        self.process = start_server().start(self.name, self._job, log, watchdog, restarted=bool(self.restarts))
+
+    def ending(self, code: int) -> str:
+        """How the process has ended: the signal or the exit code; and its last line, if that can be about the end.
+
+        What another process kills has not logged why; what aborts has.
+        """
+        if code == STOPPED_EARLY:
+            return "as a signal asked it to end"
+        if self.process is not None and self.process.lost:
+            return "with the start server"
+        name = signal.Signals(-code).name if -code in {*signal.Signals} else -code  # those for real time have no name
+        how = f"with signal {name}" if code < 0 else f"with exit code {code}"
+        last = self.log.last_line() if code > 0 or code == -signal.SIGABRT else ""
+        return f"{how}: {last}" if last else how
+
+    def check(self, seconds: float) -> bool:
+        """Count the seconds without a turn of the loop; returns whether they are too many."""
+        turns, self._turns = self._turns, self.watchdog.turns
+        self.silent = self.silent + seconds if turns == self._turns and self.code is None else 0.0
+        return self.silent > self.watchdog.patience
+
+    def terminate(self, seconds: float, turn: Callable[[], object]) -> None:
+        """Ask the process to end, and wait at most `seconds` for it; `turn` is called again and again meanwhile."""
+        if self.process is not None:
+            self.process.send_signal(signal.SIGTERM)
+            deadline = time.monotonic() + seconds
+            while self.process.poll() is None and time.monotonic() < deadline:
+                turn()
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.close()
+            self.process = None
+
+    def close(self) -> None:
+        """Kill the process if it runs, and close the log and the watchdog."""
+        self.end()
+        self.log.close()
+        self.watchdog.close()
+
+
+class Supervisor:
+    """The processes of one run, and the thread that receives its tracks, its health and its end.
+
+    A process that died or hangs is restarted: at once, then after a pause that doubles each time.
+
+    folder  of the file of the job, of the logs, and of the state if the job has no folder for it
+    after   number of the last frame that the program has, which a run that is resumed follows
+    end     the last message of the run; None before it was received
+    health  the newest health report of each process, by its name
+    """
+
+    def __init__(self, job: Job, folder: Path, after: int = 0) -> None:
+        self.end: End | None = None
+        self.health: dict[str, Health] = {}
+        self._live, self._folder = is_live(job.source), folder
+        self._frames: deque[Tracks] = deque()  # that were received, and not returned yet
+        self._changed = threading.Condition()
+        self._over: bool = False  # whether no further frames are received
+        self._error: Exception | None = None
+        self._checked = time.monotonic()
+        self._ending, self._hurries, self._ended = threading.Event(), threading.Event(), threading.Event()
+        file = replace(job, state=job.state or folder, run=token_hex(8)).save(folder)
+        endpoint = Endpoint.parse(job.endpoint, job.settings.run.keys)
+        with ExitStack() as stack:
+            window = job.settings.run.unstored_frames
+            self._results = stack.enter_context(ResultsReceiver(endpoint, window + 1, after))
+            self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
+            self._children: dict[str, Child] = {}
+            for name in NAMES:
+                child = self._children[name] = Child(name, file, folder)
+                stack.callback(child.close)
+                child.start(after)
+            self._stack = stack.pop_all()
+        self._thread = threading.Thread(target=self._run, name="catstream supervisor", daemon=True)
+        self._thread.start()
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids of the running processes, by name."""
+        running = {name: child.process for name, child in self._children.items()}
+        return {name: pid for name, process in running.items() if process is not None and (pid := process.pid)}
+
+    @property
+    def restarts(self) -> int:
+        """How many times a process was restarted."""
+        return sum(len(child.restarts) for child in self._children.values())
+
+    def next_frame(self, seconds: float = math.inf) -> dict[str, Track] | None:
+        """Wait for the next frame: the track of each object by name; none if the time is over, None after the last one.
+
+        ServiceError if a process fails repeatedly, or another thread has ended the run; VideoError after the last frame
+        if the source failed.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._frames or self._over, None if seconds == math.inf else seconds)
+            if self._frames and not self._ending.is_set():
+                tracks = self._frames.popleft()
+                if self.end is None:
+                    self._children["detector"].watchdog.read = tracks.seq
+                return tracks.tracks
+            if not self._over:
+                return {}
+        if self._error is not None:
+            raise self._error
+        if self._ending.is_set():
+            raise ServiceError("the pipeline was closed, perhaps by another thread: make another one to go on")
+        if self.end is not None and self.end.failed:
+            raise VideoError(self.end.reason)
+        return None
+
+    def stop(self) -> None:
+        """End the processes in order, and receive what they still send; at once if this is interrupted."""
+        self._ending.set()
+        interruption: BaseException | None = None
+        while not self._ended.is_set():
+            try:
+                self._ended.wait()  # of Python 3.11, a `join` that is interrupted takes the thread for ended
+            except BaseException as error:
+                self._hurries.set()
+                interruption = error
+        if interruption is not None:
+            raise interruption
+
+    # In the thread
+
+    def _run(self) -> None:
+        """Receive until the detector has exited after the end of the run; then wait for `stop`."""
+        try:
+            with self._stack:
+                deadline = math.inf
+                try:
+                    while not self._ending.is_set() and time.monotonic() < deadline:
+                        self._turn()
+                        if self.end is not None:
+                            deadline = min(deadline, time.monotonic() + EXIT_SECONDS)
+                            if self._children["detector"].code in ENDED:
+                                break
+                    self._receive_health()
+                except Exception as error:
+                    self._error = error
+                self._is_over()
+                self._ending.wait()
+                self._shut_down()
+        finally:
+            self._is_over()
+            self._ended.set()
+
+    def _is_over(self) -> None:
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+
+    def _turn(self) -> None:
+        """Receive the next frame or the end; from time to time the health, and look after the processes."""
+        message = self._results.receive(TURN_SECONDS)
+        if isinstance(message, End):
+            self.end = message
+            self._children["detector"].watchdog.read = math.inf
+        elif message is not None:
+            with self._changed:
+                self._frames.append(message)
+                self._changed.notify()
+        before, now = self._checked, time.monotonic()
+        if now - before >= TURN_SECONDS:
+            self._checked = now
+            self._receive_health()
+            if self.end is None and not self._ending.is_set():
+                self._check_children(now, min(now - before, STEP_SECONDS))
+
+    def _receive_health(self) -> None:
+        """Receive the health reports that have arrived, and log each new problem."""
+        for report in self._reports.receive_all():
+            before = self.health.get(report.process)
+            if report.trouble and (before is None or before.trouble != report.trouble):
+                _log.warning("%s: %s", report.process, report.trouble)
+            self.health = self.health | {report.process: report}
+
+    def _check_children(self, now: float, seconds: float) -> None:
+        """Restart the processes that died, and kill those that hang; ServiceError if a restart is useless."""
+        for child in self._children.values():
+            code = child.code
+            if child.process is None:
+                if now >= child.due:
+                    child.start(self._results.last)
+            elif code in ENDED:
+                # Only this one was asked to end, or the detector died after it sent its end and has to repeat it.
+                child.silent += seconds
+                if child.silent > APART_SECONDS:
+                    child.start(self._results.last)
+            elif code is not None:
+                self._restart(child, code, now)
+            elif child.check(seconds):
+                _log.warning("the %s hangs, and is killed: it has stood still for %.0f s", child.name, child.silent)
+                child.process.send_signal(signal.SIGKILL)
+                child.silent = 0.0
+        if self._live:  # a source was lost or is available again
+            for line in self._children["detector"].log.new_lines():
+                _log.warning("%s", line)
+
+    def _restart(self, child: Child, code: int, now: float) -> None:
+        """Restart a process that died with an exit code, or schedule that."""
+        if not self._folder.exists():  # with the file of its job, and the sockets
+            raise ServiceError(
+                f"the {child.name} died {child.ending(code)}, and cannot be restarted, as the folder {self._folder} "
+                "was removed during the run: start again, with TMPDIR set to a folder that nothing cleans"
+            )
+        if code == PERMANENT_FAILURE:
+            raise ServiceError(child.log.last_line())
+        child.restarts.append(now)
+        recent = sum(now - moment < RECENT_SECONDS for moment in child.restarts)
+        if recent > RESTARTS:
+            raise ServiceError(f"the {child.name} died {recent} times in a minute, the last time {child.ending(code)}")
+        _log.warning("the %s died %s; it is restarted", child.name, child.ending(code))
+        if recent == 1:
+            child.start(self._results.last)
+        else:
+            child.end()
+            child.due = now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1)
+
+    def _shut_down(self) -> None:
+        """End the processes, the detector first, as its last messages need the others; what does not end is killed."""
+        deadline = time.monotonic() + SHUTDOWN_SECONDS
+        for child in self._children.values():
+            child.terminate(max(0.1, deadline - time.monotonic()) * (not self._hurries.is_set()), self._turn)
+        self._receive_health()

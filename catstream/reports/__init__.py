@@ -1,0 +1,1 @@
+"""The HTML of reports, and the provenance of their figures."""

@@ -1,0 +1,93 @@
+"""The provenance of measured figures: the code, the command, the settings and the machine."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from threadpoolctl import threadpool_info
+
+from catstream.base import errors
+from catstream.base.settings import Settings
+from catstream.evaluation.peers import OPENCV
+
+_ROOT = Path(errors.__file__).parents[1]
+_LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
+
+
+def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[str, object]:
+    """Return the provenance of figures as a JSON object, without host name and folder names.
+
+    The commit is that of the checkout, with -dirty if files were changed, and None if catstream runs from elsewhere;
+    the settings are those that differ from the default; `words` are those of the command, by default of this process.
+    """
+    given = [Path(sys.argv[0]).name, *sys.argv[1:]] if words is None else words
+    return {
+        "version": version("catstream"),
+        "commit": _commit(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "command": shlex.join(map(_without_folder, given)),
+        "settings": settings.changed(),
+        "machine": machine(),
+    }
+
+
+def machine() -> dict[str, object]:
+    """Return the processor, the cores available to this process, the memory in GB, and versions of the libraries."""
+    blas = {
+        f"{pool['internal_api']} {pool['version']} {pool.get('architecture', '')}".strip()
+        for pool in threadpool_info()
+        if pool["user_api"] == "blas"
+    }
+    return {
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "opencv": OPENCV,
+        "blas": sorted(blas),
+        **{library: version(library) for library in _LIBRARIES},
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.machine())
+
+
+def _commit() -> str | None:
+    """Return the commit of the checkout. Changes of docs and measurements do not make it dirty."""
+    if not (_ROOT / ".git").exists():
+        return None
+    commit = _git("rev-parse", "--short=10", "HEAD")
+    changed = _git("status", "--porcelain", "--", "catstream", "services", "benchmarks", ":!benchmarks/results")
+    return f"{commit}-dirty" if commit and changed else commit
+
+
+def _git(*words: str) -> str | None:
+    git = shutil.which("git")
+    if git is None:
+        return None
+    try:
+        done = subprocess.run([git, "-C", str(_ROOT), *words], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def _without_folder(word: str) -> str:
+    option, equals, value = word.rpartition("=")
+    return f"{option}{equals}{Path(value).name}" if Path(value).is_absolute() else word

@@ -1,0 +1,32 @@
+"""Boxes, as people write them."""
+
+import numpy as np
+import pytest
+
+from catstream.base.box import Box
+from catstream.base.errors import BoxError
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["10,20,30,40", " 10 20\t30, 40", (10, 20, 30, 40), np.array([10, 20, 30, 40]), iter([10, 20, 30, 40])],
+    ids=["commas", "blanks", "tuple", "array", "iterator"],
+)
+def test_a_box_is_parsed_from_a_text_and_from_any_four_numbers(value):
+    assert Box.parse(value) == Box(10.0, 20.0, 30.0, 40.0)
+
+
+@pytest.mark.parametrize(
+    "value", ["10,20,30", "a,b,c,d", "", (10, 20, 30), [[10, 20], [30, 40]], None, 7, (10, 20, None, 40)], ids=repr
+)
+def test_anything_but_four_numbers_is_one_line_of_error_with_an_example(value):
+    said = r"a box is four numbers x,y,w,h in pixels, got .*: for example 120,80,64,48"
+    with pytest.raises(BoxError, match=said) as told:
+        Box.parse(value)
+    assert "\n" not in str(told.value)
+
+
+def test_a_long_text_is_shortened_in_the_error():
+    with pytest.raises(BoxError) as told:
+        Box.parse(np.zeros((480, 640, 3)))
+    assert len(str(told.value)) < 200

@@ -1,0 +1,152 @@
+"""Settings: what is none is refused, wherever it comes from."""
+
+import copy
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+
+from catstream.base.errors import SettingsError
+from catstream.base.settings import PRESETS, CoresetSettings, RunSettings, Settings
+
+
+@pytest.mark.parametrize("text", [b"\xff", b"coreset_size", b"x = " + b"[" * 100_000], ids=["bytes", "text", "nested"])
+def test_a_file_that_is_not_toml_is_named(text, tmp_path):
+    (tmp_path / "set.toml").write_bytes(text)
+    with pytest.raises(SettingsError, match=r"set\.toml: this is not TOML"):
+        Settings.load(file=tmp_path / "set.toml", environment={})
+
+
+def grouped(name, value):
+    """Settings made of one group."""
+    group, _, short = name.partition(".")
+    return Settings(**{group: {short: value}})
+
+
+def replaced(name, value):
+    """Settings of which one group was replaced."""
+    group, _, short = name.partition(".")
+    settings = Settings()
+    return dataclasses.replace(settings, **{group: dataclasses.replace(getattr(settings, group), **{short: value})})
+
+
+#: Each way in which a program or a user gives a setting.
+WAYS = {
+    "Settings": grouped,
+    "replace": replaced,
+    "but": lambda name, value: Settings().but({name: value}),
+    "of": lambda name, value: Settings.from_values({name: value}),
+    "set": lambda name, value: Settings.load(overrides=[f"{name}={value}"], environment={}),
+    "environment": lambda name, value: Settings.load(
+        environment={f"CATSTREAM_{name.upper().replace('.', '_')}": str(value)}
+    ),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("name", "value", "takes"),
+    [
+        ("coreset.size", "x", "int >= 2, <= 4096"),
+        ("coreset.size", 1, "int >= 2, <= 4096"),
+        ("coreset.size", 2.5, "int >= 2, <= 4096"),
+        ("extent.size_count", -3, "int >= 1, <= 15"),
+        ("run.image_rate", 5e-324, "float >= 1e-09, <= 1000"),
+        ("run.checkpoint_seconds", 0, "float > 0, <= 3600"),
+        ("run.checkpoint_seconds", float("nan"), "float > 0, <= 3600"),
+        ("belief.trusted_score", float("inf"), "float"),
+        ("run.lockstep", 7, "bool"),
+        ("teaching.classifier", "wrong", "joint | least-squares | one-class"),
+        ("teaching.classifier", "\udcff", "joint | least-squares | one-class"),
+        ("teaching.near_misses", 257, "int >= 0, <= 256"),
+    ],
+)
+def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(way, name, value, takes):
+    with pytest.raises(SettingsError) as error:
+        WAYS[way](name, value)
+    shown = (repr(value), repr(str(value)), repr(float(value)) if name == "run.checkpoint_seconds" else "")
+    assert str(error.value) in [f"setting {name} cannot be {each}: it takes {takes}" for each in shown]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_an_unknown_name_is_rejected_with_the_nearest_ones(way):
+    with pytest.raises(SettingsError) as error:
+        WAYS[way]("coreset.sice", 64)
+    variable = " for the environment variable CATSTREAM_CORESET_SICE" if way == "environment" else ""
+    assert str(error.value).startswith(f"there is no setting 'coreset.sice'{variable}, did you mean 'coreset.size'")
+    assert "`catstream settings` lists all" in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+@pytest.mark.parametrize(
+    "variable",
+    ["HOME", "LOG_LEVEL", "SERVICE_HOST", "PORT", "PORT_5700_TCP_ADDR", "RUN_SERVICE_PORT_WEB", "RUN_PORT_5700_TCP"],
+)
+def test_a_variable_with_our_prefix_that_is_for_something_else_is_left_alone(variable):
+    assert Settings.load(environment={f"CATSTREAM_{variable}": "x"}) == Settings()
+
+
+@pytest.mark.parametrize("variable", ["RUN_ENDPOINT", "CORESET_SIZE"])
+def test_an_empty_variable_of_a_setting_is_an_error(variable):
+    with pytest.raises(SettingsError, match=f"CATSTREAM_{variable} is empty"):
+        Settings.load(environment={f"CATSTREAM_{variable}": ""})
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("coreset_size", "there is no setting 'coreset_size', did you mean 'coreset.size'"),
+        ("lockstep", "there is no setting 'lockstep', did you mean 'run.lockstep'"),
+        ("keys", "there is no setting 'keys', did you mean 'run.keys'"),
+        ("qqq", r"there is no setting 'qqq': `catstream settings` lists all \d+$"),
+        ("coreset", "the group of settings coreset cannot be 1: give a CoresetSettings"),
+    ],
+)
+def test_a_name_without_its_group_one_like_no_other_and_an_invalid_group_are_rejected(name, why):
+    with pytest.raises(SettingsError, match=why):
+        Settings(**{name: 1})
+
+
+@pytest.mark.parametrize("value", ["64", True, None, [64], np.float64(6.5)], ids=repr)
+def test_a_program_gives_values_of_their_type(value):
+    with pytest.raises(SettingsError, match=r"coreset\.size cannot be"):
+        Settings(coreset={"size": value})
+
+
+def test_a_number_of_any_kind_is_stored_as_one_of_python():
+    settings = Settings(coreset={"size": np.int64(32)}, search={"area": np.float32(2.5), "context": 2})
+    assert Settings(run={"lockstep": np.True_}).run.lockstep is True
+    numbers = settings.coreset.size, settings.search.area, settings.search.context
+    assert [type(number) for number in numbers] == [int, float, float]
+    assert settings == Settings(coreset={"size": 32}, search={"area": 2.5, "context": 2.0})
+
+
+def test_groups_may_be_written_in_one_way_or_the_other():
+    flat, nested = {"coreset.size": 32, "run.seed": 7}, {"coreset": {"size": 32}, "run": {"seed": 7}}
+    groups = Settings(coreset=CoresetSettings(size=32), run=RunSettings(seed=7))
+    assert Settings.from_values(flat) == Settings.from_values(nested) == groups
+    assert Settings().but(nested) == Settings(**nested) == groups
+
+
+@pytest.mark.parametrize(
+    ("pair", "name", "value"),
+    [
+        ("search.area=.25e1", "search.area", 2.5),
+        ("run.checkpoint_seconds=1e-3", "run.checkpoint_seconds", 0.001),
+        ("search.area=5.", "search.area", 5.0),
+        ("run.seed=007", "run.seed", 7),
+        ("run.lockstep=True", "run.lockstep", True),
+        ("run.lockstep=0", "run.lockstep", False),
+        ("search.mode = full", "search.mode", "full"),
+    ],
+)
+def test_a_text_is_read_as_a_person_writes_it(pair, name, value):
+    assert Settings.load(overrides=[pair], environment={}).values()[name] == value
+
+
+@pytest.mark.parametrize("preset", [None, *PRESETS])
+def test_settings_survive_texts_copies_and_pickles(preset):
+    settings = Settings.load(preset=preset, environment={})
+    assert Settings.from_values(settings.texts()) == settings
+    assert copy.deepcopy(settings) == pickle.loads(pickle.dumps(settings)) == settings

@@ -1,0 +1,285 @@
+"""Sequences: the same truth in every layout, and the frames and boxes that runs start from."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.base.box import Box
+from catstream.base.errors import CatstreamError, SettingsError, VideoError
+from catstream.base.settings import Settings
+from catstream.evaluation.datasets import (
+    FIRST,
+    SHIFTS,
+    Sequence,
+    Start,
+    choose_starts,
+    find_sequences,
+    jittered,
+    one_pass,
+    read_attributes,
+    spatial,
+    temporal,
+)
+from catstream.evaluation.onepass import evaluate
+
+TRUTH = np.array([[10, 20, 30, 40], [12.5, 21, 30, 40], [np.nan] * 4, [15, 22, 31, 41.5]])
+
+
+def folder(place: Path, name: str, images: str, text: str, frames: int = 4, file: str = "%05d.png") -> Path:
+    """A sequence: so many frames, and a file of truth."""
+    (place / images).mkdir(parents=True)
+    for number in range(1, frames + 1):
+        cv2.imwrite(str(place / images / (file % number)), np.full((8, 8, 3), number, np.uint8))
+    (place / name).write_text(text)
+    return place
+
+
+def lines(rows: np.ndarray, sign: str = ",") -> str:
+    return "".join(sign.join(f"{value:g}" for value in row) + "\n" for row in rows)
+
+
+def corners(rows: np.ndarray) -> np.ndarray:
+    return np.hstack([rows[:, :2], rows[:, :2] + rows[:, 2:]])
+
+
+def polygons(rows: np.ndarray) -> np.ndarray:
+    x, y, w, h = rows.T
+    return np.stack([x, y + h, x, y, x + w, y, x + w, y + h], axis=1)
+
+
+def check(place: Path, name: str = "walk") -> None:
+    (sequence,) = find_sequences(place)
+    assert sequence.name == name
+    np.testing.assert_allclose(sequence.boxes, TRUTH)
+    assert [int(image[0, 0, 0]) for image in sequence.frames()] == [1, 2, 3, 4]
+    assert [int(image[0, 0, 0]) for image in sequence.frames(2)] == [3, 4]
+
+
+LAYOUTS = {
+    **{f"OTB, {sign!r}": ("groundtruth_rect.txt", "img", TRUTH, sign, "%04d.jpg") for sign in (",", "\t", " ", ", ")},
+    "TLD, corners": ("gt.txt", ".", corners(TRUTH), ",", "%05d.png"),
+    "VOT, polygons": ("groundtruth.txt", ".", polygons(TRUTH), ",", "%08d.jpg"),
+    "VOT, rectangles, and a folder of colours": ("groundtruth.txt", "color", TRUTH, ",", "%05d.png"),
+    "Princeton, and a column for occlusion": ("walk.txt", "rgb", np.hstack([TRUTH, np.eye(4, 1)]), ",", "r-%d-1.png"),
+}
+
+
+@pytest.mark.parametrize(("name", "images", "rows", "sign", "file"), LAYOUTS.values(), ids=LAYOUTS)
+def test_the_layouts_of_the_benchmarks(tmp_path, name, images, rows, sign, file):
+    place = folder(tmp_path / "walk", name, images, lines(rows, sign), file=file)
+    (place / "depth").mkdir()  # Princeton's other images
+    cv2.imwrite(str(place / "depth" / "d-1-1.png"), np.zeros((8, 8), np.uint16))
+    check(place)
+
+
+def test_otb_with_two_objects_is_two_sequences_if_both_have_a_ground_truth(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.2.txt", "img", lines(TRUTH))
+    (place / "groundtruth_rect.1.txt").touch()
+    (place / "groundtruth_rect_old.txt").write_text(lines(TRUTH + 1))  # only named like one
+    check(place)
+    (place / "groundtruth_rect.1.txt").write_text(lines(TRUTH + 1))
+    first, second = find_sequences(place)
+    assert (first.name, second.name) == ("walk.1", "walk.2")
+    np.testing.assert_allclose(first.boxes, TRUTH + 1)
+
+
+def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
+    boxes = np.tile(TRUTH[:1], (471, 1))
+    (tmp_path / "David").mkdir()
+    (tmp_path / "David" / "groundtruth_rect.txt").write_text(lines(boxes))
+    assert find_sequences(tmp_path)[0].begin == 299
+    check(folder(tmp_path / "mine" / "david", "groundtruth_rect.txt", "img", lines(TRUTH)), "david")
+
+
+def test_a_rotated_polygon_is_read_as_its_bounding_box(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth.txt", ".", 2 * "10,5,15,10,10,15,5,10\n", frames=1)
+    np.testing.assert_allclose(find_sequences(place)[0].boxes, 2 * [[5, 5, 10, 10]])
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "box"),
+    [
+        ("groundtruth_rect.txt", "215,90 61,18 50,02 50", (215.9, 61.18, 50.02, 50)),
+        ("groundtruth_rect.txt", "215,9\t61,1\t50,2\t50,3", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "215,9;61,1;50,2;50,3", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "215,9, 61,1, 50,2, 50,3", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "215.9;61.1;50.2;50.3;", (215.9, 61.1, 50.2, 50.3)),
+        ("groundtruth_rect.txt", "10, 20,30 ,40", (10, 20, 30, 40)),
+        ("groundtruth_rect.txt", "10,20 30,40", (10, 20, 30, 40)),
+        ("gt.txt", "10,5 20,5 30,5 40,5", (10.5, 20.5, 20, 20)),
+        ("groundtruth.txt", "215,90 61,18 50,02 50,03", (215.9, 61.18, 50.02, 50.03)),  # no polygon: 02
+        ("groundtruth.txt", "10,5 15,10 10,15", (10, 5, 5, 10)),  # a triangle
+        ("groundtruth.txt", "10.0,5 15,10 10,15 5,10", (5, 5, 10, 10)),
+        ("walk.txt", "10,5 20,5 30,5 40,5 0", (10.5, 20.5, 30.5, 40.5)),
+    ],
+)
+def test_decimal_commas_are_read_where_a_comma_can_be_nothing_else(tmp_path, name, line, box):
+    place = folder(tmp_path / "walk", name, "img", f"{line}\n{line}\n")
+    np.testing.assert_allclose(find_sequences(place)[0].boxes, [box, box])
+
+
+@pytest.mark.parametrize("row", ["0,0,0,0", "10,10,0,5", "NaN,NaN,NaN,NaN", "10,10,nan,5", "10,10,-3,5"])
+def test_a_box_without_area_is_an_absent_object(tmp_path, row):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", f"1,2,3,4\n{row}\n1,2,3,4\n")
+    assert np.isnan(find_sequences(place)[0].boxes).all(axis=1).tolist() == [False, True, False]
+
+
+def test_a_folder_of_sequences_in_natural_order(tmp_path):
+    for name in ("10_car", "9_dog", "img"):
+        folder(tmp_path / name, "groundtruth_rect.txt", "img", lines(TRUTH))
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("not a sequence")
+    assert [sequence.name for sequence in find_sequences(tmp_path)] == ["9_dog", "10_car", "img"]
+
+
+def test_folders_of_one_name_are_told_apart_by_the_names_of_their_links(tmp_path, monkeypatch):
+    for link in ("one", "two"):
+        place = folder(tmp_path / "data" / link / "walk", "walk.txt", "rgb", lines(TRUTH))
+        (tmp_path / link).symlink_to(place)
+        check(tmp_path / link, link)
+    monkeypatch.chdir(tmp_path / "one" / "rgb")
+    check(Path(".."))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("groundtruth_rect.txt", "", "is empty"),
+        ("groundtruth_rect.txt", "1,2,3\n", "line 1: expected x,y,w,h, with decimal points, got '1,2,3'"),
+        ("groundtruth_rect.txt", "1,2,3,4\n1,2,3,4,5\n", "line 2: expected 4 numbers as in line 1"),
+        ("groundtruth_rect.txt", "1,2,3,4\na,b,c,d\n", "line 2"),
+        ("groundtruth_rect.txt", "1,,2,3,4\n", "line 1"),
+        ("groundtruth_rect.txt", "x,y,w,h\n1,2,3,4\n", "line 1: expected x,y,w,h"),
+        ("groundtruth_rect.txt", "1,2,3,4\n\n1,2,3,4\n", "line 2 is blank: .* nan,nan,nan,nan"),
+        ("groundtruth_rect.txt", "215,90,61,18,50,02,50,03\n", "line 1: expected x,y,w,h"),
+        ("groundtruth_rect.txt", "1,2,3,4,5,6,7,8\n", "line 1: expected x,y,w,h"),
+        ("groundtruth_rect.txt", "nan,nan,nan,nan\n", "has no box: expected a line with x,y,w,h for each frame"),
+        ("groundtruth_rect.txt", "1,2,3,4\n", "has one box: .* the object in at least two"),
+        ("groundtruth_rect.txt", "1,2,3,4\nnan nan nan nan\n", "has one box"),
+        ("gt.txt", "1,2,3,4,5\n", "line 1: expected x1,y1,x2,y2"),
+        ("groundtruth.txt", "215,90 61,18 50,20 50,30\n", "line 1: expected x,y,w,h or .* a polygon"),  # either
+        ("groundtruth.txt", "215,90,61,18,50,02,50,03\n", "line 1: expected x,y,w,h or .* a polygon"),
+        ("groundtruth.txt", "1,2,3,4,5,6,7\n", "line 1: expected x,y,w,h or .* a polygon"),
+        ("walk.txt", "1,0.5,0.5,0.1,0.1,7\n", "line 1: expected x,y,w,h or x,y,w,h,occluded"),
+    ],
+)
+def test_a_malformed_ground_truth_is_an_error_with_the_line(tmp_path, name, text, message):
+    place = folder(tmp_path / "walk", name, "img", text)
+    with pytest.raises(VideoError, match=message):
+        find_sequences(place)
+
+
+def test_a_ground_truth_that_is_no_text_is_an_error(tmp_path):
+    file = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", "") / "groundtruth_rect.txt"
+    file.write_bytes("1,2,3,4\n".encode("utf-16"))
+    with pytest.raises(VideoError, match=r"cannot be read .* expected a text file"):
+        find_sequences(tmp_path)
+
+
+def test_a_folder_without_sequences_is_an_error_with_the_layouts(tmp_path):
+    for place in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(VideoError, match="groundtruth_rect"):
+            find_sequences(place)
+
+
+def test_fewer_frames_than_boxes_are_an_error(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH), frames=3)
+    with pytest.raises(VideoError, match="1 frame too few"):
+        list(find_sequences(place)[0].frames())
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b'{"walk": "blur"}', b'{"a": [1]}', b'{"\xff": []}'])
+def test_a_file_of_attributes_in_another_form_is_an_error(tmp_path, content):
+    file = tmp_path / "attributes.json"
+    file.write_bytes(content)
+    for path in (file, tmp_path / "missing.json"):
+        with pytest.raises(SettingsError, match="cannot read the attributes"):
+            read_attributes(path)
+
+
+def boxes_of(starts: list[Start], sequence: Sequence) -> np.ndarray:
+    return np.array([start.box(sequence) for start in starts])
+
+
+def test_start_frames_are_evenly_spaced_over_the_frames_with_the_object(sequence):
+    def frames(count: int) -> list[int]:
+        return [start.frame for start in temporal(count)(sequence)]
+
+    assert frames(1) == [0]
+    assert frames(2) == [0, 8]  # the object is absent in 5, 6 and 7
+    assert frames(4) == [0, 3, 8, 9]
+    assert frames(12) == [0, 1, 2, 3, 4, 8, 9, 10]  # after the last one with the object, there is nothing to measure
+
+
+@pytest.mark.parametrize("box", [(-40, 50, 60, 30), (140, 50, 60, 30), (60, 50, 30, 1), (-99, 0, 330, 90)])
+def test_a_start_frame_whose_box_tracking_cannot_start_with_is_not_used(sequence, box):
+    boxes = sequence.boxes.copy()
+    boxes[[0, 3]] = box
+    frames = [start.frame for start in temporal(4)(replace(sequence, boxes=boxes))]
+    assert frames == [1, 4, 8, 9]
+
+
+def test_if_no_frame_has_a_valid_box_or_can_be_read_the_run_says_so(sequence, tmp_path):
+    outside = replace(sequence, boxes=np.tile([-90.0, 0, 60, 60], (12, 1)))
+    unreadable = replace(sequence, path=tmp_path)
+    errors: list[CatstreamError] = []
+    assert evaluate([outside], ["mil"], Settings(), starts=temporal(2), failed=errors.append) == []
+    assert evaluate([unreadable], ["mil"], Settings(), starts=temporal(2), failed=errors.append) == []
+    starts = ["mil on walk", "mil on walk@6", "mil on walk", "mil on walk@8"]
+    assert [str(error).split(": ")[0] for error in errors] == starts
+
+
+def test_every_choice_starts_when_the_object_appears(sequence):
+    late = Sequence("late", sequence.path, np.vstack([np.full((3, 4), np.nan), sequence.boxes]))
+    for starts in (one_pass, temporal(1), spatial, jittered(3)):
+        assert {start.frame for start in starts(late)} == {3}
+    assert {start.suffix for start in spatial(late)} > {"@3-left", "@3-size-0.8"}
+
+
+def test_each_option_of_the_command_chooses_its_starts(sequence):
+    assert choose_starts()(sequence) == [FIRST]
+    starts = {*temporal(4)(sequence), *spatial(sequence), *jittered(7)(sequence)}
+    assert len({start.suffix for start in starts}) == len(starts) == 4 + 12 + 6  # each has a name of its own
+    assert choose_starts(2)(sequence) == temporal(2)(sequence)
+    assert choose_starts(boxes=2)(sequence) == jittered(2)(sequence)
+    assert choose_starts(shifts=True)(sequence) == spatial(sequence)
+
+
+def test_the_shifts_are_those_of_the_cvpr2013_benchmark(sequence):
+    x, y, w, h = sequence.boxes[0]
+    found = boxes_of(spatial(sequence), sequence)
+    np.testing.assert_allclose(found[:8, 2:], [(w, h)] * 8)
+    centres = found[:, :2] + found[:, 2:] / 2 - (x + w / 2, y + h / 2)
+    moves = [(-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, -1), (-1, 1), (1, 1)]
+    np.testing.assert_allclose(centres, np.vstack([np.array(moves) * (0.1 * w, 0.1 * h), np.zeros((4, 2))]), atol=1e-9)
+    np.testing.assert_allclose(found[8:, 2:], np.outer([0.8, 0.9, 1.1, 1.2], (w, h)))
+
+
+def test_jittered_boxes_are_the_given_one_and_fixed_random_ones_within_two_percent(sequence):
+    x, y, w, h = sequence.boxes[0]
+    found = boxes_of(jittered(5)(sequence), sequence)
+    assert found[0].tolist() == [x, y, w, h]
+    for k in range(1, 5):
+        dx, dy, dw, dh = np.random.default_rng(k).uniform(-0.02, 0.02, 4)
+        wide, high = w * (1 + dw), h * (1 + dh)
+        np.testing.assert_allclose(found[k], (x + w / 2 + dx * w - wide / 2, y + h / 2 + dy * h - high / 2, wide, high))
+
+
+@given(st.tuples(st.floats(0, 159.9), st.floats(0, 119.9)), st.tuples(st.floats(2, 320), st.floats(2, 240)), st.data())
+def test_tracking_can_start_with_every_changed_box(centre, sides, data):
+    truth = Box(0, 0, *sides).centred(*centre)
+    sequence = Sequence("walk", None, np.array([truth]))
+    variations = [*SHIFTS, *(start.variation for start in jittered(4)(sequence)[1:])]
+    box = Start(0, data.draw(st.sampled_from(variations))).box(sequence, (160, 120))
+    assert box.validated(160, 120) is box
+
+
+@pytest.mark.parametrize("variation", SHIFTS, ids=lambda variation: variation.name)
+def test_a_changed_box_in_the_middle_of_the_frame_is_not_moved(sequence, variation):
+    start = Start(0, variation)
+    np.testing.assert_allclose(start.box(sequence, (1000, 1000)), start.box(sequence), atol=1e-9)

@@ -1,0 +1,338 @@
+"""Which files are searched, how their frames are, and which sightings are an interval."""
+
+import dataclasses
+import errno
+import shutil
+from fractions import Fraction
+from itertools import pairwise
+
+import av
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import catstream
+from catstream.base.box import Box
+from catstream.base.errors import ProtocolError, ServiceError, SettingsError, VideoError
+from catstream.base.settings import RunSettings
+from catstream.features.cells import Cells
+from catstream.features.pyramid import Pyramid
+from catstream.finding.find import File, Reading, Scan, Search, Sighting, Step, find_files, load_models
+from catstream.finding.found import FileResult, SearchLog
+from catstream.video.frames import Frame
+from catstream.video.writer import VideoWriter
+
+
+@pytest.fixture(scope="session")
+def search(model_files):
+    return Search(load_models(model_files))
+
+
+@pytest.fixture(scope="session")
+def appearing(once, images):
+    """A video in which the dahlia is seen in the frames 13 to 31 only."""
+
+    def write(folder):
+        height, width = images[0].shape[:2]
+        with VideoWriter(folder / "appearing.mp4", 25, (width, height)) as writer:
+            for number in range(40):
+                image = images[number] if 13 <= number <= 31 else np.full_like(images[0], 128)
+                writer.write(image)
+
+    return once("appearing", write) / "appearing.mp4"
+
+
+def finished(log, file, search, steps=None):
+    """Search a file to its end, or so many steps of it."""
+    result = log.begin(file)
+    for number, step in enumerate(() if result.complete else search.file(file)):
+        if number == steps:
+            return result
+        result.add(step)
+    log.end(result)
+    return result
+
+
+def test_one_frame_in_a_time_is_searched_and_the_last_one(search, appearing):
+    file = File(appearing, "video")
+    steps = list(search.file(file))
+    assert [step.frame.number for step in steps] == [*range(0, 40, 5), 39]
+    seen = [each.frame for step in steps for each in step.sightings if each.object == "dahlia"]
+    assert list(dict.fromkeys(seen)) == [15, 20, 25, 30]
+    rare = dataclasses.replace(search, every=1.2)
+    assert [step.frame.number for step in rare.file(file)] == [0, 30, 39]
+
+
+def test_a_search_that_was_interrupted_finds_the_same_as_one_that_was_not(search, appearing, video, tmp_path):
+    files = File(video, "video"), File(appearing, "video")
+    with SearchLog(tmp_path / "whole", search.description) as log:
+        whole = [finished(log, file, search) for file in files]
+    with SearchLog(tmp_path / "cut", search.description) as log:
+        finished(log, files[0], search)
+        finished(log, files[1], search, 4)
+    with (tmp_path / "cut").open("ab") as stream:
+        stream.write(b'{"file":"half a li')  # a process was killed in a write
+    with SearchLog(tmp_path / "cut", search.description) as log:
+        assert log.begin(files[0]).complete
+        assert not log.begin(files[1]).complete
+        assert [finished(log, file, search) for file in files] == whole
+    with SearchLog(tmp_path / "cut", search.description) as log:
+        assert list(log.results.values()) == whole
+        assert all(interval.picture.startswith(b"\xff\xd8") for each in whole for interval in each.intervals)
+
+
+def test_a_file_that_has_changed_is_searched_anew(search, appearing, video, tmp_path):
+    path = shutil.copy(appearing, tmp_path / "one.mp4")
+    with SearchLog(tmp_path / "log", search.description) as log:
+        finished(log, File(path, "video"), search)
+        assert log.begin(File(path, "video")).complete
+        shutil.copy(video, path)
+        assert not log.begin(File(path, "video")).complete
+
+
+def test_the_log_of_another_search_is_not_continued(search, tmp_path):
+    with SearchLog(tmp_path / "log", search.description):
+        pass
+    other = dataclasses.replace(search, threshold=0.7)
+    with pytest.raises(ServiceError, match="differs in threshold"):
+        SearchLog(tmp_path / "log", other.description)
+    with SearchLog(tmp_path / "log", other.description, overwrite=True) as log:
+        assert not log.results
+
+
+@pytest.mark.parametrize(
+    "content", ["[]\n", '{"kind":"catstream find 2"}\n', "no json\n", '{"kind":"catstream find 3"}\n']
+)
+def test_a_file_that_is_no_log_is_an_error_and_stays(search, tmp_path, content):
+    (tmp_path / "log").write_text(content)
+    with pytest.raises(ServiceError, match="is not the log of a search"):
+        SearchLog(tmp_path / "log", search.description)
+    assert (tmp_path / "log").read_text() == content
+
+
+def test_find_yields_the_sightings_of_all_paths_in_order(model_files, images, appearing, tmp_path):
+    for number in (20, 21):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), images[number])
+    found = list(catstream.find(model_files[0], [tmp_path, appearing, tmp_path / "20.png"]))
+    files = [sighting.file for sighting in found]
+    assert list(dict.fromkeys(files)) == [str(tmp_path), str(appearing), str(tmp_path / "20.png")]
+    names = [sighting.image for sighting in found if sighting.file == str(tmp_path)]
+    assert list(dict.fromkeys(names)) == ["20.png", "21.png"]
+    assert {sighting.object for sighting in found} == {"dahlia"}
+
+
+def test_an_unreadable_file_is_an_error_after_the_sightings_of_the_others(model_files, appearing, tmp_path):
+    (tmp_path / "damaged.mp4").write_bytes(appearing.read_bytes()[:2000])
+    found, sightings = [], catstream.find(model_files[0], [tmp_path / "damaged.mp4", appearing])
+    with pytest.raises(VideoError, match="damaged"):
+        found.extend(sighting.file for sighting in sightings)
+    assert set(found) == {str(appearing)}
+
+
+def test_models_without_a_file_or_with_one_name_are_errors(model_files, tmp_path):
+    with pytest.raises(ServiceError, match="no saved model"):
+        load_models([tmp_path / "none.model"])
+    with pytest.raises(SettingsError, match="named 'dahlia'"):
+        load_models([model_files[0], model_files[0]])
+    with pytest.raises(SettingsError, match="at least one model"):
+        load_models([])
+    (tmp_path / "cut.model").write_bytes(model_files[0].read_bytes()[:500])
+    with pytest.raises(ProtocolError):
+        load_models([tmp_path / "cut.model"])
+
+
+@pytest.mark.parametrize("sizes", [(2, 1), (0, 1), (1, np.nan), (1, np.inf)])
+def test_sizes_are_two_positive_numbers_in_order(model_files, appearing, sizes):
+    with pytest.raises(SettingsError, match="the smaller one first, got"):
+        catstream.find(model_files[0], appearing, sizes=sizes)
+
+
+def every_window(cells, weights, bias, least):
+    """As `Cells.respond_above`, with the score of every window computed to the end."""
+    scores = cells.respond(weights, bias)
+    return np.where(scores >= least, scores, -np.inf)
+
+
+@pytest.mark.parametrize("number", [0, 20, 40, 59])
+@pytest.mark.parametrize("threshold", [0.2, 0.5])
+def test_models_together_find_the_windows_of_each_models_plain_scan(learned, images, number, threshold, monkeypatch):
+    frame = Pyramid(images[number])
+    together = Scan(learned, threshold).windows(frame)
+    monkeypatch.setattr(Cells, "respond_above", every_window)
+    plain = [Scan([each], threshold).windows(frame)[0] for each in learned]
+    for ours, theirs in zip(together, plain, strict=True):
+        assert [each.score for each in ours] == pytest.approx([each.score for each in theirs], abs=1e-4)
+        np.testing.assert_allclose([each.window for each in ours], [each.window for each in theirs])
+
+
+def test_the_object_is_found_at_its_box(learned, images, demo_video):
+    for number in (20, 40, 59):
+        dahlia, _ = Scan(learned)(images[number])
+        assert dahlia[0].box.overlap(demo_video(60)[1][number]) > 0.6
+        assert dahlia[0].score > 0.7
+
+
+def test_every_sighting_reaches_the_threshold_and_overlaps_no_better_one(learned, images):
+    for found in Scan(learned, 0.1)(images[30]):
+        assert [each.score for each in found] == sorted((each.score for each in found), reverse=True)
+        assert all(each.score >= 0.1 for each in found)
+        assert all(a.window.overlap(b.window) < 0.3 for k, a in enumerate(found) for b in found[:k])
+
+
+def test_a_frame_without_the_object_or_smaller_than_a_window_has_no_sighting(learned, rng):
+    noise = rng.integers(0, 256, (240, 320, 3), np.uint8)
+    for image in (noise, np.full((240, 320, 3), 128, np.uint8), np.zeros((9, 12, 3), np.uint8)):
+        assert Scan(learned)(image) == [[], []]
+
+
+IMAGE = np.zeros((60, 80, 3), np.uint8)
+
+
+def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):
+    return Sighting(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
+
+
+def intervals_of(*steps):
+    """The intervals of the sightings of these steps."""
+    result = FileResult("walk.mp4", [], gap=1.0)
+    for number, step in enumerate(steps):
+        result.add(Step(Frame(number, step[0].time, IMAGE), step))
+    return result.intervals
+
+
+def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one():
+    alone = sighting(0.0), sighting(0.2, x=300.0), sighting(0.4, size=80.0), sighting(1.2), sighting(2.5)
+    assert [interval.count for interval in intervals_of(*([each] for each in alone))] == [4, 1]
+
+
+seen = st.tuples(st.floats(0, 30), st.sampled_from(["anna", "ben"]), st.floats(0.5, 1))
+
+
+@given(st.lists(seen, min_size=1, max_size=40))
+def test_every_sighting_is_in_one_interval_of_its_object(facts):
+    made = [sighting(time, name=name, score=score) for time, name, score in sorted(facts)]
+    found = intervals_of(*([each] for each in made))
+    assert sum(interval.count for interval in found) == len(made)
+    for name in ("anna", "ben"):
+        own = [interval for interval in found if interval.first.object == name]
+        assert all(one.last.time + 1.0 < other.first.time for one, other in pairwise(own))
+        for each in own:
+            within = [one for one in made if one.object == name and each.first.time <= one.time <= each.last.time]
+            assert (each.count, each.best.score) == (len(within), max(one.score for one in within))
+
+
+@pytest.fixture
+def tree(tmp_path, video):
+    """A folder with videos, images and other files."""
+    for place in ("clips/a.mp4", "clips/deep/b.MP4"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(video, tmp_path / place)
+    (tmp_path / "photos").mkdir()
+    for number in (10, 9, 1):
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), np.full((20 + number, 30, 3), number, np.uint8))
+    (tmp_path / "photos" / "notes.txt").write_text("no picture")
+    (tmp_path / ".hidden").mkdir()
+    shutil.copy(video, tmp_path / ".hidden" / "c.mp4")
+    return tmp_path
+
+
+def frames(file):
+    reading = Reading()
+    searched = file.frames(0.0, RunSettings(), reading)
+    return [(frame.number, name, frame.image.shape) for frame, name in searched], reading.problems
+
+
+def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
+    found = find_files([tree, tree / "clips" / "a.mp4"])
+    kinds = [(str(file.path.relative_to(tree)), file.kind) for file in found]
+    assert kinds == [("clips/a.mp4", "video"), ("clips/deep/b.MP4", "video"), ("photos", "images")]
+
+
+def test_a_subfolder_that_may_not_be_read_is_reported_and_the_others_are_searched(tree, monkeypatch, caplog):
+    listed = type(tree).iterdir
+
+    def iterdir(folder):
+        if folder.name == "deep":
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(type(tree), "iterdir", iterdir)
+    assert [file.path.name for file in find_files([tree])] == ["a.mp4", "photos"]
+    assert f"{tree / 'clips' / 'deep'} is left out (Permission denied)" in caplog.messages
+
+
+def test_linked_folders_are_searched_once_and_what_is_left_out_is_told(tree, tmp_path_factory, caplog):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    for name in ("c.m2ts", "d.heic", "e.heic", "f"):
+        shutil.copy(tree / "clips" / "a.mp4", elsewhere / name)
+    for link, to in (("linked", elsewhere), ("loop", tree), ("again", elsewhere), ("dead", tree / "gone")):
+        (tree / link).symlink_to(to)
+    found = [str(file.path.relative_to(tree)) for file in find_files([tree])]
+    assert found == ["again/c.m2ts", "clips/a.mp4", "clips/deep/b.MP4", "photos"]
+    assert "2 .heic, 2 without a suffix, 1 .txt" in caplog.text
+
+
+def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
+    found, problems = frames(File(tree / "photos", "images"))
+    assert found == [(0, "1.png", (21, 30, 3)), (1, "9.png", (29, 30, 3)), (2, "10.png", (30, 30, 3))]
+    assert not problems
+
+
+def test_images_that_are_unreadable_or_gone_are_reported_and_the_others_are_read(tree):
+    (tree / "photos" / "9.png").write_bytes(b"no picture")
+    (tree / "photos" / "8.png").symlink_to("gone.png")
+    file = File(tree / "photos", "images")
+    assert file.signature[0] == 3
+    found, (gone, unreadable) = frames(file)
+    assert [name for _, name, _ in found] == ["1.png", "10.png"]
+    assert "8.png" in gone
+    assert "9.png" in unreadable
+
+
+def test_a_single_image_has_a_frame_for_each_page(tree):
+    cv2.imwritemulti(str(tree / "a.tif"), [np.zeros((20, 30 + page), np.uint8) for page in range(3)])
+    one, several = find_files([tree / "photos" / "10.png", tree / "a.tif"])
+    assert frames(one)[0] == [(0, "", (30, 30, 3))]
+    assert frames(several)[0] == [(page, "", (20, 30 + page, 3)) for page in range(3)]
+
+
+def test_a_video_is_searched_by_time_whatever_its_rate_and_its_size_may_change(tmp_path, caplog):
+    times = [0.0, 0.01, 0.05, 0.19, 0.2, 0.31, 0.6, 0.61, 3.0, 3.01]
+    for name, width in (("a.ts", 160), ("b.ts", 320)):
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream("mpeg4", rate=25)
+            stream.width, stream.height, stream.pix_fmt = width, 120, "yuv420p"
+            stream.codec_context.time_base = Fraction(1, 1000)
+            for time in times:
+                frame = av.VideoFrame(width, 120, "yuv420p")
+                frame.pts, frame.time_base = round(1000 * time), Fraction(1, 1000)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode(None))
+    joined = tmp_path / "joined.ts"
+    joined.write_bytes((tmp_path / "a.ts").read_bytes() + (tmp_path / "b.ts").read_bytes())
+    reading = Reading()
+    steps = File(joined, "video").frames(0.2, RunSettings(), reading)
+    assert [frame.number for frame, _ in steps] == [0, 4, 6, 8, 13, 16, 18, 19]
+    assert not reading.problems
+    assert "10 frames of another size" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("none.mp4", "no file or folder"),
+        ("empty", "neither images nor videos: "),
+        ("texts", r"neither images nor videos \(1 \.txt\)"),
+        ("0", "live"),
+        ("rtsp://a:b@c/d", "rtsp://c/d is a live"),
+    ],
+)
+def test_what_cannot_be_searched_is_an_error(tmp_path, name, message, monkeypatch):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "texts").mkdir()
+    (tmp_path / "texts" / "a.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(VideoError, match=message):
+        find_files([name])

@@ -1,0 +1,49 @@
+"""What the tests of load tests share: tracks and models as an observer sees them."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from catstream.base.box import Box
+from catstream.loadtest.camera import Schedule
+from catstream.loadtest.latency import Measures
+from catstream.loadtest.load_test import Plan, Result
+from catstream.messages.kinds import Track
+
+BOX = Box(10.0, 10.0, 20.0, 20.0)
+
+
+@pytest.fixture
+def schedule() -> Schedule:
+    """Ten frames a second from moment 100 on."""
+    return Schedule(start=100.0, rate=10.0, frames=10)
+
+
+@pytest.fixture
+def track(schedule) -> Callable[..., tuple[float, Track]]:
+    """A track of a frame of the schedule that came some seconds after the frame."""
+
+    def made(number: int, after: float, *, frame: int | None = None, box: Box | None = BOX) -> tuple[float, Track]:
+        due = schedule.due(number)
+        frame = number if frame is None else frame
+        return due + after, Track(frame + 1, frame, 0.0, "present", box, 0.9, 1, due)
+
+    return made
+
+
+@pytest.fixture
+def result() -> Callable[..., Result]:
+    """A result of streams with these latencies to the track."""
+
+    def made(*streams: list[float], followed: float = 1.0, success: float = 1.0, **others) -> Result:
+        measures = []
+        rates = {"success": success, "success_followed": success}
+        for seconds in map(np.array, streams):
+            frames = np.arange(len(seconds))
+            seen = {"due": 100 + frames / 10, "followed": frames < followed * len(seconds)}
+            measures.append(Measures(**seen, **rates, track=seconds, model=seconds, without_track=0, max_lag=3))
+        facts = {"usage": {}, "received": [], "missed": [], "frozen": 0.0}
+        return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
+
+    return made

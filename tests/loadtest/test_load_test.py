@@ -1,0 +1,194 @@
+"""Limits and plans, and real runs: pipelines on a camera that does not wait, also if they are ended early."""
+
+import subprocess
+import time
+from contextlib import nullcontext
+
+import numpy as np
+import psutil
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from catstream.base.errors import ObjectError, ServiceError, SettingsError
+from catstream.base.settings import Settings
+from catstream.loadtest import load_test as module
+from catstream.loadtest.latency import REST, Usage
+from catstream.loadtest.load import Video
+from catstream.loadtest.load_report import to_json
+from catstream.loadtest.load_test import KINDS, Limit, Plan, find_highest, run_load_test, violations
+
+
+@pytest.fixture
+def sleeper():
+    child = subprocess.Popen(["sleep", "600"])
+    yield child
+    child.kill()
+    child.wait()
+
+
+def children():
+    """Processes of this one, but for the start server and the resource tracker, which stay to its end."""
+    servers = ("processes.start_server", "resource_tracker")
+    stay = [child for child in psutil.Process().children() if any(name in str(child.cmdline()) for name in servers)]
+    return [child for child in psutil.Process().children(recursive=True) if child not in stay]
+
+
+def test_usage_shows_which_process_is_busy(sleeper):
+    usage, busy = Usage(), psutil.Process().pid
+    usage.read({"busy": [busy], "idle": [sleeper.pid]})
+    deadline = time.process_time() + 0.3
+    while time.process_time() < deadline:
+        pass
+    usage.read({"busy": [busy], "idle": [sleeper.pid]})
+    assert usage.readings["idle"][0][0] < usage.readings["busy"][0][0]
+    assert usage.readings[REST][0][0] >= 0
+    assert 0 < usage.readings["idle"][0][1] < usage.readings["busy"][0][1]
+
+
+def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():
+    def tell(_, share, figures):
+        if share > 0.05 and "tracks" in figures:
+            raise KeyboardInterrupt
+
+    plan = Plan(rate=20.0, duration=20.0, size=(320, 240))
+    load_test = run_load_test(plan, [Limit("p99", 60.0)], report=tell)
+    assert load_test.interrupted
+    assert load_test.violations == []
+    (stream,) = load_test.result.streams
+    assert 10 <= stream.frames < plan.frames
+    assert stream.frames == len(stream.track)
+    assert load_test.result.seconds == pytest.approx(stream.frames / 20)
+    assert stream.totals["sent"] == stream.totals["stored"] > stream.frames  # what it learned before counts too
+    assert children() == []
+
+
+def test_a_still_before_the_first_frame_is_not_taken_for_it_at_a_low_rate():
+    load_test = run_load_test(Plan(rate=1.0, duration=1.0, size=(64, 64)), [])
+    (stream,) = load_test.result.streams
+    assert stream.track[0] > 0
+
+
+@pytest.mark.slow
+def test_a_search_ends_with_a_rate_that_meets_the_limits_below_one_that_does_not():
+    plan = Plan(rate=30.0, duration=3.0, size=(320, 240))
+    load_test = run_load_test(plan, [Limit("p99", 1.0), Limit("skipped", 0.05)], find="rate")
+    held = {step.plan.rate for step in load_test.results if not violations(load_test.limits, step)}
+    assert load_test.highest in held
+    assert load_test.result.plan.rate == max(held)
+    assert any(violations(load_test.limits, step) for step in load_test.results) or load_test.highest == 1000.0
+
+
+@pytest.fixture
+def machine(monkeypatch, result):
+    """Makes a machine that serves so many streams, and starts at most `most`; returns the numbers that were tried."""
+
+    def made(capacity, most=64):
+        tried = []
+
+        def run(plan, *_):
+            tried.append(plan.streams)
+            if plan.streams > most:
+                raise ServiceError("it took too long")
+            followed = 1.0 if plan.streams <= capacity else 0.9
+            run = result(*[[0.01] * 50] * plan.streams, followed=followed)
+            run.plan = plan
+            return run
+
+        monkeypatch.setattr(module, "run", run)
+        monkeypatch.setattr(module, "Camera", lambda *_: nullcontext())
+        monkeypatch.setattr(module, "render", lambda *_: Video([], {}, np.empty((0, 4))))
+        return tried
+
+    return made
+
+
+@pytest.mark.parametrize(
+    ("facts", "start", "steps", "highest"),
+    [
+        ({"capacity": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
+        ({"capacity": 6, "most": 6}, 1, [1, 2, 4, 8, 6, 7], 6),
+        ({"capacity": 3}, 8, [8, 4, 2, 3], 3),
+        ({"capacity": 99}, 40, [40, 64], 64),
+        ({"capacity": 0}, 2, [2, 1], None),
+    ],
+)
+def test_the_number_of_streams_is_doubled_or_halved_and_bisected(machine, facts, start, steps, highest):
+    tried = machine(**facts)
+    load_test = run_load_test(Plan(streams=start), [Limit("skipped", 0.0)], find="streams")
+    assert (tried, load_test.highest) == (steps, highest)
+    assert load_test.result.plan.streams == (highest or 1)
+    assert load_test.violations == ([] if highest else ["no number of streams meets skipped=0: the lowest tried was 1"])
+    assert to_json(load_test)["highest_streams"] == highest
+
+
+def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(machine):
+    machine(capacity=6, most=4)
+    assert run_load_test(Plan(), [], find="streams").refused == dict.fromkeys((8.0, 6.0, 5.0), "it took too long")
+    machine(capacity=6, most=0)
+    with pytest.raises(ServiceError, match="it took too long"):
+        run_load_test(Plan(), [], find="streams")
+
+
+def test_a_limit_applies_to_the_worst_stream(result):
+    run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
+    assert violations([Limit("p99", 0.1)], run) == ["p99 is 200 ms, limit at most 100 ms (from a frame to its track)"]
+    assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
+
+
+def test_the_limit_on_success_is_a_minimum(result):
+    run = result([0.01], success=0.8)
+    assert violations([Limit("success", 0.8)], run) == []
+    assert "limit at least 0.9" in violations([Limit("success", 0.9)], run)[0]
+
+
+def test_skipped_and_missed_are_shares_and_a_failed_stream_is_a_violation_in_any_case(result):
+    run = result([0.01] * 10, followed=0.9, received=[99, 99], missed=[1, 1], errors=["stream 0: it died"])
+    assert violations([Limit("skipped", 0.1), Limit("missed", 0.01)], run) == ["stream 0: it died"]
+    assert len(violations([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 3
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_limit_can_be_parsed_and_described(name, result):
+    limit = Limit.parse(f"{name}=0.5")
+    assert Limit.parse(str(limit)) == limit
+    assert limit.describe(result([0.25])).startswith(f"{name} is ")
+
+
+@pytest.mark.parametrize("text", ["p98=0.1", "p99", "p99=", "p99=fast", "p99=-1", "p99=nan", "p99=inf", "=1", ""])
+def test_a_malformed_limit_is_an_error(text):
+    with pytest.raises(SettingsError, match=r"NAME=VALUE with one of p50, .*for example p99=0\.1"):
+        Limit.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
+        ({"size": (321, 240), "source": "h264"}, "an even width"),
+        ({"settings": Settings(run={"endpoint": "run"})}, "leave out endpoint"),
+    ],
+)
+def test_a_contradictory_plan_is_an_error(facts, said):
+    with pytest.raises(SettingsError, match=said):
+        Plan(**facts)
+
+
+def test_a_plan_has_at_most_as_many_objects_as_the_settings_allow():
+    assert "8 objects" in str(Plan(objects=8))
+    with pytest.raises(ObjectError, match="8 objects are more than 4"):
+        Plan(objects=8, settings=Settings(run={"objects_most": 4}))
+
+
+@given(st.floats(0.5, 1000), st.floats(0.5, 1000))
+def test_the_search_is_within_5_percent_of_the_highest_rate_and_tries_each_rate_once(start, capacity):
+    step_done = []
+
+    def holds(rate):
+        step_done.append(rate)
+        return rate <= capacity
+
+    found = find_highest(start, holds)
+    assert found <= capacity <= max(found * 1.05 + 0.1, 1000 * (found == 1000))
+    assert len(step_done) == len(set(step_done)) <= 18
+    assert find_highest(start, lambda _: False) is None

@@ -1,0 +1,149 @@
+"""Laws of the decisions, in histories without processes: where a detector continues, its waits, what is stored."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from catstream.base.box import Box, Window
+from catstream.messages.kinds import DetectorState, Position
+from catstream.processes.decisions import (
+    NO_OWNER,
+    DesiredObject,
+    DesiredState,
+    awaited,
+    checkpoint_is_due,
+    have_arrived,
+    resume_at,
+    stored,
+    with_end,
+)
+from catstream.wire.go_back_n import ReceiveWindow
+
+BOX, PLACE = Box(1.0, 2.0, 30.0, 40.0), Window(40.0, 30.0, 20.0, 20.0)
+STATE = DetectorState(0, "weak", PLACE, PLACE, PLACE)
+NAMES = st.sampled_from(["", "anna", "ben"])
+DESIRED = st.builds(
+    DesiredState,
+    st.dictionaries(NAMES, st.builds(DesiredObject, st.just(BOX), st.integers(1, 20), st.sampled_from(["", "digest"]))),
+    st.booleans(),
+    st.booleans(),
+)
+SEQ = st.integers(0, 20)
+VERSIONS = st.dictionaries(NAMES, st.integers(1, 9))
+
+
+@given(DESIRED)
+def test_a_desired_state_is_read_as_it_was_written(tmp_path_factory, desired):
+    file = tmp_path_factory.mktemp("state") / "desired_state.json"
+    desired.save(file)
+    assert DesiredState.load(file) == desired
+
+
+@given(DESIRED, NAMES, st.integers(1, 30))
+def test_an_object_that_begins_is_the_last_one_and_one_that_is_forgotten_leaves_the_others_in_order(desired, name, seq):
+    others = [other for other in desired.objects if other != name]
+    begun = desired.begun(name, DesiredObject(BOX, seq))
+    assert [*begun.objects] == [*others, name]
+    assert [*begun.without(name).objects] == others
+
+
+@given(DESIRED, SEQ, SEQ | st.just(NO_OWNER), VERSIONS, st.sets(NAMES), st.booleans())
+def test_a_detector_continues_where_nothing_is_lost_and_no_frame_is_learned_from_twice(
+    desired, taken, after, versions, known, live
+):
+    position = Position(taken, taken, versions=versions, states=dict.fromkeys(known, STATE))
+    start = resume_at(position, after, desired, 1.5, live=live)
+    assert start.seq <= taken, "the compressor has all messages before"
+    assert start.repeats >= taken, "a command begins no object in a message that the compressor drops as a repeat"
+    assert sorted(start.desired.objects) == sorted(desired.objects), "no object is lost"
+    if live:
+        assert start.seq == taken, "frames of a live source are not read again"
+    else:
+        assert start.seq <= after, "the owner has all frames before"
+        assert start.repeats >= (after if after < NO_OWNER else 0)
+        if versions:
+            assert start.seq == min(after, taken)
+    for name, each in start.desired.objects.items():
+        continues, begins = name in start.states, each.begins > start.seq
+        assert continues != begins, "each object either continues with its state, or begins again"
+        assert not continues or name in versions, "without a model there is nothing to continue with"
+        assert replace(each, begins=0, box=BOX) == replace(desired.objects[name], begins=0, box=BOX)
+
+
+def test_if_nothing_was_learned_yet_a_file_is_tracked_from_the_first_frame_of_an_object_again():
+    desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
+    position = Position(0, 8, states={"anna": STATE})
+    start = resume_at(position, 6, desired, 1.5, live=False)
+    assert (start.seq, start.repeats, start.desired, start.states) == (2, 8, desired, {})
+
+
+def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last():
+    desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
+    position = Position(8, 8, versions={"anna": 2}, states={"anna": STATE, "ben": STATE})
+    start = resume_at(position, 8, desired, 1.5, live=False)
+    assert start.states == {"anna": STATE}
+    assert start.desired.objects["ben"] == DesiredObject(PLACE.box(1.5), 9)
+
+
+@given(VERSIONS, VERSIONS, DESIRED)
+def test_the_models_of_all_objects_that_are_tracked_have_to_arrive_in_the_compressors_version(newest, arrived, desired):
+    here = {name: version for name, version in newest.items() if name in desired.objects}
+    assert have_arrived(Position(versions=newest), desired, newest)
+    assert have_arrived(Position(versions=newest), desired, arrived) == (here.items() <= arrived.items())
+
+
+@given(SEQ, SEQ, VERSIONS, VERSIONS)
+def test_a_detector_waits_until_its_models_include_the_features_that_are_due(due, taken, samples, newest):
+    waits = awaited(due, taken, samples, newest)
+    behind = any(newest[name] < version for name, version in samples.items() if name in newest)
+    assert (waits == "features") == (taken < due)
+    assert (waits == "models") == (taken >= due and behind)
+
+
+class Storing(RuleBasedStateMachine):
+    """A receiver with a disk that fails now and then."""
+
+    @initialize(seq=st.integers(0, 5))
+    def begin(self, seq):
+        self.position = Position(seq, seq)
+        self.window = ReceiveWindow(self.position, 8)
+        self.seq = self.on_disk = seq
+
+    @rule(works=st.booleans(), due=st.booleans())
+    def receive(self, works, due):
+        self.seq += 1
+        self.window.receive(b"peer", self.seq, 0.0)
+        urgent = self.window.half_full
+        if urgent or due:
+            self.store(works, urgent)
+        self.window.acknowledge(replace(self.position, taken=self.seq))
+
+    @rule(works=st.booleans(), urgent=st.booleans())
+    def store(self, works, urgent):
+        self.on_disk = self.seq if works else self.on_disk
+        self.position = stored(self.position, self.seq, saved=works, urgent=urgent)
+
+    @invariant()
+    def what_a_sender_may_forget_is_on_disk_or_counted(self):
+        position = self.position
+        assert position.seq - position.unsaved == self.on_disk
+        assert position.seq <= self.seq
+        assert not self.window.half_full
+
+    @invariant()
+    def the_end_is_stored_as_much_as_the_message_before_it(self):
+        ended = with_end(self.position, self.seq + 1)
+        assert (ended.seq, ended.taken) == (self.seq + 1, self.seq + 1)
+        assert ended.unsaved == (self.position.unsaved + 1 if self.position.unsaved else 0)
+        assert with_end(self.position, self.position.seq) == self.position, "of a detector that repeats messages"
+
+
+TestStoring = Storing.TestCase
+TestStoring.settings = settings(max_examples=60)
+
+
+@given(took=st.integers(0, 60), interval=st.integers(1, 20), since=st.integers(0, 1000))
+def test_at_most_a_tenth_of_the_time_is_spent_writing(took, interval, since):
+    assert checkpoint_is_due(since, took, interval) == (since >= interval and took * 10 <= took + since)

@@ -1,0 +1,63 @@
+"""The files of saved models: they are read as they were written, and a damaged one is missing."""
+
+import signal
+import stat
+from contextlib import ExitStack, closing
+
+import pytest
+
+from catstream.base.box import Box
+from catstream.base.settings import Settings
+from catstream.jobs.job import Job
+from catstream.messages.kinds import Command
+from catstream.multi import MultiTracker
+from catstream.processes.detector import DetectorLoop
+from catstream.processes.outputs import ModelFiles
+from catstream.processes.process import Process
+from catstream.video.rendered import render
+
+
+@pytest.fixture(scope="module")
+def learned():
+    tracker = MultiTracker({"coreset.size": 8})
+    for number, (image, box) in enumerate(render(8, (160, 120))):
+        if number:
+            tracker.update(image)
+        else:
+            tracker.init(image, {"anna": box})
+    return tracker.learned("anna")
+
+
+def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_path):
+    files = ModelFiles(tmp_path / "models")
+    name = files.add(learned).model
+    files.store()
+    (file,) = (tmp_path / "models").iterdir()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert ModelFiles(tmp_path / "models").get(name).to_bytes() == learned.to_bytes()
+
+
+def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, caplog):
+    files = ModelFiles(tmp_path)
+    name = files.add(learned).model
+    files.store()
+    (tmp_path / f"{name}.safetensors").write_bytes(b"torn")
+    assert ModelFiles(tmp_path).get(name) is None
+    files.keep_only(set())
+    assert list(tmp_path.iterdir()) == []
+    assert files.get(name) is None
+    assert "is not searched for any more" in caplog.text
+
+
+@pytest.mark.parametrize("has_state", [True, False])
+def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp_path, monkeypatch, has_state):
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
+    settings = Settings(coreset={"size": 8}, run={"objects_most": 1})
+    state = tmp_path if has_state else None
+    job = Job("walk.mp4", {"ben": Box(1, 2, 30, 40)}, settings=settings, endpoint=str(folder), state=state)
+    with closing(Process("detector", job)) as process, ExitStack() as stack:
+        loop = DetectorLoop(process, stack)
+        loop._conclude(answer := loop._carried_out(Command("1", "search", object="anna", model=learned.to_bytes())))
+        assert not answer.done
+        assert list(loop.desired.objects) == ["ben"]
+        assert not loop._model_files._models

@@ -1,0 +1,76 @@
+"""The coreset trees as files, for subscribers."""
+
+from unittest.mock import Mock
+
+import pytest
+
+from catstream.base.settings import Settings
+from catstream.compression.compressor import Compressor
+from catstream.jobs.saved_model import Learned
+from catstream.messages.kinds import SavedModel
+from catstream.processes.compressor import SavedModels
+from catstream.wire.channels import SAVED_MODELS
+from catstream.wire.newest import Subscriber
+from tests.learning import features
+
+SETTINGS = Settings(coreset={"size": 4})
+
+
+def compressor(name, rng, frames=6):
+    """The compressor of an object that was found in some frames."""
+    found = Compressor(SETTINGS, name)
+    for frame in range(frames):
+        found.take(frame, features(rng), found.version + 1)
+    return found
+
+
+def nothing():
+    """Do nothing after a file."""
+
+
+def received(publisher, compressors, reader, after_each=nothing):
+    """The first message that a subscriber receives while the publisher takes its turns."""
+    for _ in range(200):
+        publisher.turn(compressors, after_each)
+        if (message := reader.receive(0.05)) is not None:
+            return message
+    raise AssertionError("nothing was received")
+
+
+def test_a_subscriber_receives_the_whole_trees_of_its_object(endpoint, rng):
+    compressors, made = {name: compressor(name, rng) for name in ("anna", "ben")}, Mock()
+    with (
+        SavedModels(endpoint, SETTINGS) as publisher,
+        Subscriber(SAVED_MODELS, endpoint, SavedModel, about="ben") as reader,
+    ):
+        message = received(publisher, compressors, reader, made)
+    assert made.call_count == 2, "the process reports that it lives after each file"
+    assert (message.object, message.version) == ("ben", compressors["ben"].version)
+    assert message.file == Learned.of(compressors["ben"], SETTINGS).to_bytes()
+
+
+def test_no_file_is_made_without_a_subscriber(endpoint, rng, monkeypatch):
+    monkeypatch.setattr(Learned, "of", lambda *_: pytest.fail("a file was made"))
+    with SavedModels(endpoint, SETTINGS) as publisher:
+        for _ in range(3):
+            publisher.turn({"": compressor("", rng)}, nothing)
+
+
+def test_an_object_that_was_not_found_yet_has_no_file(endpoint, rng):
+    compressors = {"anna": Compressor(SETTINGS, "anna"), "ben": compressor("ben", rng)}
+    with SavedModels(endpoint, SETTINGS) as publisher, Subscriber(SAVED_MODELS, endpoint) as reader:
+        assert received(publisher, compressors, reader).object == "ben"
+        assert reader.receive(0.1) is None
+
+
+def test_a_later_subscriber_receives_the_newest_trees(endpoint, rng):
+    compressors = {"": compressor("", rng)}
+    with SavedModels(endpoint, SETTINGS) as publisher:
+        with Subscriber(SAVED_MODELS, endpoint) as reader:
+            first = received(publisher, compressors, reader)
+        while publisher.has_subscribers:
+            publisher.turn(compressors, nothing)
+        compressors[""] = compressor("", rng, frames=30)
+        publisher.turn(compressors, nothing)
+        with Subscriber(SAVED_MODELS, endpoint) as reader:
+            assert received(publisher, compressors, reader).version == compressors[""].version > first.version

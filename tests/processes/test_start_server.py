@@ -1,0 +1,233 @@
+"""The start server forks the processes of a program's pipelines, and ends with it; and the log of a process."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from contextlib import closing, suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from catstream.base.errors import ServiceError
+from catstream.jobs.job import Job
+from catstream.processes import start_server as module
+from catstream.processes.process import STOPPED_EARLY, Watchdog
+from catstream.processes.start_server import start_server
+from catstream.processes.supervisor import Child, ProcessLog
+
+
+@pytest.fixture
+def own_server(monkeypatch):
+    """The next start server is the test's own."""
+    monkeypatch.setattr(module, "_server", None)
+    yield
+    module.close_start_server()
+
+
+@pytest.fixture
+def start(folder, tmp_path, until):
+    """Starts a trainer, which takes turns until it is ended; its process, its watchdog and its log."""
+    started = []
+
+    def trainer(job=None):
+        place = folder / str(len(started))
+        place.mkdir()
+        file = job or Job(endpoint=str(place)).save(place)
+        log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog.opened()
+        process = start_server().start("trainer", file, log.fileno(), watchdog.handle, restarted=False)
+        started.append((process, watchdog, log))
+        until(lambda: job or watchdog.turns > 2)
+        return started[-1]
+
+    yield trainer
+    for process, watchdog, log in started:
+        process.close()
+        watchdog.close()
+        log.close()
+
+
+def opened(pid):
+    """What the descriptors of a process lead to."""
+    places = {}
+    for name in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):  # it opens and closes files meanwhile
+            places[name.name] = str(name.readlink())
+    return places
+
+
+def has_ended(process):
+    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
+
+
+def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_server(start, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    started, _, log = start()
+    process, server = psutil.Process(started.pid), start_server()
+    assert process.ppid() == server.pid
+    assert process.cwd() == str(tmp_path)
+    assert os.getsid(process.pid) == server.pid != os.getsid(0), "Ctrl-C is for the program"
+    found = opened(process.pid)
+    assert found["0"] == found["1"] == "/dev/null"
+    assert found["2"] == str(Path(f"/proc/self/fd/{log.fileno()}").readlink())
+    of_the_server = {place for place in opened(server.pid).values() if place.startswith(("socket:", "pipe:"))}
+    assert not of_the_server & {*found.values()}
+    assert psutil.Process(server.pid).num_threads() == 1, "a fork copies only one"
+
+
+def test_a_current_folder_that_was_removed_is_no_obstacle(start, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert start()[1].turns > 2
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 4), (signal.SIGKILL, -signal.SIGKILL)])
+def test_how_a_process_has_ended_is_known(start, until, number, code):
+    process, *_ = start()
+    assert process.poll() is None
+    process.send_signal(number)
+    assert until(process.poll) == code
+    assert process.pid == 0
+
+
+def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_path, until):
+    (tmp_path / "job").write_text("not a job")
+    process, _, log = start(tmp_path / "job")
+    assert until(process.poll) == 2
+    assert "job" in log.last_line()
+
+
+@pytest.mark.usefixtures("own_server")
+def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(start, until):
+    process, *_ = start()
+    running, server = psutil.Process(process.pid), start_server()
+    os.kill(server.pid, signal.SIGKILL)
+    assert until(process.poll) == -signal.SIGKILL
+    until(lambda: has_ended(running))
+    again, *_ = start()
+    assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
+
+
+def test_nothing_outlives_a_program_that_is_killed(until):
+    program = "import time; from catstream.processes.start_server import start_server; "
+    program += "print(start_server().pid, flush=True); time.sleep(600)"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as owner:
+        server = psutil.Process(int(owner.stdout.readline()))
+        owner.kill()
+    until(lambda: has_ended(server))
+
+
+@pytest.mark.parametrize("closed", ["os.closerange(0, 3)", ""], ids=["by itself", "before its start"])
+def test_a_program_without_standard_streams_has_processes_that_run(tmp_path, folder, closed):
+    job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"
+    program = f"""
+import os, time
+from pathlib import Path
+{closed}
+from catstream.processes.start_server import start_server
+from catstream.processes.process import Watchdog
+with open({str(log)!r}, "w+b") as log:
+    watchdog = Watchdog.opened()
+    process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), watchdog.handle, restarted=False)
+    while watchdog.turns < 3 and process.poll() is None:
+        time.sleep(0.01)
+    code = process.poll()
+    process.close()
+os._exit(0 if code is None else 1)
+"""
+    before = None if closed else lambda: os.closerange(0, 3)
+    assert subprocess.run([sys.executable, "-c", program], check=False, preexec_fn=before).returncode == 0
+
+
+@pytest.mark.usefixtures("own_server")
+def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_have(start, until):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
+    try:
+        process, watchdog, _ = start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    until(lambda: watchdog.turns > 2)
+    assert psutil.Process(process.pid).rlimit(psutil.RLIMIT_NOFILE) == (hard, hard)
+    process.send_signal(signal.SIGTERM)
+    assert until(process.poll) == 4
+
+
+def test_a_server_that_cannot_run_is_an_error_that_names_it(monkeypatch, until):
+    monkeypatch.setattr(module, "_server", None)
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    server = start_server()
+    until(lambda: server._process.poll() is not None)
+    with pytest.raises(ServiceError, match="/bin/false did not start"):
+        start_server()
+    assert module._server is None
+
+
+def test_a_copy_of_a_program_that_was_forked_starts_a_server_of_its_own():
+    server = start_server()
+    reading, writing = os.pipe()
+    if not (pid := os.fork()):
+        copy = start_server()
+        os.write(writing, str(copy.pid).encode())
+        copy.close()
+        os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+    assert int(os.read(reading, 100)) != server.pid
+    assert psutil.pid_exists(server.pid)
+    os.close(reading)
+    os.close(writing)
+
+
+@pytest.mark.parametrize(("name", "value"), [("frozen", True), ("executable", ""), ("executable", "/gone/python")])
+def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name, value):
+    monkeypatch.setattr(module, "_server", None)
+    monkeypatch.setattr(sys, name, value, raising=False)
+    with pytest.raises(ServiceError, match="run it with python"):
+        start_server()
+
+
+def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
+    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
+        file.write(b"detector: an earlier one\n")
+        file.flush()
+        log.begin()
+        assert log.last_line() == ""
+        file.write(b"detector: one\nTraceback\ndetector: tw")
+        file.flush()
+        assert log.new_lines() == ["an earlier one", "one"]
+        file.write(b"o\n")
+        file.flush()
+        assert log.new_lines() == ["two"]
+        assert log.last_line() == "two"
+
+
+def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_one(tmp_path):
+    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
+        file.write(b"detector: " + bytes(200_000) + b"\ndetector: the source is lost\n")
+        file.flush()
+        assert [line for _ in range(9) for line in log.new_lines()] == ["the source is lost"]
+
+
+@pytest.mark.parametrize(
+    ("code", "ending"),
+    [
+        (-signal.SIGKILL, "with signal SIGKILL"),
+        (-signal.SIGABRT, "with signal SIGABRT: its last line"),
+        (-(signal.SIGRTMIN + 1), f"with signal {signal.SIGRTMIN + 1}"),
+        (1, "with exit code 1: its last line"),
+        (STOPPED_EARLY, "as a signal asked it to end"),
+    ],
+)
+def test_the_reason_of_a_death_is_the_signal_and_what_the_process_itself_has_said_of_it(tmp_path, code, ending):
+    child = Child("trainer", tmp_path, tmp_path)
+    with closing(child.log), (tmp_path / "trainer.log").open("ab") as file:
+        file.write(b"trainer: its last line\n")
+        file.flush()
+        assert child.ending(code) == ending
+        child.log.begin()
+        assert child.ending(code) == ending.removesuffix(": its last line")

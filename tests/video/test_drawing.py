@@ -1,0 +1,198 @@
+"""Annotated video: every frame, any size, whole or not there; colours that can be told apart, and stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+
+from catstream.base.box import Box
+from catstream.base.errors import VideoError
+from catstream.messages.kinds import State, Track
+from catstream.reports.page import COLOURS
+from catstream.video.drawing import PALETTE, Colours, draw, drawn_size
+from catstream.video.source import open_source
+from catstream.video.writer import VideoWriter
+
+BOX = Box(40, 30, 60, 40)
+
+
+def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Track:
+    return Track(frame + 1, frame, 0.0, state, box, 0.8, 3)
+
+
+@pytest.mark.parametrize("state", ["bootstrapping", "present", "absent"])
+@pytest.mark.parametrize("size", [(640, 480), (320, 240), (1921, 1081), (70, 50)])
+def test_drawing_does_not_change_the_frame_and_the_text_is_below_it(state, size):
+    image = np.full((size[1], size[0], 3), 128, np.uint8)
+    drawn = draw(image, [track(state, None if state == "absent" else BOX)], Colours())
+    assert (drawn.shape[1::-1], drawn.shape[2]) == (drawn_size(size), 3)
+    assert drawn.shape[1] == size[0]
+    assert (image == 128).all()
+    assert (drawn[: size[1]] != 128).any() == (state != "absent")
+    assert (drawn[size[1] :] != 128).any()
+
+
+def test_each_object_is_drawn_in_its_own_colour_which_stays(rng):
+    image, colours = rng.integers(0, 256, (240, 320, 3), np.uint8), Colours()
+    anna, ben = replace(track(), object="anna"), replace(track(box=Box(200, 90, 50, 60)), object="ben")
+    for tracks in ([anna, ben], [ben, anna], [ben]):
+        drawn = draw(image, tracks, colours)
+        for each in tracks:
+            assert has_colour(drawn[:240], colours.of(each.object)), "its box and its name"
+            assert has_colour(drawn[240:], colours.of(each.object)), "its score"
+    assert not has_colour(drawn, colours.of("anna"))
+    assert colours.of("anna") != colours.of("ben")
+
+
+def has_colour(image, colour):
+    red, green, blue = bytes.fromhex(colour[1:])
+    return (image == (blue, green, red)).all(axis=2).sum() > 9
+
+
+@pytest.mark.parametrize("size", [(70, 50), (352, 288), (1920, 1080)])
+@pytest.mark.parametrize(
+    "box", [BOX, Box(-500, -500, 10, 10), Box(-50, -50, 900, 3), Box(60, 45, 4, 4), Box(5, 5, 0, 0), None]
+)
+def test_many_objects_with_long_names_can_be_drawn_in_any_picture(size, box):
+    tracks = [replace(track(box=box), object=f"{k}-" + 60 * "ë") for k in range(32)]
+    assert draw(np.zeros((size[1], size[0], 3), np.uint8), tracks, Colours()).shape[1] == size[0]
+
+
+@pytest.mark.parametrize("size", [(640, 480), (321, 241), (99, 77)])
+def test_the_video_has_each_frame_written_at_any_size(tmp_path, size):
+    path = tmp_path / "deep" / "out.mp4"
+    image = np.full((size[1], size[0], 3), 128, np.uint8)
+    with VideoWriter(path, 29.97, size) as video:
+        for _ in range(9):
+            video.write(image)
+        assert not path.exists()
+    with open_source(path) as source:
+        assert source.rate == pytest.approx(29.97)
+        width, height = source.size
+        assert (width, height) == tuple(side + side % 2 for side in size)
+        assert sum(1 for _ in source) == 9
+    assert [file.name for file in path.parent.iterdir()] == ["out.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("rate", "times", "precision"), [(25, [2.0, 2.04, 2.5, 2.52, 9.0], 0.001), (1 / 3600, [2.0, 3602.0, 7202.0], 10)]
+)
+def test_frames_keep_the_time_stamps_of_the_source(tmp_path, rate, times, precision):
+    with VideoWriter(tmp_path / "out.mp4", rate, (64, 64)) as video:
+        for time in times:
+            video.write(np.zeros((64, 64, 3), np.uint8), time)
+    with open_source(tmp_path / "out.mp4") as source:
+        assert [frame.time + 2 for frame in source] == pytest.approx(times, abs=precision)
+
+
+def test_pixels_keep_their_aspect(tmp_path):
+    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64), pixel_aspect=Fraction(2)) as video:
+        video.write(np.zeros((64, 64, 3), np.uint8))
+    with open_source(tmp_path / "out.mp4") as source:
+        assert source.pixel_aspect == 2
+
+
+def test_a_video_without_frames_leaves_no_file(tmp_path):
+    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_rendering_leaves_the_video_that_was_there(tmp_path):
+    (tmp_path / "out.mp4").write_bytes(b"another")
+
+    def run():
+        with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)) as video:
+            video.write(np.zeros((64, 64, 3), np.uint8))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"another"]
+
+
+@pytest.mark.parametrize("frames", [0, 200], ids=["at its end", "while it is written"])
+def test_a_full_disk_is_one_line_of_error_and_no_video_is_left(tmp_path, rng, full, frames):
+    image = rng.integers(0, 256, (240, 320, 3), np.uint8)  # noise, which no codec makes small
+
+    def run():
+        with VideoWriter(tmp_path / "out.mp4", 25, (320, 240)) as video:
+            for _ in range(50):  # the encoder keeps some back
+                video.write(image)
+            full(tmp_path / "out.mp4.part")
+            for _ in range(frames):
+                video.write(image)
+
+    with pytest.raises(VideoError, match=r"cannot write the video .* any more: No space left on device$"):
+        run()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_that_cannot_be_written_is_an_error_at_once(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(VideoError, match="cannot write the video"):
+        VideoWriter(tmp_path / "file" / "out.mp4", 25, (64, 64))
+
+
+#: Linear red, green, blue as people of each kind of vision see them (Machado and others, 2009, severity 1).
+VISIONS = {
+    "normal": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+#: Linear red, green, blue to the responses of the cones, and their cube roots to lightness and two axes of colour.
+CONES = [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]
+OKLAB = [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
+
+
+def linear(colour):
+    share = np.array(list(bytes.fromhex(colour[1:]))) / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def oklab(colour, vision):
+    return np.array(OKLAB) @ np.cbrt(np.array(CONES) @ np.clip(np.array(vision) @ linear(colour), 0, 1))
+
+
+@pytest.mark.parametrize(
+    ("colours", "kinds", "apart"),
+    [(PALETTE, VISIONS.keys(), 0.09), (COLOURS, VISIONS.keys() - {"tritanopia"}, 0.1)],
+    ids=["objects", "curves"],
+)
+def test_any_two_colours_are_distinguishable_also_for_colour_blind_people(colours, kinds, apart):
+    # The eight colours of Okabe and Ito are 0.02 to 0.12 apart in the same measure.
+    for kind in kinds:
+        seen = [oklab(colour, VISIONS[kind]) for colour in colours]
+        assert min(np.linalg.norm(one - other) for one, other in combinations(seen, 2)) > apart, kind
+
+
+@pytest.mark.parametrize("colour", PALETTE)
+def test_dark_text_on_a_colour_is_readable(colour):
+    luminance, dark = np.dot([0.2126, 0.7152, 0.0722], linear(colour)), 0.0056  # of #111
+    assert (luminance + 0.05) / (dark + 0.05) >= 4.5
+
+
+@given(some.lists(some.tuples(some.booleans(), some.sampled_from("abcdefghijkl"))))
+def test_a_colour_stays_while_its_object_lives_and_is_shared_only_if_all_are_used(events):
+    colours, living = Colours(), {}
+    for comes, name in events:
+        if comes:
+            before = living.setdefault(name, colours.of(name))
+            assert colours.of(name) == before
+        else:
+            living.pop(name, None)
+            colours.keep(living)
+        assert {name: colours.of(name) for name in living} == living
+
+
+@given(some.sets(some.text(), max_size=len(PALETTE)))
+def test_as_many_objects_as_colours_have_different_ones(names):
+    colours = Colours()
+    assert len({colours.of(name) for name in names}) == len(names)
