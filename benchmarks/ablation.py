@@ -46,7 +46,7 @@ WITHOUT: dict[str, dict[str, Any]] = {
 def figures(options: argparse.Namespace) -> Iterator[Table]:
     base = Settings()
     variants = {"nothing left out": base}
-    variants |= {f"without {name}": base.but(changes) for name, changes in WITHOUT.items()}
+    variants |= {f"without {name}": base.replace(changes) for name, changes in WITHOUT.items()}
     if options.only:
         variants = {
             name: settings

@@ -30,7 +30,7 @@ with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
     from catstream.base.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
     from catstream.base.settings import Settings
     from catstream.compression.forest import Forest
-    from catstream.jobs.saved_model import Learned
+    from catstream.jobs.saved_model import SavedModel
     from catstream.messages import storage
     from catstream.messages.heads import GROUPS
     from catstream.messages.kinds import DetectorState, Features, ObjectFeatures, TrainingRows
@@ -76,7 +76,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
     }
     forest = grown()
     forest.save(folder / "checkpoint")
-    Learned.of(forest.compressors["anna"], SETTINGS).save(folder / "learned")
+    SavedModel.of(forest.compressors["anna"], SETTINGS).save(folder / "learned")
     create(folder / "keys")
     found |= {
         "any message": Decoder(
@@ -120,10 +120,10 @@ def grown() -> Forest:
     return forest
 
 
-def narrow(path: Path) -> Learned:
+def narrow(path: Path) -> SavedModel:
     """Return a saved model whose rows have `WIDTH` columns."""
     with patch("catstream.jobs.saved_model.row_length", lambda: WIDTH):
-        return Learned.load(path)
+        return SavedModel.load(path)
 
 
 def forged(read: Callable[[Path], Any]) -> Callable[[Path], Any]:

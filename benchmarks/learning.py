@@ -21,7 +21,7 @@ from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
 from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import ObjectFeatures, Track
 from catstream.training.trainer import Trainer
 
@@ -80,19 +80,19 @@ def learn(detector: Detector, compressor: Compressor, trainer: Trainer, seq: int
         detector.adopt(trainer.train(sample))
 
 
-def model_of(found: Iterable[ObjectFeatures], settings: Settings) -> Learned:
+def model_of(found: Iterable[ObjectFeatures], settings: Settings) -> SavedModel:
     """Return the saved model of one tree that has seen all features, in the given order."""
     compressor = Compressor(settings)
     for frame, part in enumerate(found):
         compressor.take(frame, part, compressor.version + 1)
-    return Learned.of(compressor, settings)
+    return SavedModel.of(compressor, settings)
 
 
-def tracked(learned: Learned, sequence: Sequence, start: int, count: int) -> list[Track]:
+def tracked(learned: SavedModel, sequence: Sequence, start: int, count: int) -> list[Track]:
     """Return the tracks of a run that starts with a saved model and learns on."""
     settings = learned.settings
     detector, compressor, trainer = Detector(settings), learned.compressor(settings), Trainer(settings)
-    detector.seek(learned.model, learned.box, learned.likeness())
+    detector.seek(learned.model, learned.box, learned.similarity())
     tracks = []
     with one_thread(opencv=True):
         for seq, image in enumerate(islice(sequence.frames(start), count), start=1):

@@ -22,7 +22,7 @@ from catstream.compression.reduce import energy
 from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
-from catstream.jobs.saved_model import Learned, merge
+from catstream.jobs.saved_model import SavedModel, merge
 
 _EVERY = 5  # frames from one to the next in which the best window is looked up
 
@@ -47,7 +47,7 @@ def measured(task: tuple[Sequence, int]) -> tuple[str, Row, float, float] | None
     return sequence.name, row, *differences(merged, one)
 
 
-def best(learned: Learned, sequence: Sequence, start: int, count: int) -> float:
+def best(learned: SavedModel, sequence: Sequence, start: int, count: int) -> float:
     """The share of frames in which the window with the highest score overlaps the object by half."""
     found = []
     for image, truth in islice(zip(sequence.frames(start), sequence.boxes[start:], strict=True), 0, count, _EVERY):
@@ -58,7 +58,7 @@ def best(learned: Learned, sequence: Sequence, start: int, count: int) -> float:
     return fmean(found) if found else 0.0
 
 
-def differences(merged: Learned, one: Learned) -> tuple[float, float]:
+def differences(merged: SavedModel, one: SavedModel) -> tuple[float, float]:
     """Difference of the energy along the weights, in percent of c; and c, in percent of the energy of all rows."""
     trees = merged.trees["object"], one.trees["object"]
     ours, theirs = ([*(node.rows for node in tree.nodes), tree.pending] for tree in trees)

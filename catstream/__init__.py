@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from catstream.client.subscription import Subscription, subscribe
     from catstream.finding.find import Sighting, find
     from catstream.fleet.fleet import Fleet
-    from catstream.jobs.saved_model import Learned, merge
+    from catstream.jobs.saved_model import SavedModel, merge
     from catstream.messages.kinds import Track
     from catstream.multi import MultiTracker
     from catstream.pipeline import Pipeline
@@ -35,9 +35,9 @@ __all__ = [
     "CatstreamError",
     "Control",
     "Fleet",
-    "Learned",
     "MultiTracker",
     "Pipeline",
+    "SavedModel",
     "Settings",
     "Sighting",
     "Subscription",
@@ -57,7 +57,7 @@ _HOMES = {
     "CatstreamError": "base.errors",
     "Control": "client.control",
     "Fleet": "fleet.fleet",
-    "Learned": "jobs.saved_model",
+    "SavedModel": "jobs.saved_model",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "base.settings",

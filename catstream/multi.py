@@ -24,7 +24,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.features.descriptor import descriptor_of
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Features, Track, Tracks
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
@@ -56,7 +56,7 @@ class MultiTracker:
     """
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
-        self.settings = settings if isinstance(settings, Settings) else Settings().but(settings or {})
+        self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         descriptor_of(self.settings)  # loads the network, if there is one: an error comes before the first frame
         self._tracks: dict[str, Track] | None = None
 
@@ -119,7 +119,7 @@ class MultiTracker:
         *,
         time: float = 0.0,
         begin: Boxes | None = None,
-        search: Mapping[str, Learned | str | os.PathLike[str]] | None = None,
+        search: Mapping[str, SavedModel | str | os.PathLike[str]] | None = None,
     ) -> dict[str, Track]:
         """Find the objects in the next frame, and learn from it.
 
@@ -130,7 +130,7 @@ class MultiTracker:
         begin : mapping of str to boxes
             The boxes of objects that begin in this frame. An object of the same name is forgotten. If one box is
             refused, no object begins, and the frame counts as not seen.
-        search : mapping of str to Learned or path
+        search : mapping of str to SavedModel or path
             Saved models of objects that are searched for from this frame on, by name. Each is absent until it is found,
             and learning continues from its saved model. An object of the same name is forgotten.
 
@@ -154,7 +154,8 @@ class MultiTracker:
         _ = self.tracks
         image, boxes, time = as_bgr(frame), boxes_by_name({} if begin is None else begin), _seconds(time)
         models = {
-            name: each if isinstance(each, Learned) else Learned.load(each) for name, each in (search or {}).items()
+            name: each if isinstance(each, SavedModel) else SavedModel.load(each)
+            for name, each in (search or {}).items()
         }
         compressors = self._continued(models, boxes)
         if image.shape[:2] != self._size:
@@ -168,11 +169,11 @@ class MultiTracker:
             pyramid = self.detectors.pyramid(image)
             given = self.detectors.begin_all(boxes, pyramid, time)
             for name, learned in models.items():
-                self.detectors.seek(name, learned.model, learned.box, learned.likeness())
+                self.detectors.seek(name, learned.model, learned.box, learned.similarity())
             self._learn(*self.detectors.step(pyramid, time, given), compressors)
         return self.tracks
 
-    def _continued(self, models: Mapping[str, Learned], boxes: Mapping[str, Box]) -> dict[str, Compressor]:
+    def _continued(self, models: Mapping[str, SavedModel], boxes: Mapping[str, Box]) -> dict[str, Compressor]:
         """The compressors of the objects of saved models; an error if one of the objects cannot begin."""
         if both := models.keys() & boxes.keys():
             raise ObjectError(f"{listed(sorted(both))}: a box and a saved model for one object: give one of them")
@@ -194,7 +195,7 @@ class MultiTracker:
         _ = self.tracks
         self.detectors.forget(name)
 
-    def learned(self, name: str = UNNAMED) -> Learned:
+    def saved_model(self, name: str = UNNAMED) -> SavedModel:
         """Everything that was learned of an object: save it as a model, and use it in another video.
 
         Raises
@@ -209,7 +210,7 @@ class MultiTracker:
         _ = self.tracks
         if name not in self.forest.compressors:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
-        return Learned.of(self.forest.compressors[name], self.settings)
+        return SavedModel.of(self.forest.compressors[name], self.settings)
 
     def _learn(
         self, tracks: Tracks, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})

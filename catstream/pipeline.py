@@ -31,7 +31,7 @@ from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
-from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.endpoint import private_folder, reserve_endpoint
 from catstream.wire.socket import check_owner
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
@@ -155,7 +155,7 @@ class Pipeline:
             models=models or job.models,
             source=source_text(source) if source is not None else job.source,
             part=job.part if part == ALL_FRAMES else part,
-            settings=settings if isinstance(settings, Settings) else job.settings.but(settings or {}),
+            settings=settings if isinstance(settings, Settings) else job.settings.replace(settings or {}),
             results=job.results if results is None else results.after(job.results),
             paused=paused,
         )
@@ -174,7 +174,7 @@ class Pipeline:
         path = job.source if self.live else str(Path(job.source).absolute())
         settings = job.settings.for_length(self.frames)
         if settings.features.network:
-            settings = settings.but({"features.network": str(Path(settings.features.network).absolute())})
+            settings = settings.replace({"features.network": str(Path(settings.features.network).absolute())})
         network = digest_of(descriptor_of(settings, job.network))
         self._job = replace(job, source=path, size=self.size, settings=settings, network=network)
         self.source, self.part, self.settings, self.results = path, job.part, settings, job.results
@@ -197,7 +197,7 @@ class Pipeline:
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
             settings, shown = self.settings, without_password(self.source)
-            endpoint = stack.enter_context(meeting_place(settings.run.endpoint, folder, settings.run.keys, shown))
+            endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, shown))
             if self._state is not None:
                 stack.enter_context(locked_for_run(self._state, self._resumed_job, self._job))
             job = self._started(str(endpoint))

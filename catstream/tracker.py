@@ -9,7 +9,7 @@ import numpy as np
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Track
 from catstream.multi import MultiTracker
 
@@ -82,6 +82,6 @@ class Tracker:
         track = self._objects.update(frame, time=time)[UNNAMED]
         return track.box is not None, track.box
 
-    def learned(self) -> Learned:
+    def saved_model(self) -> SavedModel:
         """Everything that was learned of the object, as `MultiTracker.learned`."""
-        return self._objects.learned()
+        return self._objects.saved_model()

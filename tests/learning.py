@@ -35,4 +35,4 @@ def learned_from(video, box, part, settings=None):
                 tracker.update(frame.image)
             else:
                 tracker.init(frame.image, box)
-    return tracker.learned()
+    return tracker.saved_model()

@@ -4,7 +4,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from catstream.features.backbone import prepare
+from catstream.backbone import prepare
 
 
 def write_network(folder, images):

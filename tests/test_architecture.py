@@ -25,9 +25,10 @@ LEVELS = [
     {"multi", "client"},
     {"sinks"},
     {"tracker", "processes", "web"},
-    {"pipeline"},
+    {"pipeline", "backbone"},
     {"reports"},
-    {"evaluation", "finding", "loadtest", "fleet"},
+    {"evaluation"},
+    {"finding", "loadtest", "fleet"},
     {"cli"},
 ]
 
@@ -46,6 +47,7 @@ IMPORTERS = {
         "catstream/loadtest/crowd.py",
         "catstream/base/threads.py",
         "catstream/evaluation/peers.py",
+        "catstream/reports/provenance.py",  # its version
         "catstream/processes/detector.py",
         "catstream/sinks/events.py",
     ],
@@ -85,7 +87,7 @@ IMPORTERS = {
     "prometheus_client": ["catstream/web/prometheus.py"],
     "rich": ["catstream/cli"],
     "onnxruntime": ["catstream/features/network.py"],
-    "onnx": ["catstream/features/backbone.py"],
+    "onnx": ["catstream/backbone.py"],
 }
 
 #: Libraries that take long to import: inside the function that needs them.

@@ -164,7 +164,7 @@ def cleo(frames):
     tracker = started(frames, ["cleo"], {"coreset.size": 8})
     for frame in frames[1:]:
         tracker.update(frame)
-    return tracker.learned("cleo")
+    return tracker.saved_model("cleo")
 
 
 def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not_affect(frames, cleo, tmp_path):
@@ -177,7 +177,7 @@ def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not
             assert tracks["cleo"].state == "absent"
     assert tracks["cleo"].box.overlap(box_of("cleo", number)) > 0.6
     assert tracks["cleo"].model_version > cleo.model.version
-    assert set(cleo.origins) < set(tracker.learned("cleo").origins)
+    assert set(cleo.origins) < set(tracker.saved_model("cleo").origins)
 
 
 def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):

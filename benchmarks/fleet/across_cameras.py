@@ -29,7 +29,7 @@ from table import Table, mean_and_error, publish
 
 from catstream.base.settings import Settings
 from catstream.evaluation.datasets import Sequence, find_sequences
-from catstream.jobs.saved_model import Learned, merge
+from catstream.jobs.saved_model import SavedModel, merge
 from catstream.video.writer import VideoWriter
 
 _CAMERAS = 4
@@ -71,7 +71,7 @@ def measured(task: tuple[Scene, int, int]) -> tuple[str, Row]:
     return scene.name, {name: _searched(learned, last, scene.stranger, frames) for name, learned in searched.items()}
 
 
-def _searched(learned: Learned, last: Camera, stranger: Camera, frames: int) -> tuple[float, float, float]:
+def _searched(learned: SavedModel, last: Camera, stranger: Camera, frames: int) -> tuple[float, float, float]:
     """Search with one model."""
     tracks = tracked(learned, last.sequence, last.start, frames)
     right = hits(tracks, last.sequence, last.start)

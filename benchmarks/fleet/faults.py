@@ -408,7 +408,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         list(quantiles(trial.noticed)),
     )
     yield Table(
-        "Learned rows",
+        "SavedModel rows",
         ("films", "trees the same", "rows lost", "rows doubled", "wrong", "minutes"),
         [("in lockstep", trial.films, *([None if trial.wrong else 0] * 2), len(trial.wrong), minutes)],
         "; ".join(trial.wrong),

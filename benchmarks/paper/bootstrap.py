@@ -28,7 +28,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     starts = starts_of(options)
     pieces = [piece for found in videos(options) for piece in pieces_of(found, starts(found), options.size)]
     options.starts = 1  # for each piece
-    runs = compared(options, pieces, {name: base.but(changes) for name, changes in BOOTSTRAPS.items()})
+    runs = compared(options, pieces, {name: base.replace(changes) for name, changes in BOOTSTRAPS.items()})
     rows = []
     for name, found in runs.items():
         rate = sum(len(run.seconds) for run in found) / sum(float(run.seconds.sum()) for run in found)

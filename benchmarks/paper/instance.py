@@ -35,7 +35,7 @@ from catstream.base.workers import SPAWN
 from catstream.evaluation.datasets import Sequence
 from catstream.features.score_map import non_maximum_suppression
 from catstream.finding.find import Scan
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.tracker import Tracker
 from catstream.video.source import open_source
 
@@ -103,17 +103,17 @@ def others(first: np.ndarray, box: Box) -> list[Finder]:
     return [partial(match_template, cut(first, box)), OrbMatcher(cut(first, box))]
 
 
-def learn(images: Iterator[np.ndarray] | list[np.ndarray], box: Box) -> Learned:
+def learn(images: Iterator[np.ndarray] | list[np.ndarray], box: Box) -> SavedModel:
     tracker = Tracker()
     for number, image in enumerate(images):
         if number:
             tracker.update(image)
         else:
             tracker.init(image, box)
-    return tracker.learned()
+    return tracker.saved_model()
 
 
-def ours(learned: Learned) -> Finder:
+def ours(learned: SavedModel) -> Finder:
     scan = Scan([learned], _LEAST)
     return lambda image: [(each.score, each.box) for each in scan(image)[0][:_MOST]]
 
@@ -253,7 +253,7 @@ def _each(answers: dict[str, dict[str, list[Answer]]]) -> Table:
 
 
 def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
-    """Learned before a plain background, searched before others and in other lights."""
+    """SavedModel before a plain background, searched before others and in other lights."""
     rng = np.random.default_rng(0)
     plain = np.full((240, 320, 3), 190, np.uint8)
     shown = [_shown(plain, rng, 20, (0.9, 1.1), (0.95, 1.05), centre) for centre in _path(learning)]

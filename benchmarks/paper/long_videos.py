@@ -45,7 +45,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         sequence = named(options, name)
         path, truth = lengthened(sequence, frames)
         for n in options.sizes[:1] if options.quick else options.sizes:
-            settings = base_of(options).but({"coreset.size": n, "coreset.share": 0.0})
+            settings = base_of(options).replace({"coreset.size": n, "coreset.share": 0.0})
             label = f"{sequence.name}, n = {n}"
             journey = journeys[label] = travel(str(path), truth[0], settings, watch=max(frames // 200, 1))
             ends = (LENGTHS * frames).astype(int)

@@ -90,7 +90,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     shares = SHARES[:1] if options.quick else SHARES
     for n in options.sizes[:1] if options.quick else options.sizes:
         recipes = {
-            f"{name}, {share}": Recipe(base.but({"coreset.size": n}), tree, share)
+            f"{name}, {share}": Recipe(base.replace({"coreset.size": n}), tree, share)
             for name, tree in TREES.items()
             for share in shares
         }

@@ -174,9 +174,9 @@ class BeliefSettings(_Group):
     jump_margin: Annotated[
         float, _about("Difference of score by which a window elsewhere in the frame must exceed the local one.")
     ] = 0.4
-    sighting_likeness: Annotated[
+    sighting_similarity: Annotated[
         float,
-        _about("Likeness to the object of a saved model that a window needs to be its first detection."),
+        _about("Similarity to the object of a saved model that a window needs to be its first detection."),
     ] = 0.5
 
 
@@ -319,10 +319,10 @@ class Settings:
         environment: Mapping[str, str] | None = None,
     ) -> Settings:
         """Collect settings from all their sources: those that `given` finds, the others by default."""
-        return cls.from_values(cls.given(preset=preset, file=file, overrides=overrides, environment=environment))
+        return cls.from_values(cls.collect(preset=preset, file=file, overrides=overrides, environment=environment))
 
     @staticmethod
-    def given(
+    def collect(
         *,
         preset: str | None = None,
         file: str | os.PathLike[str] | None = None,
@@ -396,14 +396,14 @@ class Settings:
                 f"coreset.share={self.coreset.share:g} is a share of the video's length, and the length of this source "
                 "is not known: set coreset.size instead"
             )
-        return self.but({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
+        return self.replace({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
-    def but(self, others: Mapping[str, object] | Iterable[str]) -> Settings:
+    def replace(self, others: Mapping[str, object] | Iterable[str]) -> Settings:
         """A copy with some of them changed: names and values, or texts `group.name=value` as `--set` takes them.
 
         Examples
         --------
-        >>> Settings(run={"lockstep": True}).but(["coreset.size=32"]).changed()
+        >>> Settings(run={"lockstep": True}).replace(["coreset.size=32"]).changed()
         ['run.lockstep=true', 'coreset.size=32']
         """
         return Settings.from_values(self.values() | flat(_named(others)))

@@ -285,7 +285,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         },
         "frames": whole("detector", "sent")["sent"],
         "frames_per_second": None if rate is None else round(max(0.0, rate), 1),  # that of a restarted detector falls
-        "lag": int(detector["sent"] - detector["taken"]) if detector else None,
+        "lag": int(detector["sent"] - detector["processed"]) if detector else None,
         "not_stored": int(detector["sent"] - detector["stored"]) if detector else None,
         **whole("detector", "model_version"),
         **whole("compressor", "level", "leaves", "nodes", "bytes"),

@@ -14,7 +14,7 @@ from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.saved_model import merge as merged
 from catstream.processes.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 
@@ -184,7 +184,7 @@ def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -
       catstream merge door.safetensors yard.safetensors -o anna.safetensors
     """
     check_file(output, overwrite=overwrite)
-    parts = [Learned.load(file) for file in files]
+    parts = [SavedModel.load(file) for file in files]
     with warnings.catch_warnings(record=True, action="always", category=UserWarning) as doubts:
         whole = merged(parts, force=force)
     for doubt in doubts:

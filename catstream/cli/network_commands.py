@@ -53,7 +53,7 @@ def prepare(
     """
     require_extra("network")
     with INTERRUPTS.leaving():
-        from catstream.features import backbone as backbones
+        from catstream import backbone as backbones
 
     check_file(output, overwrite=overwrite)
     backbones.prepare(backbone, layer, images, output, rgb=rgb, mean=mean, std=std)
@@ -74,7 +74,7 @@ def check(file: Path) -> None:
 
 def _print(file: Path) -> None:
     with INTERRUPTS.leaving():
-        from catstream.features import backbone as backbones
+        from catstream import backbone as backbones
 
     found = backbones.check(file)
     click.echo(f"{file}: {found.network.channels} channels, digest {found.network.digest}")

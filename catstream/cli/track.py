@@ -39,7 +39,7 @@ from catstream.processes.options import (
     with_part,
     with_reading,
 )
-from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_result, is_file, shown
+from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
@@ -191,7 +191,7 @@ class _Run:
         finally:
             if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
                 output = [] if files.output is None else [str(files.output)]
-                console.print(progress.summary([*output, *map(shown, pipeline.results.write)]))
+                console.print(progress.summary([*output, *map(redacted, pipeline.results.write)]))
         if self.resume is not None and not progress.frames and not interrupted:
             console.print(
                 f"no frames were left to track, the run in {self.resume} is complete: to track the source again, "

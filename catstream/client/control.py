@@ -21,8 +21,8 @@ from catstream.base.box import Box
 from catstream.base.errors import CommandRejectedError, SilenceError
 from catstream.base.names import UNNAMED, check_name
 from catstream.client.registry import follow
-from catstream.jobs.saved_model import Learned
-from catstream.messages.kinds import Answer, Command, SavedModel, Verb
+from catstream.jobs.saved_model import SavedModel
+from catstream.messages.kinds import Answer, Command, ModelFile, Verb
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.endpoint import Place, find, source_at
@@ -87,7 +87,7 @@ class Control(AbstractContextManager["Control"]):
         """
         return self.execute("set-box", object, box=Box.parse(box), keep=keep, time=time)
 
-    def search(self, model: Learned | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
+    def search(self, model: SavedModel | str | os.PathLike[str], object: str = UNNAMED) -> Answer:
         """Search for the object of a saved model from the next frame on, beside the others.
 
         The model, or the path of its file on this machine, is sent to the pipeline, which keeps a copy. The object is
@@ -99,7 +99,7 @@ class Control(AbstractContextManager["Control"]):
         ServiceError, ProtocolError
             If the file cannot be read, or is not a saved model.
         """
-        learned = model if isinstance(model, Learned) else Learned.load(model)
+        learned = model if isinstance(model, SavedModel) else SavedModel.load(model)
         return self.execute("search", object, model=learned.to_bytes())
 
     def forget(self, object: str = UNNAMED) -> Answer:
@@ -122,7 +122,7 @@ class Control(AbstractContextManager["Control"]):
         return self.execute("resume")
 
     def save(self, path: str | os.PathLike[str], object: str = UNNAMED) -> Answer:
-        """Write everything that was learned of an object to a file of this machine, which `catstream.Learned` reads.
+        """Write everything that was learned of an object to a file of this machine, which `catstream.SavedModel` reads.
 
         Raises
         ------
@@ -170,14 +170,14 @@ class Control(AbstractContextManager["Control"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _newest(self, name: str, version: int) -> Learned:
+    def _newest(self, name: str, version: int) -> SavedModel:
         """Return what was learned of an object up to a version or a later one."""
         deadline = monotonic() + self.timeout
-        with Subscriber(SAVED_MODELS, self._place, SavedModel, about=name) as saved:
+        with Subscriber(SAVED_MODELS, self._place, ModelFile, about=name) as saved:
             while (left := deadline - monotonic()) > 0:
                 message = saved.receive(left)
                 if message is not None and message.version >= version:
-                    return Learned.from_bytes(message.file, f"the saved model from {self.endpoint}")
+                    return SavedModel.from_bytes(message.file, f"the saved model from {self.endpoint}")
         raise SilenceError(
             f"no coreset trees arrived from {self.endpoint} within {self.timeout:g} s: "
             "check the pipeline with catstream status"

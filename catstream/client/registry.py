@@ -24,7 +24,7 @@ from catstream.base.names import UNNAMED
 from catstream.messages.kinds import End, Features, FleetStatus, Listing, Question, StreamStatus, Track
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder
-from catstream.wire.endpoint import Endpoint, Place, find, fleets, meeting_place, private_folder
+from catstream.wire.endpoint import Endpoint, Place, find, fleets, private_folder, reserve_endpoint
 from catstream.wire.keys import Keys
 
 #: Port at which the registry of a cluster listens by default.
@@ -232,7 +232,7 @@ class RegistryServer(AbstractContextManager["RegistryServer"]):
         self._status = status
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
-            self.endpoint = stack.enter_context(meeting_place(listen, folder, keys, fleet=status().name))
+            self.endpoint = stack.enter_context(reserve_endpoint(listen, folder, keys, fleet=status().name))
             self._responder = stack.enter_context(Responder[Question, Listing](REGISTRY, self.endpoint))
             self._stack = stack.pop_all()
 

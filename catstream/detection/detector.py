@@ -16,8 +16,8 @@ from catstream.base.box import Box, Window
 from catstream.base.errors import BoxError, ProtocolError
 from catstream.base.settings import Settings
 from catstream.detection import belief, extent, search, teacher
-from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
+from catstream.detection.similarity import Similarity
 from catstream.detection.teacher import Training
 from catstream.features.cells import Cells
 from catstream.features.descriptor import Descriptor
@@ -45,7 +45,7 @@ class Detector:
 
     state           after the last frame, None before there is an object; with the model, and SCM if in use, all there
     is newest_version  of the models that arrived, in use or not
-    likeness        to the object of a saved model, used until that is found; None without a saved model
+    similarity        to the object of a saved model, used until that is found; None without a saved model
     """
 
     def __init__(self, settings: Settings, name: str = "", descriptor: Descriptor | None = None) -> None:
@@ -55,7 +55,7 @@ class Detector:
         self.newest_version = 0
         self._scm: SparseCollaborativeModel | None = None
         self._taught: tuple[int, Cells] | None = None  # number of the last frame that was taught, and the cells around
-        self.likeness: Likeness | None = None
+        self.similarity: Similarity | None = None
 
     @property
     def box(self) -> Box | None:
@@ -79,7 +79,7 @@ class Detector:
         self.state, self.model, self._scm = DetectorState(seq - 1, "confident", window, window, window), model, scm
         return self._result(seq, time, 1.0, training)
 
-    def seek(self, model: Model, box: Box, likeness: Likeness, frame: int = 0) -> None:
+    def seek(self, model: Model, box: Box, similarity: Similarity, frame: int = 0) -> None:
         """Start with a saved model: the object is absent until it is found, in whichever frame and size that is.
 
         Another object before it is forgotten. `box` in pixels is about as large as the object may be, and `frame` is
@@ -94,7 +94,7 @@ class Detector:
             )
         window = Window.around(box, self.settings.search.context)
         self.state = DetectorState(frame, "lost", window, window, None)
-        self.model, self.likeness, self._scm = replace(model, began=frame), likeness, None
+        self.model, self.similarity, self._scm = replace(model, began=frame), similarity, None
         self.newest_version = max(self.newest_version, model.version)
 
     def look(self, frame: Pyramid, seq: int) -> Detection:
@@ -102,7 +102,7 @@ class Detector:
         if self._scm is not None:
             score, box = self._scm.follow(frame.image)
             return Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
-        self.state, found = looked(self._known(), frame, seq, self.model, self.likeness, self.settings)
+        self.state, found = looked(self._known(), frame, seq, self.model, self.similarity, self.settings)
         return found
 
     def settle(self, found: Detection, frame: Pyramid, seq: int, time: float) -> Result:
@@ -115,7 +115,7 @@ class Detector:
         self.state = state
         if self._is_explained(found, seq) or self._is_still(found, seq):
             return self._result(seq, time, found.score, {})
-        training = taught(state, found, frame, seq, model, self.likeness, settings)
+        training = taught(state, found, frame, seq, model, self.similarity, settings)
         self._taught = (seq, found.around.cells) if training and found.around is not None else None
         return self._result(seq, time, found.score, training)
 
@@ -196,16 +196,16 @@ class Detector:
 
 
 def looked(
-    state: DetectorState, frame: Pyramid, seq: int, model: Model, likeness: Likeness | None, settings: Settings
+    state: DetectorState, frame: Pyramid, seq: int, model: Model, similarity: Similarity | None, settings: Settings
 ) -> tuple[DetectorState, Detection]:
     """Search the object in the next frame; returns the state with the place that was expected, and the detection.
 
     Costs the same for every frame: a few small patches around the object, and the whole frame if the belief is low (or
-    always, if `search.mode` is "full"), or as long as the object of a saved model with this likeness is sought.
+    always, if `search.mode` is "full"), or as long as the object of a saved model with this similarity is sought.
     """
     state = belief.expected(state)
-    if state.first_window is None and likeness is not None:
-        return search.seek(frame, state, seq, model, likeness, settings)
+    if state.first_window is None and similarity is not None:
+        return search.seek(frame, state, seq, model, similarity, settings)
     return state, search.find(frame, state, seq, model, settings)
 
 
@@ -226,12 +226,12 @@ def taught(
     frame: Pyramid,
     seq: int,
     model: Model,
-    likeness: Likeness | None,
+    similarity: Similarity | None,
     settings: Settings,
 ) -> Training:
     """The training rows of a frame, as far as the belief in its detection allows."""
-    if state.first_window is None and likeness is not None:
-        return teacher.training_beside(frame, found.window, model, likeness, settings)
+    if state.first_window is None and similarity is not None:
+        return teacher.training_beside(frame, found.window, model, similarity, settings)
     if not _policy(state, settings).teach:
         return {}
     return teacher.training_of(frame, state.window, found.around, seq, model, settings)

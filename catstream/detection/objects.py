@@ -18,8 +18,8 @@ from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.threads import in_parallel
 from catstream.detection.detector import Detector, Result
-from catstream.detection.likeness import Likeness
 from catstream.detection.search import Detection
+from catstream.detection.similarity import Similarity
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks
@@ -89,13 +89,13 @@ class Detectors:
             features = replace(found, training=features.training)
         return track, features
 
-    def seek(self, name: str, model: Model, box: Box, likeness: Likeness) -> None:
+    def seek(self, name: str, model: Model, box: Box, similarity: Similarity) -> None:
         """Search for the object of a saved model from the next frame on; another one of this name is forgotten.
 
         Nothing changes after a ProtocolError, as of `Detector.seek`, or an ObjectError, as of `add`.
         """
         detector = self.detectors.get(name) or self._made(name)
-        detector.seek(model, box, likeness, self.seq)
+        detector.seek(model, box, similarity, self.seq)
         self.detectors.pop(name, None)
         self.detectors[name] = detector  # the last one, as in `begin`
 

@@ -15,7 +15,7 @@ import numpy as np
 from catstream.base.box import Window
 from catstream.base.settings import BeliefSettings, ExtentSettings, SearchSettings, Settings
 from catstream.detection import belief, extent
-from catstream.detection.likeness import Likeness
+from catstream.detection.similarity import Similarity
 from catstream.features.layout import EDGE, WINDOW
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap, non_maximum_suppression, vertex
@@ -32,7 +32,7 @@ _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in th
 _LIKELY_STEPS = 8  # larger or smaller than the size at which an object was first found, that are tried
 _SIGHTINGS = 3  # successive frames that must agree before the object of a saved model is found
 _SIGHTING_LEAD = 0.1  # difference of score to the best window elsewhere that it needs
-_LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose likeness to the object is at least half as high
+_LEAD_OVER_ALIKE = 0.25  # difference of score to another window whose similarity to the object is at least half as high
 SAME_OVERLAP = 0.3  #: above which two windows in successive frames show the same object
 
 #: A region of a frame that is searched, and the factor of the window's size in it.
@@ -78,7 +78,7 @@ def find(frame: Pyramid, state: DetectorState, seq: int, model: Model, settings:
 
 
 def seek(
-    frame: Pyramid, state: DetectorState, seq: int, model: Model, likeness: Likeness, settings: Settings
+    frame: Pyramid, state: DetectorState, seq: int, model: Model, similarity: Similarity, settings: Settings
 ) -> tuple[DetectorState, Detection]:
     """The best window of the whole frame, over the range of sizes that are searched before the first detection.
 
@@ -87,9 +87,9 @@ def seek(
     searched at a third of the sizes.
     """
     limits = settings.belief
-    best, stands_out = _sighting(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model, likeness, limits)
+    best, stands_out = _sighting(frame, state.window, _SOUGHT_FACTORS[seq % 3 :: 3], model, similarity, limits)
     if state.sightings or best.score >= limits.confident_score:
-        best, stands_out = _sighting(frame, state.window, _SOUGHT_FACTORS, model, likeness, limits)
+        best, stands_out = _sighting(frame, state.window, _SOUGHT_FACTORS, model, similarity, limits)
     seen = best.score >= limits.confident_score and stands_out
     again = state.sightings > 0 and best.window.overlap(state.confident_window) > SAME_OVERLAP
     state = replace(
@@ -99,12 +99,12 @@ def seek(
     )
     if state.sightings < _SIGHTINGS:
         return state, best
-    found = replace(_at_likely_size(frame, best, model, likeness), score=best.score, redetected=True)
+    found = replace(_at_likely_size(frame, best, model, similarity), score=best.score, redetected=True)
     return replace(state, window=found.window, first_window=found.window), found
 
 
-def _at_likely_size(frame: Pyramid, found: Detection, model: Model, likeness: Likeness) -> Detection:
-    """A detection moved by at most a cell, at the size with the highest sum of score and likeness.
+def _at_likely_size(frame: Pyramid, found: Detection, model: Model, similarity: Similarity) -> Detection:
+    """A detection moved by at most a cell, at the size with the highest sum of score and similarity.
 
     The score alone prefers windows that are too small, because they contain less background, and it may be higher than
     that of the object's mean, 1. The subspace of the object contains its own outline and margin.
@@ -115,7 +115,7 @@ def _at_likely_size(frame: Pyramid, found: Detection, model: Model, likeness: Li
     def tried(step: int) -> tuple[float, Detection]:
         scores = ScoreMap.around(frame, found.window.scaled(extent.size(step)), _FINE_SIDE, model, vectors)
         best = Detection(*scores.best())
-        return min(best.score, 1.0) + likeness(scores.cells.row(*scores.highest())), best
+        return min(best.score, 1.0) + similarity(scores.cells.row(*scores.highest())), best
 
     return max((tried(step) for step in range(-_LIKELY_STEPS, _LIKELY_STEPS + 1)), key=lambda each: each[0])[1]
 
@@ -218,7 +218,7 @@ def _sighting(
     window: Window,
     factors: tuple[float, ...],
     model: Model,
-    likeness: Likeness,
+    similarity: Similarity,
     limits: BeliefSettings,
 ) -> tuple[Detection, bool]:
     """The best window of a whole frame, at the size of a window times each of several factors; and whether it looks
@@ -230,13 +230,13 @@ def _sighting(
     parts = [(factor, frame.region_around(window.scaled(factor))) for factor in factors]
     maps = _searched(frame, parts, window, model)
     scores = _best_map(maps)
-    best, alike = Detection(*scores.best()), likeness(scores.cells.row(*scores.highest()))
+    best, alike = Detection(*scores.best()), similarity(scores.cells.row(*scores.highest()))
     apart = max((each.apart(best.window) for _, each in maps), key=lambda each: float(each.scores.max()))
     rival = max(float(apart.scores.max()), 0.0)
     lead = best.score - rival
-    if alike < limits.sighting_likeness or lead < _SIGHTING_LEAD:
+    if alike < limits.sighting_similarity or lead < _SIGHTING_LEAD:
         return best, False
-    alike_rival = likeness(apart.cells.row(*apart.highest())) if rival else 0.0
+    alike_rival = similarity(apart.cells.row(*apart.highest())) if rival else 0.0
     return best, lead >= _LEAD_OVER_ALIKE or alike_rival < alike / 2
 
 

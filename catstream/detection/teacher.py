@@ -19,8 +19,8 @@ from catstream.base.box import Box, Window
 from catstream.base.errors import BoxError
 from catstream.base.settings import Settings, TeachingSettings
 from catstream.detection import extent
-from catstream.detection.likeness import Likeness
 from catstream.detection.search import due
+from catstream.detection.similarity import Similarity
 from catstream.features.cells import window_rows
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, COLOURS, EDGE, MARGIN, WINDOW
@@ -109,7 +109,9 @@ def training_at(
     return {APPEARANCE: rows, **(_extents(frame, window, around.vectors, rows, settings) if extents else {})}
 
 
-def training_beside(frame: Pyramid, window: Window, model: Model, likeness: Likeness, settings: Settings) -> Training:
+def training_beside(
+    frame: Pyramid, window: Window, model: Model, similarity: Similarity, settings: Settings
+) -> Training:
     """The rows of a frame in which the object of a saved model has not been found yet: background of a new scene.
 
     Windows with a high score are taken, but neither the best one, which may be the object, nor others that look like
@@ -118,7 +120,7 @@ def training_beside(frame: Pyramid, window: Window, model: Model, likeness: Like
     scores = ScoreMap.whole(frame, window, model)
     most, least = settings.teaching.hard_negatives, settings.belief.weak_score
     rows = _strongest(frame, scores, window, model, most, least)
-    strange = rows[[likeness(row) < settings.belief.sighting_likeness for row in rows]]
+    strange = rows[[similarity(row) < settings.belief.sighting_similarity for row in rows]]
     return {APPEARANCE: _rows(strange, 0, 1, settings.teaching)} if len(strange) else {}
 
 

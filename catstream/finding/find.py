@@ -26,20 +26,20 @@ from catstream.base.errors import SettingsError, VideoError
 from catstream.base.settings import RunSettings, Settings
 from catstream.base.text import counted
 from catstream.base.threads import one_thread
-from catstream.detection.likeness import Likeness
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
+from catstream.detection.similarity import Similarity
 from catstream.features.cells import Cells
 from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Model
 from catstream.video.frames import Frame, read_ahead
 from catstream.video.images import IMAGES, ImageReader, first_pages, image_files, natural_order, pages_of
 from catstream.video.source import VIDEOS, is_live, open_source
 
-_One = TypeVar("_One", bound=str | os.PathLike[str] | Learned)
+_One = TypeVar("_One", bound=str | os.PathLike[str] | SavedModel)
 #: A frame that is searched, and the name of its file in a folder of images.
 _Searched = tuple[Frame, str]
 
@@ -227,23 +227,23 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """A model, its measure of likeness, a window of the learned size, and the settings that it was learned with."""
+    """A model, its measure of similarity, a window of the learned size, and the settings that it was learned with."""
 
     model: Model
-    likeness: Likeness
+    similarity: Similarity
     window: Window
     settings: Settings
 
     def seen(self, scores: ScoreMap, row: int, column: int, window: Window) -> Seen:
         """A window whose features are at (row, column) of a map of appearance scores."""
-        score = min(1.0, float(scores.scores[row, column])) * self.likeness(scores.cells.row(row, column))
+        score = min(1.0, float(scores.scores[row, column])) * self.similarity(scores.cells.row(row, column))
         return Seen(window, window.box(self.settings.search.context), score)
 
 
 class Scan:
     """Searches frames for the objects of several models.
 
-    The score of a window is its likeness to the object (see `catstream.detection.likeness`) times the score of the
+    The score of a window is its similarity to the object (see `catstream.detection.similarity`) times the score of the
     appearance model, of which at most 1 counts: about 1 on the object, and near 0 on an unknown background.
 
     threshold : least score of a sighting
@@ -253,14 +253,16 @@ class Scan:
 
     def __init__(
         self,
-        learned: Iterable[Learned],
+        learned: Iterable[SavedModel],
         threshold: float = THRESHOLD,
         sizes: tuple[float, float] = SIZES,
         descriptor: Descriptor | None = None,
     ) -> None:
         self._threshold, self._descriptor = threshold, descriptor
         self._models = [
-            _Template(each.model, each.likeness(), Window.around(each.box, each.settings.search.context), each.settings)
+            _Template(
+                each.model, each.similarity(), Window.around(each.box, each.settings.search.context), each.settings
+            )
             for each in learned
         ]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
@@ -298,8 +300,8 @@ class Scan:
         """
         least = _FITTED * self._threshold
         model = searched.model
-        if frame.descriptor is None:  # no likeness is above 1 / share
-            appearance = cells.respond_above(model.weights, model.bias, least * searched.likeness.share)
+        if frame.descriptor is None:  # no similarity is above 1 / share
+            appearance = cells.respond_above(model.weights, model.bias, least * searched.similarity.share)
         else:
             appearance = cells.respond(model.weights, model.bias)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
@@ -366,7 +368,7 @@ class Search:
     network     file of the network that the models were learned with, empty for none
     """
 
-    models: Mapping[str, Learned]
+    models: Mapping[str, SavedModel]
     settings: RunSettings = field(default_factory=RunSettings)
     threshold: float = THRESHOLD
     every: float = EVERY
@@ -410,7 +412,7 @@ class Search:
 
 
 def find(
-    models: str | os.PathLike[str] | Learned | Iterable[str | os.PathLike[str] | Learned],
+    models: str | os.PathLike[str] | SavedModel | Iterable[str | os.PathLike[str] | SavedModel],
     paths: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
     *,
     threshold: float = THRESHOLD,
@@ -463,12 +465,12 @@ def find(
     return _sightings(search, find_files(_several(paths)))
 
 
-def load_models(models: Iterable[str | os.PathLike[str] | Learned]) -> dict[str, Learned]:
+def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[str, SavedModel]:
     """Load models; return each by the name of its object, or of its file."""
-    named: dict[str, Learned] = {}
+    named: dict[str, SavedModel] = {}
     for number, each in enumerate(models, 1):
-        learned = each if isinstance(each, Learned) else Learned.load(each)
-        name = learned.object or (f"object-{number}" if isinstance(each, Learned) else Path(each).stem)
+        learned = each if isinstance(each, SavedModel) else SavedModel.load(each)
+        name = learned.object or (f"object-{number}" if isinstance(each, SavedModel) else Path(each).stem)
         if name in named:
             raise SettingsError(f"two models are named {name!r}: rename the file of one, or save it under another name")
         named[name] = learned
@@ -477,7 +479,7 @@ def load_models(models: Iterable[str | os.PathLike[str] | Learned]) -> dict[str,
     return named
 
 
-def _digest(learned: Learned) -> str:
+def _digest(learned: SavedModel) -> str:
     """Identifies what is searched with: weights, bias and size."""
     digest = hashlib.sha256(learned.model.weights.tobytes())
     digest.update(np.array([learned.model.bias, *learned.box[2:]]).tobytes())
@@ -501,7 +503,7 @@ def _sightings(search: Search, files: list[File]) -> Iterator[Sighting]:
 
 def _several(given: _One | Iterable[_One]) -> Iterable[_One]:
     """One value or several, as several."""
-    return [given] if isinstance(given, str | os.PathLike | Learned) else given
+    return [given] if isinstance(given, str | os.PathLike | SavedModel) else given
 
 
 def _scanned(scan: Scan, frames: Iterator[_Searched]) -> Generator[tuple[_Searched, list[list[Seen]]]]:

@@ -31,7 +31,7 @@ from catstream.base.errors import (
 from catstream.client.control import control
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Generation, Store
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
@@ -231,7 +231,7 @@ class Stream:
 
     def _search(self, pipeline: Pipeline, model: Generation, name: str) -> None:
         """Search for an object by a saved model in the store."""
-        learned = Learned.from_bytes(model.files["model"], f"the model of {name!r} in the store")
+        learned = SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store")
         with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
             controlled.search(learned, name)
 

@@ -44,7 +44,7 @@ from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
 from catstream.jobs import state
 from catstream.jobs.job import Job
-from catstream.jobs.saved_model import Learned, merge
+from catstream.jobs.saved_model import SavedModel, merge
 from catstream.messages.kinds import FleetStatus
 from catstream.wire.endpoint import private_folder
 
@@ -426,7 +426,7 @@ def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
     return chosen
 
 
-def _learned(store: Store, stream: str, name: str, *, named: bool) -> Learned | None:
+def _learned(store: Store, stream: str, name: str, *, named: bool) -> SavedModel | None:
     """What the newest state of a stream in the store has learned of an object; None if that is nothing."""
     try:
         if (newest := store.stream(stream).newest()) is None:
@@ -485,6 +485,6 @@ def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:
     found = {}
     for stream in streams:
         for name, file in stream.models.items():
-            Learned.load(file)  # its errors name the file
+            SavedModel.load(file)  # its errors name the file
             found[stream.name, name] = file.read_bytes()
     return found

@@ -26,7 +26,7 @@ from catstream.base.threads import one_thread
 from catstream.compression.compressor import Compressor, sample_of
 from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
-from catstream.detection.likeness import Likeness
+from catstream.detection.similarity import Similarity
 from catstream.features.layout import row_length
 from catstream.messages import storage
 from catstream.messages.heads import TREES
@@ -39,12 +39,12 @@ _KIND = "learned 3"  # and the version of what the file holds
 #: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
 _SAME = ("coreset.size", "coreset.reduction", "search.context", "teaching.colours", "teaching.classifier")
 
-#: Likeness of two models, below which a merge is rejected, and below which it gives a warning: see decision 54.
+#: Similarity of two models, below which a merge is rejected, and below which it gives a warning: see decision 54.
 _UNLIKE, _DOUBTFUL = 0.25, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Learned:
+class SavedModel:
     """Everything that was learned of an object. The trees are not changed: `compressor` makes copies of them.
 
     object    name of the object, empty for the object without a name
@@ -101,13 +101,13 @@ class Learned:
             raise SettingsError(f"{one} was learned with {ours}, {other} {theirs}: give the same file features.network")
 
     @one_thread()
-    def likeness(self) -> Likeness:
-        """Measures the likeness of a window to the object, from the trees: see `catstream.detection.likeness`."""
+    def similarity(self) -> Similarity:
+        """Measures the similarity of a window to the object, from the trees: see `catstream.detection.similarity`."""
         tree, background = self.trees["object"], self.trees["background"]
         rows = np.vstack([*(node.rows for node in tree.nodes), tree.pending])
         whole = energy(rows) + tree.dropped_energy
         mean = (background.sum / background.rows_seen).astype(np.float32)
-        return Likeness.of(rows, whole, tree.sum, tree.rows_seen, mean)
+        return Similarity.of(rows, whole, tree.sum, tree.rows_seen, mean)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one safetensors file, atomically.
@@ -210,7 +210,7 @@ def check_files(files: Mapping[str, Path], settings: Settings, network: str) -> 
     are too large.
     """
     for file in files.values():
-        Learned.load(file).check_fits(settings, network)
+        SavedModel.load(file).check_fits(settings, network)
     check_sizes({name: file.stat().st_size for name, file in files.items()})
 
 
@@ -237,7 +237,7 @@ def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
     """
     models = {name: part.model for name, part in features.objects.items() if part.model}
     return {
-        name: Learned.from_bytes(model, f"the saved model of {listed([name])}").compressor(
+        name: SavedModel.from_bytes(model, f"the saved model of {listed([name])}").compressor(
             settings, features.network, name
         )
         for name, model in models.items()
@@ -245,7 +245,7 @@ def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
 
 
 @one_thread()  # of the trees, too: more threads add in another order, which changes the bits
-def merge(parts: Iterable[Learned], *, force: bool = False) -> Learned:
+def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     """One saved model from several of the same object, as if one stream had contained all their frames.
 
     The trees are merged, and a model is trained from them. The bound of the merged tree is the sum of the bounds plus
@@ -254,8 +254,8 @@ def merge(parts: Iterable[Learned], *, force: bool = False) -> Learned:
 
     The size is the geometric mean of the sizes. An object without a name may be merged with one that has a name.
 
-    The objects must look alike: each model is compared with the others by the likeness of its mean appearance (see
-    `catstream.detection.likeness`), of the two directions the higher one. Models of one object have 0.34 or more,
+    The objects must look alike: each model is compared with the others by the similarity of its mean appearance (see
+    `catstream.detection.similarity`), of the two directions the higher one. Models of one object have 0.34 or more,
     most pairs of different objects less than 0.25. Below 0.5 there is a UserWarning. Several models may be a chain, for
     example of views from different sides: each needs to look like one of the others only.
 
@@ -267,11 +267,11 @@ def merge(parts: Iterable[Learned], *, force: bool = False) -> Learned:
     ------
     SettingsError
         If there are fewer than two, if their settings or names differ, if two contain the same frames, or if their
-        objects do not look alike (below 0.25); or if a part is no `Learned`, but for example the name of a file.
+        objects do not look alike (below 0.25); or if a part is no `SavedModel`, but for example the name of a file.
     """
     parts = list(parts)
-    if wrong := [part for part in parts if not isinstance(part, Learned)]:
-        raise SettingsError(f"a merge takes saved models, got {wrong[0]!r}: read a file with catstream.Learned.load")
+    if wrong := [part for part in parts if not isinstance(part, SavedModel)]:
+        raise SettingsError(f"a merge takes saved models, got {wrong[0]!r}: read a file with catstream.SavedModel.load")
     if len(parts) < 2:
         raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
     first, origins = parts[0], set(parts[0].origins)
@@ -297,7 +297,7 @@ def merge(parts: Iterable[Learned], *, force: bool = False) -> Learned:
     )
 
 
-def _check_merge(one: Learned, other: Learned, origins: set[str]) -> None:
+def _check_merge(one: SavedModel, other: SavedModel, origins: set[str]) -> None:
     """Raise SettingsError if a saved model cannot be merged; `origins` are those of all before it."""
     if one.object and other.object and one.object != other.object:
         raise SettingsError(
@@ -313,12 +313,12 @@ def _check_merge(one: Learned, other: Learned, origins: set[str]) -> None:
         )
 
 
-def _check_alike(parts: Sequence[Learned]) -> None:
+def _check_alike(parts: Sequence[SavedModel]) -> None:
     """Raise SettingsError, or warn, if the models do not look like those of one object.
 
-    The models are connected by their highest likenesses, as in a maximum spanning tree; the lowest of these decides.
+    The models are connected by their highest similarityes, as in a maximum spanning tree; the lowest of these decides.
     """
-    measures = [part.likeness() for part in parts]
+    measures = [part.similarity() for part in parts]
     means = [(tree.sum / tree.rows_seen).astype(np.float32) for tree in (part.trees["object"] for part in parts)]
     lowest, connected, rest = (1.0, 0, 0), [0], set(range(1, len(parts)))
     while rest:
@@ -326,11 +326,11 @@ def _check_alike(parts: Sequence[Learned]) -> None:
         lowest = min(lowest, link)
         connected.append(link[2])
         rest.remove(link[2])
-    likeness, one, other = lowest
-    if likeness < _DOUBTFUL:
+    similarity, one, other = lowest
+    if similarity < _DOUBTFUL:
         one, other = sorted((one + 1, other + 1))
-        text = f"saved models {one} and {other} look like different objects (likeness {likeness:.2f}"
-        if likeness < _UNLIKE:
+        text = f"saved models {one} and {other} look like different objects (similarity {similarity:.2f}"
+        if similarity < _UNLIKE:
             raise SettingsError(
                 f"{text}, at least {_UNLIKE} is needed): merge models of the same object, or pass --force "
                 "(force=True in Python) if it is the same one"

@@ -28,7 +28,7 @@ from catstream.base.text import listed
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.jobs.job import Job
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 
 #: Folder of the checkpoints, in that of the state.
 TREES = "trees"
@@ -59,7 +59,7 @@ def last_time(folder: Path) -> float:
     return CheckpointStore(folder / TREES).position()[1]
 
 
-def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
+def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> SavedModel:
     """Everything that was learned of an object up to the newest valid checkpoint; "" is also the only object.
 
     ObjectError if there is no such object; ServiceError if nothing was learned before a checkpoint.
@@ -70,7 +70,7 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> Learned:
     if forest.compressors and name not in forest.compressors:
         wanted = repr(name) if name else "without a name"
         raise ObjectError(f"there is no object {wanted}: the objects are {listed(forest.compressors)}")
-    return Learned.of(forest.compressors.get(name) or Compressor(settings, name), settings)
+    return SavedModel.of(forest.compressors.get(name) or Compressor(settings, name), settings)
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -187,7 +187,7 @@ def measure(
         success_followed=_success(boxes[followed], true[followed]),
         max_lag=max(
             (
-                int(health.counters["sent"] - health.counters["taken"])
+                int(health.counters["sent"] - health.counters["processed"])
                 for moment, health in observations.health
                 if health.process == "detector" and schedule.start <= moment <= end
             ),

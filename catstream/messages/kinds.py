@@ -182,18 +182,18 @@ class Features:
 class Position:
     """How far the receiver of an acknowledged channel is, receiver -> sender.
 
-    seq       all messages up to this one are stored, except for the last `unsaved` ones: the sender drops its copies
-    taken     all messages up to this one have been processed
-    unsaved   how many of the messages up to `seq` are in memory only, because the disk cannot be written
-    versions  version of the newest Sample of each object that has one, by name
-    again     whether the sender has to send all messages after `taken` again, as they may be lost
-    states    for a sender that was restarted: the state of each object's detector after the message that it asked for,
-              or after the nearest one that is known, by name
+    seq        all messages up to this one are stored, except for the last `in_memory` ones: the sender drops its copies
+    processed  all messages up to this one have been processed
+    in_memory  how many of the messages up to `seq` are in memory only, because the disk cannot be written
+    versions   version of the newest Sample of each object that has one, by name
+    again      whether the sender has to send all messages after `processed` again, as they may be lost
+    states     for a sender that was restarted: the state of each object's detector after the message that it asked
+               for, or after the nearest one that is known, by name
     """
 
     seq: Integer = 0
-    taken: Integer = 0
-    unsaved: Integer = 0
+    processed: Integer = 0
+    in_memory: Integer = 0
     versions: ByObject[Integer] = field(default_factory=dict)
     again: bool = False
     states: ByObject[DetectorState] = field(default_factory=dict)
@@ -373,7 +373,7 @@ class Preview:
 
 
 @dataclass(frozen=True, slots=True)
-class SavedModel:
+class ModelFile:
     """Everything that was learned of an object, compressor -> anyone.
 
     version  version of the newest sample of the object

@@ -11,9 +11,9 @@ from catstream.base.errors import ServiceError
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.jobs.saved_model import Learned, continued
+from catstream.jobs.saved_model import SavedModel, continued
 from catstream.jobs.state import TREES, locked
-from catstream.messages.kinds import End, Features, Position, SavedModel
+from catstream.messages.kinds import End, Features, ModelFile, Position
 from catstream.processes.decisions import checkpoint_is_due, stored, with_end
 from catstream.processes.process import MESSAGE_SECONDS, Process
 from catstream.wire.acknowledged import Receiver
@@ -97,14 +97,14 @@ class CompressorLoop:
             self._store(urgent)
         if message is not None or self._position is not before:
             # Samples count without a checkpoint, because in lockstep the detector waits for their models.
-            position = replace(self._position, taken=seq, versions=self._forest.versions)
+            position = replace(self._position, processed=seq, versions=self._forest.versions)
             features.acknowledge(with_end(position, message.seq) if isinstance(message, End) else position)
         features.answer()
 
     @property
     def _stored(self) -> int:
         """Number of the newest message that is in a checkpoint."""
-        return self._position.seq - self._position.unsaved
+        return self._position.seq - self._position.in_memory
 
     def _store(self, urgent: bool) -> None:
         self._process.watchdog.allow()
@@ -127,7 +127,9 @@ class CompressorLoop:
         """Store all received messages; the sender continues with the next compressor."""
         if self._forest.seq > self._stored:
             self._store(urgent=False)
-            self._features.acknowledge(replace(self._position, taken=self._forest.seq, versions=self._forest.versions))
+            self._features.acknowledge(
+                replace(self._position, processed=self._forest.seq, versions=self._forest.versions)
+            )
 
     def _check(self, message: Features | End) -> None:
         """Raise ProtocolError for features of another stream."""
@@ -138,7 +140,7 @@ class CompressorLoop:
         return self._forest.counters() | {"stored": self._stored}
 
 
-class SavedModels(Publisher[SavedModel]):
+class SavedModels(Publisher[ModelFile]):
     """Sends the trees of each object after each new sample, at most once a second; nothing without subscribers."""
 
     def __init__(self, endpoint: Endpoint, settings: Settings) -> None:
@@ -162,8 +164,8 @@ class SavedModels(Publisher[SavedModel]):
 
     def _send(self, name: str, compressor: Compressor) -> None:
         try:
-            learned = Learned.of(compressor, self._settings)
+            learned = SavedModel.of(compressor, self._settings)
         except ServiceError:  # the object of a saved model has not been found yet
             return
-        self.send(SavedModel(compressor.version, learned.to_bytes(), name))
+        self.send(ModelFile(compressor.version, learned.to_bytes(), name))
         self._sent[name] = compressor.version, monotonic()

@@ -116,8 +116,8 @@ def resume_at(position: Position, after: int, desired: DesiredState, context: fl
     after : number of the last frame that the owner of the run has
     context : size of a window, in boxes of its object
     """
-    seq = position.taken if live else min(after, position.taken)
-    repeats = position.taken if live or after == NO_OWNER else max(after, position.taken)
+    seq = position.processed if live else min(after, position.processed)
+    repeats = position.processed if live or after == NO_OWNER else max(after, position.processed)
     begun = {name: each for name, each in desired.objects.items() if each.begins <= seq}
     if begun and not live and not position.versions:
         return Start(min(each.begins for each in begun.values()) - 1, repeats, desired, {})
@@ -143,22 +143,22 @@ def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str
 
 
 def awaited(
-    due: int, taken: int, samples: Mapping[str, int], newest: Mapping[str, int]
+    due: int, processed: int, samples: Mapping[str, int], newest: Mapping[str, int]
 ) -> Literal["", "features", "models"]:
     """The channel on which a detector waits before its next frame; empty if it need not wait.
 
-    `due` is the seq of the newest features that the models must include by now, and `taken` that of the newest ones
+    `due` is the seq of the newest features that the models must include by now, and `processed` that of the newest ones
     that the compressor has processed. `samples` are the versions of each object's newest sample of the features up to
     `due`, and `newest` those of the newest models that have arrived, of each object that had begun by then.
 
-    >>> awaited(due=7, taken=6, samples={}, newest={"": 0})
+    >>> awaited(due=7, processed=6, samples={}, newest={"": 0})
     'features'
-    >>> awaited(due=7, taken=8, samples={"": 3}, newest={"": 2})
+    >>> awaited(due=7, processed=8, samples={"": 3}, newest={"": 2})
     'models'
-    >>> awaited(due=7, taken=8, samples={"": 3}, newest={"": 3})
+    >>> awaited(due=7, processed=8, samples={"": 3}, newest={"": 3})
     ''
     """
-    if taken < due:
+    if processed < due:
         return "features"
     return "models" if any(newest[name] < version for name, version in samples.items() if name in newest) else ""
 
@@ -180,12 +180,12 @@ def stored(position: Position, seq: int, *, saved: bool, urgent: bool) -> Positi
     If the disk is full, one that is urgent, as the sender waits for it, is acknowledged although it is only in memory:
     training continues.
 
-    >>> stored(Position(8), 12, saved=False, urgent=True).unsaved
+    >>> stored(Position(8), 12, saved=False, urgent=True).in_memory
     4
     """
     if not saved and not urgent:
         return position
-    return replace(position, seq=seq, unsaved=0 if saved else seq - position.seq + position.unsaved)
+    return replace(position, seq=seq, in_memory=0 if saved else seq - position.seq + position.in_memory)
 
 
 def with_end(position: Position, seq: int) -> Position:
@@ -196,4 +196,4 @@ def with_end(position: Position, seq: int) -> Position:
     """
     if seq <= position.seq:
         return position
-    return replace(position, seq=seq, taken=seq, unsaved=position.unsaved and position.unsaved + 1)
+    return replace(position, seq=seq, processed=seq, in_memory=position.in_memory and position.in_memory + 1)

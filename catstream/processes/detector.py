@@ -19,7 +19,7 @@ from catstream.base.addresses import without_password
 from catstream.base.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import SEARCHED
 from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state
 from catstream.processes.control_commands import STOPPED, answer, carried_out, check_room, is_kept, object_of
@@ -101,7 +101,7 @@ class DetectorLoop:
         self._ending = STOPPED if self.desired.stopped else ""  # reason for which no more frames are tracked
         self._boxes: list[Command] = []  # that wait for a frame
         self._arrived: dict[str, Model] = {}  # of objects that have not begun again yet
-        self._begun: dict[str, Learned] = {}  # the saved models that objects begin with in the next message
+        self._begun: dict[str, SavedModel] = {}  # the saved models that objects begin with in the next message
         self._skipped = 0  # frames that were left out because the run was paused or waited for a box
         self._paused_until = 0.0  # end of a pause that ends by itself, as its sender may be gone
         self._tracks = Tracks(0, 0, {})  # the last ones
@@ -175,7 +175,7 @@ class DetectorLoop:
             detector = self.detectors.add(name)
             detector.resume(state, models[name])
             if state.is_sought and (learned := self._model_files.get(self.desired.objects[name].model)) is not None:
-                detector.likeness = learned.likeness()
+                detector.similarity = learned.similarity()
         self._arrived = {name: model for name, model in models.items() if name not in start.states}
         features.window.resume(start.seq, position)
         self._conclude()
@@ -237,7 +237,7 @@ class DetectorLoop:
             if not each.model:
                 given[name] = self.detectors.begin(name, pyramid, each.box, frame.time)
             elif (learned := self._model_files.get(each.model)) is not None:
-                self.detectors.seek(name, learned.model, learned.box, learned.likeness())
+                self.detectors.seek(name, learned.model, learned.box, learned.similarity())
                 self._begun[name] = learned
             else:
                 self.desired = self.desired.without(name)
@@ -282,7 +282,7 @@ class DetectorLoop:
         while not (self.end_reason or self._live):
             known = self.detectors.detectors.items()
             newest = {name: each.newest_version for name, each in known if each.state and each.state.first_frame < due}
-            channel = awaited(due, features.window.taken, features.window.count_samples(due), newest)
+            channel = awaited(due, features.window.processed, features.window.count_samples(due), newest)
             if not channel:
                 return
             if channel == "features":
@@ -330,7 +330,7 @@ class DetectorLoop:
         if command.model is None:
             return None
         self._process.watchdog.allow()
-        learned = Learned.from_bytes(command.model, "the file")
+        learned = SavedModel.from_bytes(command.model, "the file")
         learned.check_fits(self._process.settings, self.detectors.network)
         return self._model_files.add(learned)
 
@@ -437,7 +437,7 @@ class DetectorLoop:
         window = self._outputs.features.window
         own = {
             "sent": window.sent,
-            "taken": window.taken,
+            "processed": window.processed,
             "stored": window.stored,
             "model_version": max((each.model_version for each in self._tracks.tracks.values()), default=0),
             "objects": len(self.desired.objects),
@@ -476,5 +476,5 @@ def _desired(process: Process, models: ModelFiles) -> DesiredState:
             process.trouble = str(error)
             _log.warning("%s", error)
     boxes = {name: DesiredObject(box, begins=1) for name, box in job.boxes.items()}
-    saved = {name: models.add(Learned.load(file)) for name, file in job.models.items()}
+    saved = {name: models.add(SavedModel.load(file)) for name, file in job.models.items()}
     return DesiredState(boxes | saved, paused=job.paused)

@@ -115,7 +115,7 @@ with_part = combined(
 #: Adds `--settings`, `--preset` and `--set`, as the argument `given`: a dict of the settings that were given.
 with_given = combined(
     "given",
-    lambda file, preset, pairs: Settings.given(preset=preset, file=file, overrides=pairs),
+    lambda file, preset, pairs: Settings.collect(preset=preset, file=file, overrides=pairs),
     click.option("--settings", "file", type=PATH, help="TOML file of settings."),
     click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings."),
     click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated."),

@@ -12,7 +12,7 @@ from time import monotonic
 from catstream.base.box import Box
 from catstream.base.errors import CatstreamError
 from catstream.base.files import write_atomically
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import End, Features, Preview, Tracks
 from catstream.processes.decisions import DesiredObject
 from catstream.processes.process import Process
@@ -108,20 +108,20 @@ class ModelFiles:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._models: dict[str, Learned] = {}
+        self._models: dict[str, SavedModel] = {}
 
-    def add(self, learned: Learned) -> DesiredObject:
+    def add(self, learned: SavedModel) -> DesiredObject:
         """Keep a saved model in memory; returns the object that it begins in the first message, with its name."""
         data = learned.to_bytes()
         name = blake2b(data, digest_size=16).hexdigest()
         self._models[name] = learned
         return DesiredObject(learned.box, 1, name, len(data), learned.model.version)
 
-    def get(self, name: str) -> Learned | None:
+    def get(self, name: str) -> SavedModel | None:
         """The saved model of a name, None if its file cannot be read."""
         if name not in self._models:
             try:
-                self._models[name] = Learned.load(self._file(name))
+                self._models[name] = SavedModel.load(self._file(name))
             except CatstreamError as error:
                 _log.warning("the object of a saved model is not searched for any more: %s", error)
         return self._models.get(name)

@@ -13,13 +13,12 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 from threadpoolctl import threadpool_info
 
-from catstream.base import errors
 from catstream.base.settings import Settings
-from catstream.evaluation.peers import OPENCV
 
-_ROOT = Path(errors.__file__).parents[1]
+_ROOT = Path(__file__).parents[2]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
 
 
@@ -53,7 +52,7 @@ def machine() -> dict[str, object]:
         "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9),
         "system": platform.system(),
         "python": platform.python_version(),
-        "opencv": OPENCV,
+        "opencv": cv2.__version__,
         "blas": sorted(blas),
         **{library: version(library) for library in _LIBRARIES},
     }

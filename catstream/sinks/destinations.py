@@ -157,8 +157,8 @@ def sink_of(place: str) -> Row:
     row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
     if row is None:
         raise VideoError(
-            f"{shown(place)} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, where "
-            "- is standard output; for other formats use catstream export"
+            f"{redacted(place)} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, "
+            "where - is standard output; for other formats use catstream export"
         )
     return row
 
@@ -190,11 +190,11 @@ def check_sink(place: str, options: SinkOptions) -> None:
         home.check(place, options)
 
 
-def shown(place: str) -> str:
+def redacted(place: str) -> str:
     """Return a destination as messages name it: an address without its password, of a webhook its host alone.
 
-    >>> shown("mqtt://me:secret@10.0.0.7/yard"), shown("https://example.com/hooks/T0/B0/secret"), shown("a@b:c.csv")
-    ('mqtt://10.0.0.7/yard', 'https://example.com/...', 'a@b:c.csv')
+    >>> redacted("mqtt://me:secret@10.0.0.7/yard"), redacted("https://example.com/hooks/T0/B0/secret")
+    ('mqtt://10.0.0.7/yard', 'https://example.com/...')
     """
     if is_file(place):
         return place

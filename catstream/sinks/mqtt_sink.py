@@ -26,7 +26,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from catstream.base.errors import VideoError
 from catstream.base.text import counted
 from catstream.jobs.job import SinkOptions
-from catstream.sinks.destinations import Origin, TrackedFrame, shown
+from catstream.sinks.destinations import Origin, TrackedFrame, redacted
 from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split
 
 _LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
@@ -176,5 +176,5 @@ def _checked(place: str) -> SplitResult:
     """The parts of the address; VideoError if it is not valid."""
     url = split(place, "mqtt://[USER:PASSWORD@]HOST[:PORT]/TOPIC")
     if url.path in ("", "/") or set("+#@") & set(unquote(url.path)) or set("?#") & set(place):
-        raise VideoError(f"{shown(place)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")
+        raise VideoError(f"{redacted(place)} has no valid topic: expected mqtt://HOST/TOPIC, without any of + # ? @")
     return url

@@ -14,7 +14,7 @@ from uuid import uuid4
 from catstream.base.errors import SilenceError, VideoError
 from catstream.client.subscription import Subscription
 from catstream.messages.kinds import Preview, Track
-from catstream.sinks.destinations import Origin, shown
+from catstream.sinks.destinations import Origin, redacted
 from catstream.sinks.events import Event, Events
 
 #: Messages that wait for a destination that is away or slow; further ones are missed.
@@ -30,7 +30,7 @@ class Warnings:
     """Warns about a destination, which is shown without its password."""
 
     def __init__(self, place: str) -> None:
-        self._shown, self._problem = shown(place), ""
+        self._shown, self._problem = redacted(place), ""
 
     def warn(self, problem: str) -> None:
         """Warn of a problem of the destination, once however often it occurs; with "", say that it is over."""
@@ -83,4 +83,4 @@ def split(place: str, form: str) -> SplitResult:
             return url
     except ValueError:
         pass
-    raise VideoError(f"{shown(place)} is not valid: expected {form}, other characters escaped as in %20")
+    raise VideoError(f"{redacted(place)} is not valid: expected {form}, other characters escaped as in %20")

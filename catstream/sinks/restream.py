@@ -27,7 +27,7 @@ from catstream.base.text import counted
 from catstream.client.subscription import Subscription
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Origin, TrackedFrame, shown
+from catstream.sinks.destinations import Origin, TrackedFrame, redacted
 from catstream.sinks.reports import Warnings, split
 from catstream.sinks.video_sink import DrawnPictures
 from catstream.video.writer import LiveWriter
@@ -55,7 +55,7 @@ class StreamSink:
         """Raise VideoError if this is no address of a stream."""
         form = f"{place.partition('://')[0]}://[USER:PASSWORD@]HOST[:PORT]/PATH"
         if split(place, form).path in ("", "/"):
-            raise VideoError(f"{shown(place)} does not name a stream: expected {form}")
+            raise VideoError(f"{redacted(place)} does not name a stream: expected {form}")
 
     def write(self, frame: TrackedFrame) -> None:
         """Count the frame if it is missed; the process receives the tracks from the pipeline itself."""

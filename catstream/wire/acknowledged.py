@@ -104,7 +104,7 @@ class Receiver(ChannelSocket[Message]):
     Each message that `receive` returns is processed, and then acknowledged. Senders that were restarted wait for
     `answer`: what they have not sent themselves should be stored by then, as they cannot repeat it without the source.
 
-    position  where the stream continues; the next message received is the one after `position.taken`
+    position  where the stream continues; the next message received is the one after `position.processed`
     size      as the sender's
     check     raises ProtocolError if a message does not belong to this stream; it then does not count as received
     states    returns the states of the detectors after a message, for a sender that was restarted
@@ -147,12 +147,14 @@ class Receiver(ChannelSocket[Message]):
         delivered, reply = self.window.receive(peer, message.seq, monotonic(), last=last, size=len(data))
         if reply is not None:
             self._reply(peer, reply)
-        if not delivered and message.seq > self.window.taken + self._size + 1:  # more than a sender may have in flight
-            self._reject("sequence", f"message {message.seq} came after {self.window.taken}")
+        if (
+            not delivered and message.seq > self.window.processed + self._size + 1
+        ):  # more than a sender may have in flight
+            self._reject("sequence", f"message {message.seq} came after {self.window.processed}")
         return message if delivered else None
 
     def acknowledge(self, position: Position) -> None:
-        """Acknowledge all that was received; it is stored up to `position.seq`, except the last `position.unsaved`."""
+        """Acknowledge all messages; up to `position.seq`, except the last `in_memory` ones, they are stored."""
         self.window.acknowledge(position)
         if self.window.peer is not None:
             self._reply(self.window.peer, self.window.position)

@@ -35,10 +35,10 @@ from catstream.messages.kinds import (
     Health,
     Listing,
     Model,
+    ModelFile,
     Preview,
     Question,
     Sample,
-    SavedModel,
     Track,
     Tracks,
 )
@@ -117,8 +117,8 @@ CONTROL: Channel[Command | Answer] = Channel(
 TRAINING: Channel[Features | End] = Channel(
     "training", (Features, End), ("detector",), None, "every", 10, _FEATURES, "features", "watch", high_water_mark=64
 )
-SAVED_MODELS: Channel[SavedModel] = Channel(
-    "saved-models", (SavedModel,), ("compressor",), None, "newest", 11, 512, role="watch", high_water_mark=2
+SAVED_MODELS: Channel[ModelFile] = Channel(
+    "saved-models", (ModelFile,), ("compressor",), None, "newest", 11, 512, role="watch", high_water_mark=2
 )
 
 #: THE TABLE, by name.

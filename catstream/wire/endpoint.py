@@ -205,7 +205,7 @@ def private_folder() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def meeting_place(text: str, default: Path, keys: str = "", source: str = "", fleet: str = "") -> Iterator[Endpoint]:
+def reserve_endpoint(text: str, default: Path, keys: str = "", source: str = "", fleet: str = "") -> Iterator[Endpoint]:
     """The endpoint of one pipeline, or of the registry of a fleet, locked for it; removes all socket files afterwards.
 
     `text` and `keys` are settings. The private folder `default` is used if `text` is empty, and the endpoint is found

@@ -9,14 +9,14 @@ application once and in order, and replies with a `Position` once the applicatio
 copies of what is stored.
 
 If a message is missing, or a sender asks for the position on another connection than that of the last message, the
-reply says `again`: the sender transmits all messages after `taken` again. On the same connection none is lost; for the
-same reason the sender goes back once for several such replies. It asks if it was restarted, and after
+reply says `again`: the sender transmits all messages after `processed` again. On the same connection none is lost; for
+the same reason the sender goes back once for several such replies. It asks if it was restarted, and after
 `PATIENCE_SECONDS` without a reply while messages wait. So either side may be restarted, any connection may break, and
 any reply may be lost: each message is still delivered once, in order. The end of the stream is delivered at any `seq`
 up to the next one: a restarted sender may end before it has repeated all that was delivered.
 
-A message may be acknowledged although it is only in memory, because the disk cannot be written (`Position.unsaved`). If
-such a receiver is restarted, the sender cannot retransmit it and raises `StreamRewoundError`: it has to make the
+A message may be acknowledged although it is only in memory, because the disk cannot be written (`Position.in_memory`).
+If such a receiver is restarted, the sender cannot retransmit it and raises `StreamRewoundError`: it has to make the
 messages again from the source.
 """
 
@@ -43,11 +43,11 @@ class SendWindow:
     sent          newest seq that was pushed
     acknowledged  newest seq that the receiver will not ask for again while it lives
     stored        newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written
-    taken         newest seq that the receiver has processed
+    processed         newest seq that the receiver has processed
     """
 
     def __init__(self, channel: str, size: int, now: float) -> None:
-        self.sent = self.acknowledged = self.stored = self.taken = 0
+        self.sent = self.acknowledged = self.stored = self.processed = 0
         self._channel, self._size = channel, size
         self._unacknowledged: deque[tuple[int, bytes]] = deque()  # oldest first
         self._bytes = 0  # their total size
@@ -61,9 +61,9 @@ class SendWindow:
 
     def resume(self, seq: int, position: Position) -> None:
         """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
-        self.sent = self.acknowledged = self.taken = seq
-        self.stored = min(seq, position.seq - position.unsaved)
-        self._sent_before = position.taken + self._size  # a whole window of the earlier sender may be on its way
+        self.sent = self.acknowledged = self.processed = seq
+        self.stored = min(seq, position.seq - position.in_memory)
+        self._sent_before = position.processed + self._size  # a whole window of the earlier sender may be on its way
 
     @property
     def full(self) -> bool:
@@ -105,26 +105,26 @@ class SendWindow:
                 "it holds another stream: restart it, or start this process with --resume"
             )
         if position.again:
-            if position.taken < self.acknowledged:
+            if position.processed < self.acknowledged:
                 raise StreamRewoundError(
-                    f"the receiver of {self._channel} had {self.acknowledged} messages and now has {position.taken}: "
-                    "what came between is made again from the source"
+                    f"the receiver of {self._channel} had {self.acknowledged} messages and now has "
+                    f"{position.processed}: what came between is made again from the source"
                 )
-        elif position.seq < self.acknowledged or position.taken < self.taken:
+        elif position.seq < self.acknowledged or position.processed < self.processed:
             return False
         self._last_reply = now
         if position.versions != self._newest:
-            self._samples.append((self.taken + 1, position.versions))
+            self._samples.append((self.processed + 1, position.versions))
             self._newest = position.versions
         while self._unacknowledged and self._unacknowledged[0][0] <= position.seq:
             self._bytes -= len(self._unacknowledged.popleft()[1])
             self._in_flight = max(self._in_flight - 1, 0)
         self.acknowledged = max(self.acknowledged, min(position.seq, self.sent))
-        self.stored = max(self.stored, min(position.seq - position.unsaved, self.sent))
-        self.taken = min(position.taken, self.sent)
+        self.stored = max(self.stored, min(position.seq - position.in_memory, self.sent))
+        self.processed = min(position.processed, self.sent)
         if position.again and now - self._went_back > AGAIN_SECONDS:
             self._went_back = now
-            self._in_flight = min(sum(seq <= position.taken for seq, _ in self._unacknowledged), self._in_flight)
+            self._in_flight = min(sum(seq <= position.processed for seq, _ in self._unacknowledged), self._in_flight)
         return True
 
     def count_samples(self, seq: int) -> dict[str, int]:
@@ -142,16 +142,16 @@ class SendWindow:
 
 
 class ReceiveWindow:
-    """The receiver's side: the stream continues with the message after `position.taken`; the sender keeps `size`.
+    """The receiver's side: the stream continues with the message after `position.processed`; the sender keeps `size`.
 
-    taken      newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
+    processed      newest seq that was delivered; it is processed before `acknowledge` and the next `receive`
     ended      whether the sender has sent the end of the stream
     connected  whether the sender of the newest message was still connected when a message was last awaited
     peer       the sender of the newest message, to which acknowledgements go; None before the first
     """
 
     def __init__(self, position: Position, size: int) -> None:
-        self.taken = position.taken
+        self.processed = position.processed
         self.ended = self.connected = False
         self.peer: bytes | None = None
         self._position, self._size = position, size
@@ -161,12 +161,12 @@ class ReceiveWindow:
     @property
     def position(self) -> Position:
         """The reply to the sender of the last message."""
-        return replace(self._position, taken=self.taken)
+        return replace(self._position, processed=self.processed)
 
     @property
     def half_full(self) -> bool:
         """Whether half of the sender's window is not stored yet: the sender waits while its window is full."""
-        return 2 * (self.taken - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
+        return 2 * (self.processed - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def asked(self, peer: bytes) -> Position:
         """The reply to a sender that asks for the position."""
@@ -180,10 +180,10 @@ class ReceiveWindow:
         Returns whether it is the next one, to be given to the application; and the reply to its sender, if any.
         """
         ends = last and not self.ended  # also before a restarted sender has repeated what was delivered
-        if seq <= self.taken and not ends:  # retransmitted: the sender does not know that it arrived
+        if seq <= self.processed and not ends:  # retransmitted: the sender does not know that it arrived
             return False, self.position
-        if seq <= self.taken + 1:
-            self.taken, self.ended, self._bytes = max(seq, self.taken), last, self._bytes + size
+        if seq <= self.processed + 1:
+            self.processed, self.ended, self._bytes = max(seq, self.processed), last, self._bytes + size
             self.peer, self.connected, self._gap_reported = peer, True, -math.inf
             return True, None
         if now - self._gap_reported <= PATIENCE_SECONDS:
@@ -192,9 +192,9 @@ class ReceiveWindow:
         return False, replace(self.position, again=True)
 
     def acknowledge(self, position: Position) -> None:
-        """All delivered messages are processed, and stored up to `position.seq`, except the last `position.unsaved`."""
+        """All messages are processed; up to `position.seq`, except the last `in_memory` ones, they are stored."""
         self._position = position
-        if position.seq >= self.taken:
+        if position.seq >= self.processed:
             self._bytes = 0
 
     def disconnected(self) -> None:

@@ -35,7 +35,7 @@ def replaced(name, value):
 WAYS = {
     "Settings": grouped,
     "replace": replaced,
-    "but": lambda name, value: Settings().but({name: value}),
+    "but": lambda name, value: Settings().replace({name: value}),
     "of": lambda name, value: Settings.from_values({name: value}),
     "set": lambda name, value: Settings.load(overrides=[f"{name}={value}"], environment={}),
     "environment": lambda name, value: Settings.load(
@@ -126,7 +126,7 @@ def test_groups_may_be_written_in_one_way_or_the_other():
     flat, nested = {"coreset.size": 32, "run.seed": 7}, {"coreset": {"size": 32}, "run": {"seed": 7}}
     groups = Settings(coreset=CoresetSettings(size=32), run=RunSettings(seed=7))
     assert Settings.from_values(flat) == Settings.from_values(nested) == groups
-    assert Settings().but(nested) == Settings(**nested) == groups
+    assert Settings().replace(nested) == Settings(**nested) == groups
 
 
 @pytest.mark.parametrize(

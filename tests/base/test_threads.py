@@ -140,7 +140,7 @@ with open_source(video) as source:
         tracker = catstream.Tracker()
         for number, frame in enumerate(islice(source, 25)):
             tracker.update(frame.image) if number else tracker.init(frame.image, box)
-        models.append(tracker.learned())
+        models.append(tracker.saved_model())
 print(blake2b(catstream.merge(models).to_bytes()).hexdigest())
 """
 

@@ -170,7 +170,7 @@ def test_status_fails_and_names_a_silent_process(resting, said):
 
 
 def test_the_lines_of_status_that_depend_on_the_source_and_the_trees():
-    counters = {"sent": 9.0, "taken": 9.0, "stored": 9.0, "skipped": 2.0}
+    counters = {"sent": 9.0, "processed": 9.0, "stored": 9.0, "skipped": 2.0}
     reports = {"detector": [Health("detector", 1.0, counters)], "compressor": [Health("compressor", 1.0, {"seq": 1.0})]}
     lines = _format(_summary("run", reports)).splitlines()
     assert "source     2 frames skipped" in lines, "a demo is never opened again"

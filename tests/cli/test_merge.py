@@ -3,7 +3,7 @@
 import pytest
 
 from catstream.base.box import Box
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from tests.learning import learned_from
 
 #: A part of the background of the demo video.
@@ -27,7 +27,7 @@ def test_models_of_two_cameras_are_merged_into_one_file(succeed, models, tmp_pat
     door, yard, _ = models
     output, errors = succeed("merge", door, yard, "-o", tmp_path / "both")
     assert not errors
-    one, other, both = map(Learned.load, (door, yard, tmp_path / "both"))
+    one, other, both = map(SavedModel.load, (door, yard, tmp_path / "both"))
     rows = both.trees["object"].rows_seen
     assert rows == one.trees["object"].rows_seen + other.trees["object"].rows_seen
     assert f"2 saved models, 2 videos, {rows} rows of the object" in output
@@ -66,5 +66,5 @@ def test_a_doubt_is_one_line_and_the_models_are_merged(succeed, models, tmp_path
     door, _, lake = models
     output, errors = succeed("merge", door, lake, "-o", tmp_path / "both")
     assert errors.count("\n") == 1
-    assert "catstream: warning: saved models 1 and 2 look like different objects (likeness 0." in errors
+    assert "catstream: warning: saved models 1 and 2 look like different objects (similarity 0." in errors
     assert "2 saved models" in output

@@ -7,7 +7,7 @@ from threading import Event
 
 import pytest
 
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
 
@@ -72,7 +72,7 @@ def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, stee
     assert (code, answer) == (0, f"the object begins at {box} in frame 0")
     assert status()["state"] == "paused"
     until(lambda: steer("save", tmp_path / "one")[0] == 0)  # once there is a model of the frame of the box
-    assert Learned.load(tmp_path / "one").model.frame == 0
+    assert SavedModel.load(tmp_path / "one").model.frame == 0
     assert steer("resume") == (0, "resumed after frame 0")
     errors = run.communicate(timeout=120)[1]
     assert run.returncode == 0, errors

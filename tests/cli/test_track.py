@@ -16,7 +16,7 @@ import pytest
 
 from catstream.base.errors import VideoError
 from catstream.cli.track import RunProgress
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
 from catstream.sinks.track_log import LineSink, read_frames
 from catstream.video.source import open_source
@@ -70,7 +70,7 @@ def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, succeed, tmp_p
     for file in ("model", "out/demo.ndjson"):
         assert (tmp_path / file).read_bytes() == (whole_run / file).read_bytes()
     newest = int(table(tmp_path / "out" / "demo.csv")[-1]["model_version"])
-    assert Learned.load(tmp_path / "model").model.version >= newest > 2
+    assert SavedModel.load(tmp_path / "model").model.version >= newest > 2
 
 
 def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
@@ -105,7 +105,7 @@ def test_a_stopped_run_keeps_its_results(long_video, said, until, tmp_path, numb
     assert len(table(tmp_path / "demo.csv")) == len(rows)
     with open_source(tmp_path / "demo.mp4") as film:  # it may be short of the frame at which the signal came
         assert len(rows) - sum(1 for _ in film) in (0, 1)
-    assert Learned.load(tmp_path / "model").model.version >= 1
+    assert SavedModel.load(tmp_path / "model").model.version >= 1
     assert (len(children.result()), running()) == (3, [])
 
 

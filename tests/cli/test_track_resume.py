@@ -14,7 +14,7 @@ from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.jobs.job import Job
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import TREES
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
@@ -91,7 +91,7 @@ def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(kill
     assert "32 messages sent, 32 stored" in errors
     assert CheckpointStore(kept / TREES).load(Settings()).seq == 32
     output, _ = succeed("save", tmp_path / "one", "--state", kept)
-    saved = Learned.load(tmp_path / "one")
+    saved = SavedModel.load(tmp_path / "one")
     assert output == f"model {saved.model.version} is in {tmp_path / 'one'}\n"
     assert saved.model.version == CheckpointStore(kept / TREES).load(Settings()).version
     assert "one exists already: replace it with --overwrite" in fail("save", tmp_path / "one", "--state", kept)

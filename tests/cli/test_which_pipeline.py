@@ -8,7 +8,7 @@ from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.wire.endpoint import meeting_place, private_folder
+from catstream.wire.endpoint import private_folder, reserve_endpoint
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def pipeline(folder, commanded, monkeypatch):
 
         def start(source):
             own = stack.enter_context(private_folder())
-            place = stack.enter_context(meeting_place("", own, source=source))
+            place = stack.enter_context(reserve_endpoint("", own, source=source))
             return place, stack.enter_context(commanded(place))
 
         yield start

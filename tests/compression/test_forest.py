@@ -243,7 +243,7 @@ def test_a_state_of_other_trees_is_rejected_and_not_reported_as_damage(settings,
     store.save(forest)
     (reduction,) = REDUCTIONS.keys() - {settings.coreset.reduction}
     with pytest.raises(SettingsError, match=message):
-        store.load(settings.but({f"coreset.{other}": {"size": 16, "reduction": reduction}[other]}))
+        store.load(settings.replace({f"coreset.{other}": {"size": 16, "reduction": reduction}[other]}))
     assert not store.trouble
 
 

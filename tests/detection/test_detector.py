@@ -10,8 +10,8 @@ from catstream.base.box import Box
 from catstream.base.errors import BoxError, ProtocolError
 from catstream.base.settings import Settings
 from catstream.detection.detector import Detector
-from catstream.detection.likeness import Likeness
 from catstream.detection.objects import Detectors
+from catstream.detection.similarity import Similarity
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import APPEARANCE, GROUPS
@@ -24,7 +24,7 @@ class Follower(Detector):
     """A detector with the number of its last frame, which takes images one after the other."""
 
     def __init__(self, settings=()):
-        super().__init__(Settings().but(settings))
+        super().__init__(Settings().replace(settings))
         self.seq = 0
 
     def start(self, image, box, time=0.0):
@@ -229,17 +229,17 @@ def learned(scene):
 
 
 @pytest.fixture
-def likeness(scene):
+def similarity(scene):
     """To the object of `learned`."""
     training = Follower().start(scene((60, 50)), START)[1].training[APPEARANCE]
     own, other = training.rows[training.labels == 1], training.rows[training.labels == 0]
-    return Likeness.of(own, float((own**2).sum()), own.sum(axis=0), len(own), other.mean(axis=0))
+    return Similarity.of(own, float((own**2).sum()), own.sum(axis=0), len(own), other.mean(axis=0))
 
 
-def sought(model, likeness, frames, settings=()):
+def sought(model, similarity, frames, settings=()):
     """Tracks and features of an object, as large as START when it was learned, that is searched for in these frames."""
     detector = Follower(settings)
-    detector.seek(model, START, likeness)
+    detector.seek(model, START, similarity)
     return zip(*[detector.step(frame) for frame in frames], strict=True)
 
 
@@ -251,8 +251,8 @@ def two(scene):
     return frame
 
 
-def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned, likeness):
-    tracks, _ = sought(learned, likeness, [scene(), *[scene((90, 60))] * 3])
+def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned, similarity):
+    tracks, _ = sought(learned, similarity, [scene(), *[scene((90, 60))] * 3])
     assert [track.state for track in tracks] == ["absent"] * 3 + ["present"]
     assert {track.model_version for track in tracks} == {7}
     assert tracks[-1].box.overlap(Box(90, 60, 48, 40)) > 0.6
@@ -260,59 +260,59 @@ def test_a_model_finds_its_object_in_frames_that_it_never_saw(scene, learned, li
 
 @pytest.mark.parametrize("before", [0, 1, 2], ids="frames before: {}".format)
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0], ids="size: {}".format)
-def test_the_first_box_of_an_object_that_is_found_has_its_size(scene, learned, likeness, factor, before):
+def test_the_first_box_of_an_object_that_is_found_has_its_size(scene, learned, similarity, factor, before):
     frame = cv2.resize(scene((90, 60)), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     empty = cv2.resize(scene(), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    tracks, _ = sought(learned, likeness, [empty] * before + [frame] * 5)
+    tracks, _ = sought(learned, similarity, [empty] * before + [frame] * 5)
     box = next(track.box for track in tracks if track.box is not None)
     assert np.sqrt(box.area / (48 * 40)) == pytest.approx(factor, rel=0.15)
 
 
-def test_a_window_that_does_not_lead_its_frame_is_not_the_object(two, learned, likeness):
-    tracks, _ = sought(learned, likeness, [two] * 10)
+def test_a_window_that_does_not_lead_its_frame_is_not_the_object(two, learned, similarity):
+    tracks, _ = sought(learned, similarity, [two] * 10)
     assert {track.state for track in tracks} == {"absent"}
     assert tracks[-1].score > Settings().belief.confident_score
 
 
-def test_a_window_that_does_not_look_like_the_object_is_not_the_object(scene, learned, likeness):
+def test_a_window_that_does_not_look_like_the_object_is_not_the_object(scene, learned, similarity):
     frames = [scene((90, 60))] * 5
-    stranger = dataclasses.replace(likeness, basis=np.roll(likeness.basis, 1, axis=1))
-    (own, _), (other, _) = (sought(learned, each, frames) for each in (likeness, stranger))
+    stranger = dataclasses.replace(similarity, basis=np.roll(similarity.basis, 1, axis=1))
+    (own, _), (other, _) = (sought(learned, each, frames) for each in (similarity, stranger))
     assert own[-1].state == "present"
     assert {track.state for track in other} == {"absent"}
 
 
-def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(two, learned, likeness):
-    _, features = sought(learned, likeness, [two] * 4, {"belief.weak_score": 0.1})  # neither of the two is found
+def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(two, learned, similarity):
+    _, features = sought(learned, similarity, [two] * 4, {"belief.weak_score": 0.1})  # neither of the two is found
     rows = [rows for each in features for rows in each.training.values()]
     assert rows
     assert all(not each.labels.any() for each in rows)
-    assert all(likeness(row) < Settings().belief.sighting_likeness for each in rows for row in each.rows)
+    assert all(similarity(row) < Settings().belief.sighting_similarity for each in rows for row in each.rows)
 
 
-def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned, likeness):
-    tracks, _ = sought(learned, likeness, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
+def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned, similarity):
+    tracks, _ = sought(learned, similarity, [scene((90, 60)), scene((200, 150)), scene((20, 150))] * 3)
     assert {track.state for track in tracks} == {"absent"}
 
 
-def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned, likeness):
-    _, features = sought(learned, likeness, [scene((90, 60))] * 5)
+def test_nothing_is_learned_of_an_object_before_it_is_found(scene, learned, similarity):
+    _, features = sought(learned, similarity, [scene((90, 60))] * 5)
     taught = [each.training.get(APPEARANCE) for each in features]
     assert not any(rows is not None and rows.labels.any() for rows in taught[:2])
     assert any(rows is not None and rows.labels.any() for rows in taught[2:])
 
 
-def test_a_resumed_search_continues_bit_for_bit(scene, learned, likeness):
-    (tracks, features), other = sought(learned, likeness, [scene((90, 60))] * 5), Follower()
+def test_a_resumed_search_continues_bit_for_bit(scene, learned, similarity):
+    (tracks, features), other = sought(learned, similarity, [scene((90, 60))] * 5), Follower()
     assert features[1].detector.sightings == 2
     other.go_on(2, features[1].detector, learned)
-    other.likeness = likeness
+    other.similarity = similarity
     assert tuple(other.step(scene((90, 60)))[0] for _ in range(3)) == tracks[2:]
 
 
-def test_a_model_of_other_features_is_rejected(likeness):
+def test_a_model_of_other_features_is_rejected(similarity):
     with pytest.raises(ProtocolError, match="learn it again"):
-        Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, likeness)
+        Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, similarity)
 
 
 def test_a_box_of_a_past_frame_is_searched_for_in_those_since_and_only_its_own_rows_are_learned(scene):

@@ -84,7 +84,7 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
 
 
 def test_a_wrong_size_or_aspect_ratio_is_labelled_with_a_gaussian_of_its_steps_and_with_the_steps(frame, model):
-    settings = SETTINGS.but({"extent.size_count": 5, "extent.aspect_count": 3})
+    settings = SETTINGS.replace({"extent.size_count": 5, "extent.aspect_count": 3})
     training = teacher.training_at(frame, OBJECT, 3, model, settings)
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
     extents = training[EXTENT]
@@ -97,7 +97,7 @@ def test_a_wrong_size_or_aspect_ratio_is_labelled_with_a_gaussian_of_its_steps_a
 
 
 def test_without_a_weight_of_the_extent_head_it_has_no_rows(frame, model):
-    assert set(teacher.training_at(frame, OBJECT, 3, model, SETTINGS.but({"extent.weight": 0}))) == {APPEARANCE}
+    assert set(teacher.training_at(frame, OBJECT, 3, model, SETTINGS.replace({"extent.weight": 0}))) == {APPEARANCE}
 
 
 def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
@@ -112,7 +112,7 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
 
 def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
     for used in (True, False):
-        settings = SETTINGS.but({"teaching.colours": used})
+        settings = SETTINGS.replace({"teaching.colours": used})
         first, training = teacher.first_training(frame, OBJECT, np.random.default_rng(1), settings)
         groups = [*training.values(), *teacher.training_at(frame, OBJECT, 3, model, settings).values()]
         assert all(group.rows[:, COLOURS].any() == used for group in groups)

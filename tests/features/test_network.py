@@ -77,7 +77,7 @@ def test_without_onnxruntime_opencv_computes_the_same_or_the_error_names_the_ext
 
 
 def test_vectors_are_centred_and_vary_as_much_as_four_cells(descriptor, walk):
-    from catstream.features.backbone import _crops
+    from catstream.backbone import _crops
 
     vectors = np.concatenate([descriptor(each)[2:-2, 2:-2].reshape(-1, 32) for each in _crops(walk)])
     assert vectors.shape[1] == descriptor.channels == 32

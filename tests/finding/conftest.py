@@ -3,7 +3,7 @@
 import pytest
 
 from catstream.base.box import Box
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.video.source import open_source
 from tests.learning import learned_from
 
@@ -28,7 +28,7 @@ def model_files(once, video, demo_video):
 
 @pytest.fixture(scope="session")
 def learned(model_files):
-    return [Learned.load(file) for file in model_files]
+    return [SavedModel.load(file) for file in model_files]
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from catstream.features.layout import row_length
 from catstream.fleet.fleet import disjoint, merge_streams
 from catstream.fleet.store import Store
 from catstream.jobs.job import Job
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import files
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features
@@ -37,7 +37,7 @@ def learned(seed):
     compressor = Compressor(SETTINGS, "anna")
     for frame, each in enumerate(stream(seed)):
         compressor.take(frame, each, compressor.version + 1)
-    return Learned.of(compressor, SETTINGS)
+    return SavedModel.of(compressor, SETTINGS)
 
 
 @given(PARTS, st.randoms())
@@ -79,7 +79,7 @@ def test_the_newest_states_of_all_streams_are_merged_within_the_bound_and_only_a
     assert (set(merged.streams), merged.skipped) == ({"door", "yard", "hall"}, ())
     first = Store(store).model("anna").newest()
     assert first.files["model"] == merged.model
-    tree = Learned.from_bytes(merged.model, "").trees["object"]
+    tree = SavedModel.from_bytes(merged.model, "").trees["object"]
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(row_length(), 3)))[0].astype(np.float32)
     rows = [each.training[APPEARANCE].rows[:4] for seed in range(3) for each in stream(seed)]
     truth, kept = energy(np.vstack(rows) @ basis), energy(rows_of(tree) @ basis)
@@ -96,7 +96,7 @@ def test_of_streams_that_share_frames_the_one_with_the_most_is_merged(store, tmp
     put_state(tmp_path, "porch", 0, 14)  # the frames of the door, and two more
     merged = merge_streams(store, ["door", "porch", "yard"], "anna", named=False)
     assert (set(merged.streams), merged.skipped) == ({"porch", "yard"}, ("door",))
-    assert Learned.from_bytes(merge_streams(store, ["hall"], "", named=True).model, "").origins == learned(2).origins
+    assert SavedModel.from_bytes(merge_streams(store, ["hall"], "", named=True).model, "").origins == learned(2).origins
 
 
 def test_a_stream_that_is_named_has_to_know_the_object(store):

@@ -12,7 +12,7 @@ from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
 from catstream.features.layout import row_length
-from catstream.jobs.saved_model import Learned, check_sizes, merge
+from catstream.jobs.saved_model import SavedModel, check_sizes, merge
 from catstream.messages import storage
 from catstream.messages.heads import APPEARANCE, TREES
 from tests.learning import BOX, features, rows_of
@@ -35,7 +35,7 @@ def compressed(messages, compressor=None, settings=SETTINGS, name=""):
 
 
 def learn(messages, settings=SETTINGS, name=""):
-    return Learned.of(compressed(messages, None, settings, name), settings)
+    return SavedModel.of(compressed(messages, None, settings, name), settings)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def bits(trees):
 
 def test_a_saved_model_is_loaded_bit_for_bit(learned, tmp_path):
     learned.save(tmp_path / "one")
-    read = Learned.load(tmp_path / "one")
+    read = SavedModel.load(tmp_path / "one")
     assert read.to_bytes() == learned.to_bytes()
     assert bits(read.trees) == bits(learned.trees)
     for one, other in zip(read.trees.values(), learned.trees.values(), strict=True):
@@ -64,13 +64,13 @@ def test_a_saved_model_is_loaded_bit_for_bit(learned, tmp_path):
 @pytest.mark.parametrize("half", [7, 30, 53])
 def test_a_stream_continued_from_a_saved_model_gives_the_trees_of_one_stream(messages, half, tmp_path):
     learn(messages[:half]).save(tmp_path / "one")
-    continued = compressed(messages[half:], Learned.load(tmp_path / "one").compressor(SETTINGS))
+    continued = compressed(messages[half:], SavedModel.load(tmp_path / "one").compressor(SETTINGS))
     assert bits(continued.trees) == bits(compressed(messages).trees)
 
 
 def test_the_energy_lost_before_saving_stays_in_the_bound(messages, tmp_path):
     learn(messages[:30]).save(tmp_path / "one")
-    continued = compressed(messages[30:], Learned.load(tmp_path / "one").compressor(SETTINGS))
+    continued = compressed(messages[30:], SavedModel.load(tmp_path / "one").compressor(SETTINGS))
     tree, whole = continued.trees["object"], np.vstack([m.training[APPEARANCE].rows[:4] for m in messages])
     basis = np.linalg.qr(np.random.default_rng(2).normal(size=(WIDTH, 3)))[0].astype(np.float32)
     truth, kept, slack = energy(whole @ basis), energy(rows_of(tree) @ basis), 1e-5 * energy(whole)
@@ -95,14 +95,14 @@ def test_before_the_first_sample_or_while_its_object_is_searched_for_a_run_has_n
     sought = dataclasses.replace(message, box=None, detector=dataclasses.replace(message.detector, first_window=None))
     compressor = compressed([sought], learned.compressor(SETTINGS))
     with pytest.raises(ServiceError, match="the object of the saved model was not found yet"):
-        Learned.of(compressor, SETTINGS)
+        SavedModel.of(compressor, SETTINGS)
 
 
 def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
     learned.save(tmp_path / "one")
     monkeypatch.setattr("catstream.jobs.saved_model.row_length", lambda: WIDTH + 1)
     with pytest.raises(ProtocolError, match=f"{WIDTH} features of a window, this catstream has {WIDTH + 1}"):
-        Learned.load(tmp_path / "one")
+        SavedModel.load(tmp_path / "one")
 
 
 @pytest.mark.parametrize("tree", TREES)
@@ -110,7 +110,7 @@ def test_a_file_without_one_of_the_trees_is_an_error(learned, tree):
     arrays, metadata = storage.decode(learned.to_bytes(), "one")
     trees = {name: each for name, each in metadata["trees"].items() if name != tree}
     with pytest.raises(ProtocolError, match=f"it has no tree '{tree}': learn the object again"):
-        Learned.from_bytes(storage.encode(arrays, {**metadata, "trees": trees}), "one")
+        SavedModel.from_bytes(storage.encode(arrays, {**metadata, "trees": trees}), "one")
 
 
 def test_an_unwritable_file_is_an_error_and_leaves_nothing(learned, tmp_path):
@@ -156,7 +156,7 @@ def test_the_size_of_a_merged_object_is_the_geometric_mean_in_any_order(learned)
 def test_frames_cannot_be_merged_twice(learned, messages):
     with pytest.raises(SettingsError, match="the same frames"):
         merge([learned, learned])
-    longer = Learned.of(compressed(stream(2), learned.compressor(SETTINGS)), SETTINGS)
+    longer = SavedModel.of(compressed(stream(2), learned.compressor(SETTINGS)), SETTINGS)
     with pytest.raises(SettingsError, match="the same frames"):
         merge([longer, learned])
     with pytest.raises(SettingsError, match="the same frames"):
@@ -173,7 +173,7 @@ def test_models_that_do_not_fit_are_not_merged(learned):
             merge([learn(stream(1), name="anna"), wrong])
     with pytest.raises(SettingsError, match="two or more"):
         merge([learned])
-    with pytest.raises(SettingsError, match=r"got 'a.safetensors': read a file with catstream.Learned.load"):
+    with pytest.raises(SettingsError, match=r"got 'a.safetensors': read a file with catstream.SavedModel.load"):
         merge([learned, "a.safetensors"])
 
 
@@ -183,7 +183,7 @@ def turned(*parts):
 
 
 def test_models_in_doubt_are_merged_with_a_warning():
-    with pytest.warns(UserWarning, match=r"models 1 and 2 look like different objects \(likeness 0\.[34]"):
+    with pytest.warns(UserWarning, match=r"models 1 and 2 look like different objects \(similarity 0\.[34]"):
         merge([turned(0, 1, 2), turned(1, 2, 3)])
 
 
@@ -209,7 +209,7 @@ def test_a_file_without_any_of_its_parts_is_an_error(learned):
         wrong += [(rest | other, metadata) for other in ({}, {name: np.float32([[np.nan]])}, {name: np.float32(1)})]
     for parts in wrong:
         with pytest.raises(ProtocolError, match="not a saved model"):
-            Learned.from_bytes(storage.encode(*parts), "one")
+            SavedModel.from_bytes(storage.encode(*parts), "one")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from catstream.base.errors import CommandRejectedError
 from catstream.base.settings import Settings
 from catstream.client.control import control
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
@@ -86,7 +86,7 @@ def test_objects_are_saved_forgotten_and_begun_by_name_while_paused(video, objec
             tracks.append(next(frames))
         steering.pause()
         saved = steering.save(tmp_path / "ben", "ben")
-        assert saved.object == Learned.load(tmp_path / "ben").object == "ben"
+        assert saved.object == SavedModel.load(tmp_path / "ben").object == "ben"
         begin = steering.set_box(objects["anna"], np.str_("dora"))
         assert begin.reason.startswith("the object dora begins at")
         with pytest.raises(CommandRejectedError, match="which object"):

@@ -109,13 +109,13 @@ def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folde
     run = {"box": boxes[0], "settings": ["run.checkpoint_seconds=3600", "run.unstored_frames=2000"]}
     with Subscriber(HEALTH, Endpoint.parse(str(folder))) as health:
         compressor, detector = by_hand(path, order=("compressor", "detector"), **run)
-        # Without a trainer the detector stands still, with features that were taken and not stored.
+        # Without a trainer the detector stands still, with features that were processed and not stored.
         told = (report.counters for report in iter(lambda: health.receive(60), None) if report.process == "detector")
-        taken = next(counters["taken"] for counters in told if counters["taken"])
+        processed = next(counters["processed"] for counters in told if counters["processed"])
         compressor.send_signal(signal.SIGTERM)
         assert compressor.wait(30) == 0
         stored = CheckpointStore(folder / TREES).load(Settings()).seq
-        assert stored >= taken
+        assert stored >= processed
         by_hand(path, order=("compressor",), **run)  # tells it, if the last answer was lost
         until(lambda: next(told)["stored"] >= stored)
     assert detector.poll() is None

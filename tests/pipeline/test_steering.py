@@ -21,7 +21,7 @@ from catstream.base.errors import (
 from catstream.base.settings import Settings
 from catstream.client.control import control
 from catstream.client.subscription import subscribe
-from catstream.jobs.saved_model import Learned
+from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.processes.decisions import DesiredState
@@ -184,7 +184,7 @@ def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
 
 def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video, tmp_path):
     path, boxes = video
-    settings = SETTINGS.but({"run.lockstep": True})  # the video does not end before the second model
+    settings = SETTINGS.replace({"run.lockstep": True})  # the video does not end before the second model
     with Pipeline(path, boxes[0], settings, state=tmp_path / "kept") as pipeline:
         before = next(track for track in pipeline if track.model_version >= 2)
     (tmp_path / "kept" / "desired_state.json").write_text("{")
@@ -209,7 +209,7 @@ def test_commands_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path,
 
 def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_video, saved):
     path, boxes = long_video
-    version = Learned.load(saved).model.version
+    version = SavedModel.load(saved).model.version
     soon = Settings(run={"lag_frames": 5})  # the part is shorter than the lag that the default allows
     with Pipeline(path, settings=soon, model=saved, part=slice(40, None)) as pipeline:
         tracks = list(pipeline)
@@ -356,7 +356,7 @@ def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoev
     assert tracks[-1].object == "anna"
     if victims:  # after a restart the search may begin too late in this short video for three sightings
         return
-    expected, learned, tracker = [], Learned.load(saved), MultiTracker()
+    expected, learned, tracker = [], SavedModel.load(saved), MultiTracker()
     began = next(track.began for track in tracks if track.object == "anna")
     with open_source(path) as source:
         for frame in source:

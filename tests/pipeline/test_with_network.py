@@ -9,7 +9,7 @@ import pytest
 
 from catstream.base.errors import SettingsError
 from catstream.finding.find import find
-from catstream.jobs.saved_model import Learned, merge
+from catstream.jobs.saved_model import SavedModel, merge
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.tracker import Tracker
@@ -45,7 +45,7 @@ def expected(video, objects, settings):
             else:
                 tracker.init(frame.image, objects, frame.time)
             tracks += tracker.tracks.values()
-    return tracks, tracker.learned("anna")
+    return tracks, tracker.saved_model("anna")
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +117,9 @@ def test_saved_models_of_one_network_are_merged_and_of_two_are_not(video, expect
         with open_source(path, part=slice(0, 20)) as source:
             for frame in source:
                 tracker.update(frame.image) if frame.number else tracker.init(frame.image, boxes[0].scaled(1.02))
-        return tracker.learned()
+        return tracker.saved_model()
 
-    one = Learned.load(saved)
+    one = SavedModel.load(saved)
     assert one.to_bytes() == expected[1].to_bytes()
     whole = merge([one, learned(settings)])
     assert (whole.model.network, len(whole.model.weights)) == (one.model.network, len(one.model.weights))

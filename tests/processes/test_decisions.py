@@ -51,20 +51,20 @@ def test_an_object_that_begins_is_the_last_one_and_one_that_is_forgotten_leaves_
 
 @given(DESIRED, SEQ, SEQ | st.just(NO_OWNER), VERSIONS, st.sets(NAMES), st.booleans())
 def test_a_detector_continues_where_nothing_is_lost_and_no_frame_is_learned_from_twice(
-    desired, taken, after, versions, known, live
+    desired, processed, after, versions, known, live
 ):
-    position = Position(taken, taken, versions=versions, states=dict.fromkeys(known, STATE))
+    position = Position(processed, processed, versions=versions, states=dict.fromkeys(known, STATE))
     start = resume_at(position, after, desired, 1.5, live=live)
-    assert start.seq <= taken, "the compressor has all messages before"
-    assert start.repeats >= taken, "a command begins no object in a message that the compressor drops as a repeat"
+    assert start.seq <= processed, "the compressor has all messages before"
+    assert start.repeats >= processed, "a command begins no object in a message that the compressor drops as a repeat"
     assert sorted(start.desired.objects) == sorted(desired.objects), "no object is lost"
     if live:
-        assert start.seq == taken, "frames of a live source are not read again"
+        assert start.seq == processed, "frames of a live source are not read again"
     else:
         assert start.seq <= after, "the owner has all frames before"
         assert start.repeats >= (after if after < NO_OWNER else 0)
         if versions:
-            assert start.seq == min(after, taken)
+            assert start.seq == min(after, processed)
     for name, each in start.desired.objects.items():
         continues, begins = name in start.states, each.begins > start.seq
         assert continues != begins, "each object either continues with its state, or begins again"
@@ -95,11 +95,11 @@ def test_the_models_of_all_objects_that_are_tracked_have_to_arrive_in_the_compre
 
 
 @given(SEQ, SEQ, VERSIONS, VERSIONS)
-def test_a_detector_waits_until_its_models_include_the_features_that_are_due(due, taken, samples, newest):
-    waits = awaited(due, taken, samples, newest)
+def test_a_detector_waits_until_its_models_include_the_features_that_are_due(due, processed, samples, newest):
+    waits = awaited(due, processed, samples, newest)
     behind = any(newest[name] < version for name, version in samples.items() if name in newest)
-    assert (waits == "features") == (taken < due)
-    assert (waits == "models") == (taken >= due and behind)
+    assert (waits == "features") == (processed < due)
+    assert (waits == "models") == (processed >= due and behind)
 
 
 class Storing(RuleBasedStateMachine):
@@ -118,7 +118,7 @@ class Storing(RuleBasedStateMachine):
         urgent = self.window.half_full
         if urgent or due:
             self.store(works, urgent)
-        self.window.acknowledge(replace(self.position, taken=self.seq))
+        self.window.acknowledge(replace(self.position, processed=self.seq))
 
     @rule(works=st.booleans(), urgent=st.booleans())
     def store(self, works, urgent):
@@ -128,15 +128,15 @@ class Storing(RuleBasedStateMachine):
     @invariant()
     def what_a_sender_may_forget_is_on_disk_or_counted(self):
         position = self.position
-        assert position.seq - position.unsaved == self.on_disk
+        assert position.seq - position.in_memory == self.on_disk
         assert position.seq <= self.seq
         assert not self.window.half_full
 
     @invariant()
     def the_end_is_stored_as_much_as_the_message_before_it(self):
         ended = with_end(self.position, self.seq + 1)
-        assert (ended.seq, ended.taken) == (self.seq + 1, self.seq + 1)
-        assert ended.unsaved == (self.position.unsaved + 1 if self.position.unsaved else 0)
+        assert (ended.seq, ended.processed) == (self.seq + 1, self.seq + 1)
+        assert ended.in_memory == (self.position.in_memory + 1 if self.position.in_memory else 0)
         assert with_end(self.position, self.position.seq) == self.position, "of a detector that repeats messages"
 
 

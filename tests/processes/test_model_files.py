@@ -25,7 +25,7 @@ def learned():
             tracker.update(image)
         else:
             tracker.init(image, {"anna": box})
-    return tracker.learned("anna")
+    return tracker.saved_model("anna")
 
 
 def test_a_stored_model_is_read_by_its_name_and_by_its_owner_only(learned, tmp_path):

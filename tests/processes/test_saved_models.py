@@ -6,8 +6,8 @@ import pytest
 
 from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
-from catstream.jobs.saved_model import Learned
-from catstream.messages.kinds import SavedModel
+from catstream.jobs.saved_model import SavedModel
+from catstream.messages.kinds import ModelFile
 from catstream.processes.compressor import SavedModels
 from catstream.wire.channels import SAVED_MODELS
 from catstream.wire.newest import Subscriber
@@ -41,16 +41,16 @@ def test_a_subscriber_receives_the_whole_trees_of_its_object(endpoint, rng):
     compressors, made = {name: compressor(name, rng) for name in ("anna", "ben")}, Mock()
     with (
         SavedModels(endpoint, SETTINGS) as publisher,
-        Subscriber(SAVED_MODELS, endpoint, SavedModel, about="ben") as reader,
+        Subscriber(SAVED_MODELS, endpoint, ModelFile, about="ben") as reader,
     ):
         message = received(publisher, compressors, reader, made)
     assert made.call_count == 2, "the process reports that it lives after each file"
     assert (message.object, message.version) == ("ben", compressors["ben"].version)
-    assert message.file == Learned.of(compressors["ben"], SETTINGS).to_bytes()
+    assert message.file == SavedModel.of(compressors["ben"], SETTINGS).to_bytes()
 
 
 def test_no_file_is_made_without_a_subscriber(endpoint, rng, monkeypatch):
-    monkeypatch.setattr(Learned, "of", lambda *_: pytest.fail("a file was made"))
+    monkeypatch.setattr(SavedModel, "of", lambda *_: pytest.fail("a file was made"))
     with SavedModels(endpoint, SETTINGS) as publisher:
         for _ in range(3):
             publisher.turn({"": compressor("", rng)}, nothing)

@@ -10,7 +10,7 @@ from catstream.client.registry import Registry, address_of, fleet_and_stream, lo
 from catstream.messages.kinds import FleetStatus, Listing, NodeStatus, Question, StreamStatus
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
-from catstream.wire.endpoint import find, fleets, meeting_place, running
+from catstream.wire.endpoint import find, fleets, reserve_endpoint, running
 from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, revoke, synchronise
 from catstream.wire.socket import rejects
 
@@ -30,7 +30,10 @@ def test_a_fleet_of_thousands_of_streams_arrives_whole(managing):
 
 @pytest.mark.parametrize("answer", [b"{}", b'{"name": 3', b"{" + b'"a": [' * 100_000])
 def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
-    with meeting_place("", folder, fleet="site") as place, Responder[Question, Listing](REGISTRY, place) as responder:
+    with (
+        reserve_endpoint("", folder, fleet="site") as place,
+        Responder[Question, Listing](REGISTRY, place) as responder,
+    ):
 
         def serve():
             for question in responder.receive_all(20):
@@ -44,7 +47,7 @@ def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
 
 
 def test_a_fleet_is_no_pipeline_and_a_pipeline_is_no_fleet(folder, managing):
-    with managing(SITE) as controller, meeting_place("", folder, source="walk.mp4") as pipeline:
+    with managing(SITE) as controller, reserve_endpoint("", folder, source="walk.mp4") as pipeline:
         assert fleets() == {"site": controller}
         assert running() == [pipeline]
         assert find() == pipeline

@@ -26,7 +26,7 @@ def samples(feed):
 
 def test_each_counter_of_a_process_is_a_metric_with_the_object_as_its_label(feed, facts):
     report = replace(facts.tracking(6.0, "anna", "ben"), source="rtsp://door/1")
-    report.counters.update(taken=5.0, model_version=3.0)
+    report.counters.update(processed=5.0, model_version=3.0)
     learned = {"anna": {"rows": 3.0, "loss_leaves": 1.0}, "ben": {"rows": 4.0, "loss_leaves": 2.0}}
     feed.dashboard.take(report, 0.0)
     feed.dashboard.take(Health("compressor", 1.0, {"rows": 7.0, "stored": 4.0}, objects=learned), 0.0)

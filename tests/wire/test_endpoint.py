@@ -14,7 +14,7 @@ import pytest
 
 from catstream.base.errors import ServiceError
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint, find, meeting_place, note, private_folder, running, source_at
+from catstream.wire.endpoint import Endpoint, find, note, private_folder, reserve_endpoint, running, source_at
 from catstream.wire.keys import Keys, create
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
@@ -56,7 +56,7 @@ def test_a_name_that_has_addresses_of_one_family_only_is_listened_on_and_looked_
 
 def test_a_pipeline_with_keys_is_found_with_them(folder):
     create(folder / "keys")
-    with private_folder() as note, meeting_place(str(folder / "run"), note, str(folder / "keys")) as place:
+    with private_folder() as note, reserve_endpoint(str(folder / "run"), note, str(folder / "keys")) as place:
         (found,) = (other for other in running() if str(other) == str(place))
     assert found.keys == Keys.load(folder / "keys")
 
@@ -91,7 +91,7 @@ def test_a_full_disk_for_temporary_files_is_an_error_that_names_it(disk, monkeyp
     with (
         pytest.raises(ServiceError, match=f"{disk}.*No space left"),
         private_folder() as folder,
-        meeting_place("tcp://127.0.0.1:5700", folder, source="walk.mp4"),
+        reserve_endpoint("tcp://127.0.0.1:5700", folder, source="walk.mp4"),
     ):
         pass
     assert [file.name for file in disk.iterdir()] == ["ballast"]
@@ -106,7 +106,7 @@ def test_no_folder_for_temporary_files_is_an_error(monkeypatch):
 
 
 def test_a_folder_that_is_made_is_for_this_user_alone_and_another_one_has_to_be(folder):
-    with meeting_place(str(folder / "a" / "b"), folder):
+    with reserve_endpoint(str(folder / "a" / "b"), folder):
         assert mode(folder / "a" / "b") == 0o700
     (folder / "file").touch()
     (folder / "open").mkdir()
@@ -117,21 +117,21 @@ def test_a_folder_that_is_made_is_for_this_user_alone_and_another_one_has_to_be(
         os.chown(folder / "theirs", 12345, 12345)
         bad["theirs"] = "a folder of your own"
     for name, problem in bad.items():
-        with pytest.raises(ServiceError, match=problem), meeting_place(str(folder / name), folder):
+        with pytest.raises(ServiceError, match=problem), reserve_endpoint(str(folder / name), folder):
             pass
 
 
 def killed(place: str = "") -> Path:
     """Kill a pipeline that meets in a folder, or in a private one; returns the folder."""
-    script = "import os, signal, sys; from catstream.wire.endpoint import meeting_place, private_folder\n"
-    script += "with private_folder() as private, meeting_place(sys.argv[1], private) as endpoint:\n"
+    script = "import os, signal, sys; from catstream.wire.endpoint import reserve_endpoint, private_folder\n"
+    script += "with private_folder() as private, reserve_endpoint(sys.argv[1], private) as endpoint:\n"
     script += "    print(endpoint, flush=True)\n    os.kill(os.getpid(), signal.SIGKILL)"
     return Path(subprocess.run([sys.executable, "-c", script, place], capture_output=True, text=True).stdout.strip())
 
 
 def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
     assert killed(str(folder)) == folder
-    with meeting_place(str(folder), folder) as endpoint:
+    with reserve_endpoint(str(folder), folder) as endpoint:
         assert endpoint.folder == folder
 
 
@@ -150,7 +150,7 @@ def test_the_folder_of_a_killed_process_is_removed_by_the_next_one_and_of_a_runn
 
 def test_no_socket_file_is_left_of_a_pipeline(folder):
     before = set(folder.iterdir())
-    with meeting_place(str(folder), folder) as endpoint:
+    with reserve_endpoint(str(folder), folder) as endpoint:
         for channel, sender in PLACES:
             Path(endpoint.address(channel, sender).removeprefix("ipc://")).touch()
     assert set(folder.iterdir()) == before
@@ -159,7 +159,7 @@ def test_no_socket_file_is_left_of_a_pipeline(folder):
 @pytest.mark.parametrize("place", ["", "run", "tcp://127.0.0.1:5999"], ids=["a folder of its own", "a folder", "tcp"])
 def test_a_running_pipeline_is_found_until_it_ends(folder, place):
     place = str(folder / place) if place == "run" else place
-    with private_folder() as private, meeting_place(place, private) as endpoint:
+    with private_folder() as private, reserve_endpoint(place, private) as endpoint:
         assert endpoint in running()
         assert find(str(endpoint)) == endpoint
     assert endpoint not in running()
@@ -167,7 +167,7 @@ def test_a_running_pipeline_is_found_until_it_ends(folder, place):
 
 def test_a_pipeline_is_found_by_a_source_whose_name_is_not_utf_8():
     source = os.fsdecode(b"walk\xff.mp4")
-    with private_folder() as own, meeting_place("", own, source=source) as endpoint:
+    with private_folder() as own, reserve_endpoint("", own, source=source) as endpoint:
         assert find(source=source) == endpoint
 
 
@@ -175,7 +175,7 @@ def test_a_pipeline_is_found_by_a_source_whose_name_is_not_utf_8():
 def test_a_note_of_another_version_does_not_hide_the_pipelines_of_this_one(text):
     with (
         private_folder() as one,
-        meeting_place("", one, source="good.mp4") as good,
+        reserve_endpoint("", one, source="good.mp4") as good,
         private_folder() as two,
         note(two / "endpoint", text),
     ):
@@ -186,9 +186,9 @@ def test_a_pipeline_whose_keys_cannot_be_read_does_not_hide_the_others(tmp_path)
     create(tmp_path / "keys")
     with (
         private_folder() as one,
-        meeting_place("", one, source="good.mp4") as good,
+        reserve_endpoint("", one, source="good.mp4") as good,
         private_folder() as two,
-        meeting_place("tcp://127.0.0.1:5998", two, str(tmp_path / "keys"), "other.mp4") as other,
+        reserve_endpoint("tcp://127.0.0.1:5998", two, str(tmp_path / "keys"), "other.mp4") as other,
     ):
         assert {str(good), str(other)} <= {str(endpoint) for endpoint in running()}
         shutil.move(tmp_path / "keys", tmp_path / "moved")

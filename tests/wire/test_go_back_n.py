@@ -1,4 +1,4 @@
-"""The acknowledged window, in random histories: each message is taken once and in order, whatever breaks or restarts.
+"""The acknowledged window, in random histories: each message is processed once, in order, whatever breaks or restarts.
 
 No process, no socket, no clock: the two state machines, a network that breaks and repeats frames, and a disk.
 """
@@ -85,32 +85,32 @@ class Histories(RuleBasedStateMachine):
     def store(self):
         """Write a checkpoint, if the disk takes it."""
         if not self.full:
-            self.disk = self.receiver.taken
-        self.in_memory |= self.receiver.taken > self.disk
-        taken = self.receiver.taken
-        self.position = Position(taken, taken, taken - self.disk, made_by(taken))
+            self.disk = self.receiver.processed
+        self.in_memory |= self.receiver.processed > self.disk
+        processed = self.receiver.processed
+        self.position = Position(processed, processed, processed - self.disk, made_by(processed))
 
     def arrives(self, peer, frame):
         """A frame arrives at the receiver, which takes a message only if it is the next one."""
         if frame == ASKS:
             self.reply(peer, self.receiver.asked(peer))
             return
-        seq, before = int(frame.split()[1]), self.receiver.taken
+        seq, before = int(frame.split()[1]), self.receiver.processed
         delivered, reply = self.receiver.receive(peer, seq, self.now)
         self.reply(peer, reply)
         if delivered:
-            assert (seq, self.receiver.taken) == (before + 1, before + 1)
+            assert (seq, self.receiver.processed) == (before + 1, before + 1)
             self.position = replace(self.position, versions=made_by(seq))
             self.acknowledge()
         else:
-            assert self.receiver.taken == before
+            assert self.receiver.processed == before
 
     def replied(self, message):
         """A reply arrives at the sender."""
         if not self.resumed:
             if message.again:
-                self.sender.resume(message.taken, message)
-                self.resumed, self.known = True, message.taken
+                self.sender.resume(message.processed, message)
+                self.resumed, self.known = True, message.processed
             return
         try:
             assert self.sender.receive(message, self.now) or not message.again
@@ -193,7 +193,7 @@ class Histories(RuleBasedStateMachine):
     @rule()
     def sender_asks_for_the_count_samples_what_was_taken(self):
         """A sample counts from the message that led to it, or an earlier one; none counts that was not made."""
-        seq = self.sender.taken
+        seq = self.sender.processed
         if seq <= max(self.known, self.asked):
             return
         self.asked = seq
@@ -206,7 +206,7 @@ class Histories(RuleBasedStateMachine):
 
     @rule(seq=st.integers(0, 50))
     def stranger_repeats_a_frame(self, seq):
-        if seq <= self.receiver.taken:  # one that is not of the stream is rejected before it is counted
+        if seq <= self.receiver.processed:  # one that is not of the stream is rejected before it is counted
             self.arrives(STRANGER, payload(seq) if seq else ASKS)
 
     # What holds at any moment.
@@ -228,10 +228,10 @@ class Histories(RuleBasedStateMachine):
     @invariant()
     def counts_are_in_order(self):
         if self.senders and self.resumed:
-            assert self.sender.stored <= self.sender.acknowledged <= self.sender.taken <= self.sender.sent
+            assert self.sender.stored <= self.sender.acknowledged <= self.sender.processed <= self.sender.sent
 
     def teardown(self):
-        """Once nothing is lost any more, everything that was sent is taken and stored."""
+        """Once nothing is lost any more, everything that was sent is processed and stored."""
         if not self.senders:
             return
         for _ in range(20):
@@ -243,8 +243,8 @@ class Histories(RuleBasedStateMachine):
                     self.reply_arrives(twice=False)
             self.receiver_stores(full=False)
         assert self.resumed
-        assert self.receiver.taken >= self.sender.sent
-        assert self.sender.acknowledged == self.sender.taken == self.sender.sent
+        assert self.receiver.processed >= self.sender.sent
+        assert self.sender.acknowledged == self.sender.processed == self.sender.sent
         if self.sender.sent > self.known:
             assert self.sender.count_samples(self.sender.sent) == made_by(self.sender.sent)
         assert not self.sender._unacknowledged
@@ -254,14 +254,14 @@ TestHistories = Histories.TestCase
 TestHistories.settings = settings(max_examples=150, stateful_step_count=60)
 
 
-@given(taken=st.integers(0, 5), seq=st.integers(1, 9))
-def test_an_end_is_delivered_once_at_any_number_up_to_the_next_one(taken, seq):
+@given(processed=st.integers(0, 5), seq=st.integers(1, 9))
+def test_an_end_is_delivered_once_at_any_number_up_to_the_next_one(processed, seq):
     """A restarted sender may end before it has repeated what was delivered; a gap before the end is asked for."""
-    receiver = ReceiveWindow(Position(taken, taken), 4)
+    receiver = ReceiveWindow(Position(processed, processed), 4)
     delivered, _ = receiver.receive(b"restarted", seq, 1.0, last=True)
-    assert delivered == receiver.ended == receiver.connected == (seq <= taken + 1)
-    assert receiver.taken == (max(seq, taken) if delivered else taken)
-    receiver.acknowledge(Position(receiver.taken))
+    assert delivered == receiver.ended == receiver.connected == (seq <= processed + 1)
+    assert receiver.processed == (max(seq, processed) if delivered else processed)
+    receiver.acknowledge(Position(receiver.processed))
     again, reply = receiver.receive(b"restarted", seq, 2.0, last=True)
     assert not again
     if delivered:
@@ -351,7 +351,7 @@ def test_a_sender_that_only_waits_transmits_nothing_again():
     for stored in (0, 2):
         receiver.acknowledge(Position(stored))
         sender.receive(receiver.asked(b"peer"), now=1.0)
-        assert (sender.acknowledged, sender.taken) == (stored, 2)
+        assert (sender.acknowledged, sender.processed) == (stored, 2)
         assert frames(sender) == []
 
 
@@ -360,13 +360,13 @@ def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late
     window = filled(size=4, count=4)
     window.receive(Position(2, 3), now=0.0)
     assert not window.receive(late, now=50.0)
-    assert (window.acknowledged, window.stored, window.taken) == (2, 2, 3)
+    assert (window.acknowledged, window.stored, window.processed) == (2, 2, 3)
     assert window.must_ask(50.0), "it is no sign of life"
 
 
 def test_messages_kept_in_memory_by_a_full_disk_are_acknowledged_and_do_not_count_as_stored():
     window = filled(size=4, count=3)
-    window.receive(Position(3, 3, unsaved=2), now=0.0)
+    window.receive(Position(3, 3, in_memory=2), now=0.0)
     assert (window.acknowledged, window.stored) == (3, 1)
     window.push(4, payload(4))
     with pytest.raises(StreamRewoundError, match="had 3 messages and now has 1"):
@@ -377,6 +377,6 @@ def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sen
     window = SendWindow("features", 4, now=0.0)
     window.resume(3, Position(5, 5))
     window.receive(Position(9, 9), now=0.0)
-    assert (window.acknowledged, window.stored, window.taken) == (3, 3, 3)
+    assert (window.acknowledged, window.stored, window.processed) == (3, 3, 3)
     with pytest.raises(ProtocolError, match="another stream"):
         window.receive(Position(10, 10), now=0.0)

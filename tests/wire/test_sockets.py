@@ -47,7 +47,7 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint,
             sender.poll(0.05)  # nobody answers: it asks where the receiver is, and will send all again
         for _ in range(10):
             turn()
-        until(lambda: sender.window.taken == 1, turn)
+        until(lambda: sender.window.processed == 1, turn)
     assert taken == [1]
 
 

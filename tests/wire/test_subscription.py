@@ -15,7 +15,7 @@ from catstream.base.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
-from catstream.wire.endpoint import meeting_place
+from catstream.wire.endpoint import reserve_endpoint
 from catstream.wire.newest import Publisher
 from tests.wire.examples import model
 from tests.wire.examples import present as track
@@ -256,7 +256,7 @@ def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
 
 def test_a_subscriber_ends_if_the_sockets_of_its_pipeline_are_gone_from_the_folder(folder, until):
     with catstream.subscribe(str(folder), "tracks", timeout=20) as subscription:
-        with meeting_place(str(folder), folder) as place, Publisher(TRACKS, place) as publisher:
+        with reserve_endpoint(str(folder), folder) as place, Publisher(TRACKS, place) as publisher:
             until(lambda: publisher.has_subscribers, publisher.serve_late_joiners)
             publisher.send(track(1))
             assert next(subscription).seq == 1

@@ -1,4 +1,4 @@
-"""Likeness: how much of a window's appearance lies in the subspace of the object's earlier appearances.
+"""Similarity: how much of a window's appearance lies in the subspace of the object's earlier appearances.
 
 The score of a model separates the object from the background that it was trained on. In another scene, windows that
 are neither may score high. Distances to subspaces are what a coreset preserves, so they can be measured from it.
@@ -15,11 +15,11 @@ _DIRECTIONS = 12  # dimension of the subspace
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Likeness:
+class Similarity:
     """The subspace of an object, and the share of the energy of its own rows that lies in it.
 
-    With the mean b of the background, the share of a row x is ||V (x - b)||^2 / ||x - b||^2. Its likeness is this share
-    divided by that of the object's own rows, so that one threshold holds for all objects.
+    With the mean b of the background, the share of a row x is ||V (x - b)||^2 / ||x - b||^2. Its similarity is this
+    share divided by that of the object's own rows, so that one threshold holds for all objects.
 
     basis       V, float32 (k, d), orthonormal rows
     background  b, float32 (d,)
@@ -52,7 +52,7 @@ class Likeness:
         return cls(basis, background, float(values[-_DIRECTIONS:].sum()) / whole)
 
     def __call__(self, row: np.ndarray) -> float:
-        """Likeness of a row, float32 (d,): about 1 for the object, about 0.2 for an unknown background."""
+        """Similarity of a row, float32 (d,): about 1 for the object, about 0.2 for an unknown background."""
         away = row - self.background
         inside = self.basis @ away
         return float(inside @ inside) / (self.share * float(away @ away) + 1e-12)
