@@ -14,8 +14,8 @@ import numpy as np
 from sequences import CHECK, sequences
 from table import command, mean_and_error
 
-from catstream.base.errors import SettingsError
 from catstream.base.settings import Settings
+from catstream.errors import SettingsError
 from catstream.evaluation.accuracy import rows_of
 from catstream.evaluation.datasets import Sequence, Starts, choose_starts
 from catstream.evaluation.onepass import evaluate

@@ -33,10 +33,10 @@ from sequences import FIRST, named, objects, scratch
 from table import Table, benchmark, command
 
 from catstream.base.box import Box
-from catstream.base.errors import ServiceError
 from catstream.base.settings import Settings
 from catstream.client.control import Control, control
 from catstream.compression.forest import Forest
+from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
 from catstream.evaluation.scores import score
 from catstream.jobs.job import Job

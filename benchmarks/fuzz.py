@@ -27,9 +27,9 @@ COMPILED = ["catstream.features.kernels"]  # by numba: no bytecode
 
 with atheris.instrument_imports(include=["catstream"], exclude=COMPILED):
     from catstream.base.box import Box
-    from catstream.base.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
     from catstream.base.settings import Settings
     from catstream.compression.forest import Forest
+    from catstream.errors import CatstreamError, ProtocolError, ServiceError, SettingsError
     from catstream.jobs.saved_model import SavedModel
     from catstream.messages import storage
     from catstream.messages.heads import GROUPS

@@ -19,9 +19,9 @@ import psutil
 from sequences import objects, scratch
 from table import Table, benchmark, command
 
-from catstream.base.errors import ServiceError
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.errors import ServiceError
 from catstream.jobs.state import TREES
 from catstream.sinks.track_log import read_frames
 from catstream.video.rendered import write

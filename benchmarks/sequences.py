@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, VideoError
+from catstream.errors import BoxError, VideoError
 from catstream.evaluation.datasets import Sequence, find_sequences
 from catstream.tracker import Tracker
 from catstream.video.rendered import FRAMES, SIZE, Sprite, cut_out_dahlia, load_photograph, write

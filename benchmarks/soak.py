@@ -24,11 +24,11 @@ from learning import features as learned
 from sequences import named, scratch
 from table import Table, benchmark, command, plots
 
-from catstream.base.errors import ServiceError
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.compression.tree import CoresetTree
+from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence
 from catstream.messages.heads import APPEARANCE, GROUPS
 from catstream.messages.kinds import End, Features, ObjectFeatures, TrainingRows

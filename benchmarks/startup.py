@@ -19,7 +19,7 @@ from sequences import named
 from table import Table, benchmark, command
 
 from catstream.base.box import Box
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 
 CACHE = "NUMBA_CACHE_DIR"  # folder of the compiled kernels
 

@@ -19,8 +19,8 @@ from sequences import rendered
 from table import Table, benchmark, command
 
 import catstream
-from catstream.base.errors import SilenceError
 from catstream.base.settings import Settings
+from catstream.errors import SilenceError
 from catstream.loadtest.load import Subscribers
 from catstream.messages.kinds import Track
 

@@ -16,9 +16,9 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from catstream.base.errors import CatstreamError
 from catstream.base.settings import Settings
 from catstream.base.threads import one_thread
+from catstream.errors import CatstreamError
 from catstream.reports.provenance import provenance
 
 _ROOT = Path(__file__).parents[1]

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from catstream.base.box import Box
-    from catstream.base.errors import CatstreamError
     from catstream.base.settings import Settings
     from catstream.client.control import Control, control
     from catstream.client.subscription import Subscription, subscribe
+    from catstream.errors import CatstreamError
     from catstream.finding.find import Sighting, find
     from catstream.fleet.fleet import Fleet
     from catstream.jobs.saved_model import SavedModel, merge
@@ -54,7 +54,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Box": "base.box",
-    "CatstreamError": "base.errors",
+    "CatstreamError": "errors",
     "Control": "client.control",
     "Fleet": "fleet.fleet",
     "SavedModel": "jobs.saved_model",

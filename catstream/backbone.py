@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from catstream.base.box import Window
-from catstream.base.errors import SettingsError, VideoError, require_extra
 from catstream.base.files import write_atomically, writing
+from catstream.errors import SettingsError, VideoError, require_extra
 from catstream.features.layout import CELL, EDGE, STRIDE, WINDOW
 from catstream.features.network import ENERGY, MOST_CHANNELS, Network, by_onnxruntime
 from catstream.features.pyramid import Pyramid

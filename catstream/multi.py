@@ -15,7 +15,6 @@ from types import MappingProxyType
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, FrameError, ObjectError
 from catstream.base.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name
 from catstream.base.settings import Settings
 from catstream.base.text import listed
@@ -23,6 +22,7 @@ from catstream.base.threads import one_thread
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
+from catstream.errors import BoxError, FrameError, ObjectError
 from catstream.features.descriptor import descriptor_of
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Features, Track, Tracks

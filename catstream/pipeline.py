@@ -19,10 +19,10 @@ from types import TracebackType
 from typing import Literal, Self
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import ServiceError, SettingsError
 from catstream.base.files import check_file
 from catstream.base.names import Boxes, boxes_by_name, check_boxes
 from catstream.base.settings import Settings
+from catstream.errors import ServiceError, SettingsError
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.jobs.job import Job, Models, Results, files_by_name
 from catstream.jobs.saved_model import check_files

@@ -21,7 +21,7 @@ from time import monotonic
 from typing import Any
 
 import catstream
-from catstream.base.errors import BoxError, CommandRejectedError, SilenceError
+from catstream.errors import BoxError, CommandRejectedError, SilenceError
 
 os.environ["MAVLINK20"] = "1"  # before the import: messages of tracking exist in version 2 only
 from pymavlink import mavutil

@@ -22,7 +22,7 @@ import pytest
 
 import catstream
 from catstream.base.box import Box
-from catstream.base.errors import SilenceError
+from catstream.errors import SilenceError
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source

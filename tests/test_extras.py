@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from catstream.base.errors import EXTRAS, MissingExtraError, install_command, require_extra
+from catstream.errors import EXTRAS, MissingExtraError, install_command, require_extra
 from catstream.sinks.destinations import export_of, sink_of
 
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]

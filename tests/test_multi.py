@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from catstream.base import threads
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
 from catstream.base.settings import Settings
+from catstream.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
 from catstream.multi import MultiTracker
 
 STEPS = {"anna": (4, 1), "ben": (-3, 2), "cleo": (0, -4)}  # pixels a frame

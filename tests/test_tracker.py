@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, FrameError, SettingsError
 from catstream.base.settings import PRESETS, Settings
 from catstream.compression.forest import Forest
+from catstream.errors import BoxError, FrameError, SettingsError
 from catstream.tracker import Tracker
 
 _SCM = {"teaching.bootstrap": "scm", "coreset.size": 36, "teaching.copies": 5}

@@ -33,10 +33,10 @@ from chaos import fingerprint, quantiles, undisturbed
 from table import Table, benchmark, command
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, ServiceError
 from catstream.base.settings import Settings
 from catstream.client.registry import REGISTRY_PORT, Registry
 from catstream.compression.forest import Forest
+from catstream.errors import CatstreamError, ServiceError
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store

@@ -1,1 +1,1 @@
-"""What every part uses: boxes, settings, errors, names, files, threads."""
+"""The foundations: boxes, settings, names, files, threads."""

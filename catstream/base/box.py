@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple, Self
 
 from msgspec import Meta
 
-from catstream.base.errors import BoxError
+from catstream.errors import BoxError
 
 #: Numbers of a rectangle in a message; one that is made here is not checked.
 _Coordinate = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from catstream.base.errors import CatstreamError, ServiceError
+from catstream.errors import CatstreamError, ServiceError
 
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, ObjectError
+from catstream.errors import BoxError, ObjectError
 
 #: The name of an object that has none.
 UNNAMED = ""

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_t
 import msgspec
 from msgspec import Meta
 
-from catstream.base.errors import CatstreamError, SettingsError
+from catstream.errors import CatstreamError, SettingsError
 
 #: The value of a setting.
 Value = str | int | float | bool

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import TypeVar
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 
 _Result = TypeVar("_Result")
 

@@ -12,8 +12,8 @@ from typing import cast
 import click
 
 from catstream.base.addresses import without_passwords
-from catstream.base.errors import CatstreamError
 from catstream.cli.common import INTERRUPTS, complain, stopped
+from catstream.errors import CatstreamError
 
 #: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
 #: long; commands that belong together share one.

@@ -19,7 +19,6 @@ import numpy as np
 from rich.console import Console
 
 from catstream.base.box import Box
-from catstream.base.errors import ServiceError, SilenceError
 from catstream.base.files import check_file
 from catstream.base.names import UNNAMED, check_name, split_name
 from catstream.base.text import counted
@@ -27,6 +26,7 @@ from catstream.cli.common import complain, screen, table
 from catstream.client.control import Control, control
 from catstream.client.registry import address_of, locate
 from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
+from catstream.errors import ServiceError, SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
 from catstream.messages.kinds import Health, run_state

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.table import Column, Table
 
 from catstream.base.addresses import without_passwords
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _WIDTH = 140  # columns of a table that is not printed to a terminal

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import click
 
-from catstream.base.errors import SettingsError
 from catstream.base.settings import describe
 from catstream.cli.common import screen, table
+from catstream.errors import SettingsError
 from catstream.processes.options import PATH, with_json
 from catstream.wire.channels import CHANNELS, Role
 from catstream.wire.keys import ROLES, allow, clients, create, revoke

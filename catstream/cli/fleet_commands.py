@@ -18,13 +18,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from catstream.base.errors import FleetError
 from catstream.base.files import check_file, write_atomically, writing
 from catstream.base.names import UNNAMED, split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
+from catstream.errors import FleetError
 from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.processes.options import PATH, with_json, with_keys, with_overwrite
 

@@ -11,7 +11,6 @@ import click
 from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from rich.table import Table
 
-from catstream.base.errors import CatstreamError
 from catstream.base.files import writing
 from catstream.base.settings import Settings
 from catstream.base.text import counted
@@ -27,6 +26,7 @@ from catstream.cli.common import (
     with_json_file,
     write_json,
 )
+from catstream.errors import CatstreamError
 from catstream.processes.options import FOLDER, PATH, NumberRange, with_settings
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from catstream.base.errors import CatstreamError, VideoError
 from catstream.base.files import check_file
 from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
+from catstream.errors import CatstreamError, VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.saved_model import merge as merged
 from catstream.processes.options import PATH, NumberRange, with_overwrite, with_skip_damaged

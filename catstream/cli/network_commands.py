@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from catstream.base.errors import require_extra
 from catstream.base.files import check_file
 from catstream.cli.common import INTERRUPTS
+from catstream.errors import require_extra
 from catstream.processes.options import PATH, with_overwrite
 
 _Levels = tuple[float, float, float]

@@ -19,12 +19,12 @@ from rich.table import Column
 from rich.text import Text
 
 from catstream.base.box import Box
-from catstream.base.errors import require_extra
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted, listed
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.cli.write import check_used, with_sink_options, with_table
+from catstream.errors import require_extra
 from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run
 from catstream.messages.kinds import Track

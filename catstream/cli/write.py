@@ -13,12 +13,12 @@ import click
 import numpy as np
 from rich.console import Console
 
-from catstream.base.errors import VideoError
 from catstream.base.names import is_name
 from catstream.base.text import counted, listed
 from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
 from catstream.client.subscription import subscribe
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.processes.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations

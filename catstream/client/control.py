@@ -18,9 +18,9 @@ from time import monotonic
 from uuid import uuid4
 
 from catstream.base.box import Box
-from catstream.base.errors import CommandRejectedError, SilenceError
 from catstream.base.names import UNNAMED, check_name
 from catstream.client.registry import follow
+from catstream.errors import CommandRejectedError, SilenceError
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Answer, Command, ModelFile, Verb
 from catstream.wire.channels import CONTROL, SAVED_MODELS

@@ -19,8 +19,8 @@ from uuid import uuid4
 
 import msgspec
 
-from catstream.base.errors import ServiceError, SilenceError
 from catstream.base.names import UNNAMED
+from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, FleetStatus, Listing, Question, StreamStatus, Track
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester, Responder

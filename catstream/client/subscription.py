@@ -25,9 +25,9 @@ from typing import Any, Generic, Self, TypeVar, cast
 import zmq
 import zmq.asyncio
 
-from catstream.base.errors import ServiceError, SilenceError
 from catstream.base.names import check_name
 from catstream.client.registry import FollowedStream, described, follow
+from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Track, run_state
 from catstream.wire.channels import HEALTH, PUBLIC, TRACKS
 from catstream.wire.endpoint import Endpoint, Place, find

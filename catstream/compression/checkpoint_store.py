@@ -8,9 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from catstream.base.errors import ProtocolError
 from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
+from catstream.errors import ProtocolError
 
 _KEPT = 2
 _DAMAGED = "damaged"  # name of the newest damaged checkpoint, which is kept for analysis

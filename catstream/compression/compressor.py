@@ -13,9 +13,9 @@ import numpy as np
 
 from catstream.base.arrays import Bool, Float32
 from catstream.base.box import Box
-from catstream.base.errors import SettingsError
 from catstream.base.settings import Settings
 from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpack_trees
+from catstream.errors import SettingsError
 from catstream.messages.heads import APPEARANCE, TREES, Tree
 from catstream.messages.kinds import DetectorState, ObjectFeatures, Sample, TrainingRows
 from catstream.messages.storage import Arrays, Metadata, pack, unpack

@@ -11,9 +11,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from catstream.base.errors import ProtocolError, ServiceError, SettingsError
 from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.messages.kinds import DetectorState, Features, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix

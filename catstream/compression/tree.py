@@ -12,9 +12,9 @@ from typing import ClassVar, Self
 import numpy as np
 
 from catstream.base.arrays import Float64, is_finite
-from catstream.base.errors import ProtocolError
 from catstream.compression.node import Node, sample
 from catstream.compression.reduce import shrink
+from catstream.errors import ProtocolError
 from catstream.messages import storage
 from catstream.messages.kinds import Summary
 from catstream.messages.storage import Arrays, Metadata

@@ -13,12 +13,12 @@ from zlib import crc32
 import numpy as np
 
 from catstream.base.box import Box, Window
-from catstream.base.errors import BoxError, ProtocolError
 from catstream.base.settings import Settings
 from catstream.detection import belief, extent, search, teacher
 from catstream.detection.search import Detection
 from catstream.detection.similarity import Similarity
 from catstream.detection.teacher import Training
+from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import Cells
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import WINDOW, row_length

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import ObjectError
 from catstream.base.names import check_count, check_name, errors_about
 from catstream.base.settings import Settings
 from catstream.base.text import listed
@@ -20,6 +19,7 @@ from catstream.base.threads import in_parallel
 from catstream.detection.detector import Detector, Result
 from catstream.detection.search import Detection
 from catstream.detection.similarity import Similarity
+from catstream.errors import ObjectError
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks

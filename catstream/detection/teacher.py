@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from catstream.base.box import Box, Window
-from catstream.base.errors import BoxError
 from catstream.base.settings import Settings, TeachingSettings
 from catstream.detection import extent
 from catstream.detection.search import due
 from catstream.detection.similarity import Similarity
+from catstream.errors import BoxError
 from catstream.features.cells import window_rows
 from catstream.features.descriptor import Descriptor
 from catstream.features.layout import CELL, COLOURS, EDGE, MARGIN, WINDOW

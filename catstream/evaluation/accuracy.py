@@ -12,8 +12,8 @@ from statistics import fmean, pstdev
 import numpy as np
 
 from catstream.base.arrays import Float64
-from catstream.base.errors import CatstreamError
 from catstream.base.settings import Settings
+from catstream.errors import CatstreamError
 from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
 from catstream.reports.page import SHARES, Axis, plot, table, write_page

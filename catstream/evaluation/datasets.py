@@ -36,8 +36,8 @@ import numpy as np
 
 from catstream.base.arrays import Float64, UInt8
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, SettingsError, VideoError
 from catstream.base.text import counted
+from catstream.errors import BoxError, SettingsError, VideoError
 from catstream.video.images import natural_order
 from catstream.video.source import open_source
 

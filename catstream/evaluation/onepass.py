@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, SettingsError, VideoError
 from catstream.base.settings import Settings
 from catstream.base.threads import one_thread
 from catstream.base.workers import run_tasks
+from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import FIRST, Sequence, Start, Starts, one_pass
 from catstream.evaluation.peers import PEERS, Peer
 from catstream.evaluation.runs import EvaluationRun, load, prepare_folder, save

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, SettingsError, install_command
+from catstream.errors import BoxError, SettingsError, install_command
 
 OPENCV: str = cv2.__version__  #: version of OpenCV
 

@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from catstream.base.arrays import Float64
-from catstream.base.errors import CatstreamError, SettingsError, VideoError
 from catstream.base.files import write_atomically, writing
 from catstream.base.settings import Settings
+from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence, Start
 from catstream.evaluation.peers import OPENCV
 from catstream.evaluation.scores import Score, score

@@ -11,8 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from catstream.base.errors import SettingsError
 from catstream.base.settings import Settings
+from catstream.errors import SettingsError
 
 
 class Descriptor(Protocol):

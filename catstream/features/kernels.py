@@ -19,7 +19,7 @@ import numpy as np
 from numpy import float32
 
 from catstream.base.arrays import Float32, Float64, Int64, UInt8, UInt16
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 
 try:
     import numba

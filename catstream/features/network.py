@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.base.errors import MissingExtraError, SettingsError, install_command
 from catstream.base.threads import one_at_a_time
+from catstream.errors import MissingExtraError, SettingsError, install_command
 from catstream.features.layout import CELL, STRIDE
 
 #: Mean square length of a vector: so much does the HOG of a cell vary.

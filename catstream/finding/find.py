@@ -22,12 +22,12 @@ import numpy as np
 
 from catstream.base.addresses import without_password
 from catstream.base.box import Box, Window
-from catstream.base.errors import SettingsError, VideoError
 from catstream.base.settings import RunSettings, Settings
 from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
 from catstream.detection.similarity import Similarity
+from catstream.errors import SettingsError, VideoError
 from catstream.features.cells import Cells
 from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
 from catstream.features.layout import CELL, WINDOW

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import ServiceError
 from catstream.base.files import write_atomically, writing
 from catstream.base.text import counted
+from catstream.errors import ServiceError
 from catstream.finding.find import File, Reading, Sighting, Step
 from catstream.reports.page import Bar, clock, figure, legend, table, timeline, write_page
 from catstream.video.drawing import Colours

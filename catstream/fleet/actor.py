@@ -20,7 +20,8 @@ from dataclasses import replace
 from hashlib import sha256
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import (
+from catstream.client.control import control
+from catstream.errors import (
     CatstreamError,
     CommandRejectedError,
     FencedError,
@@ -28,7 +29,6 @@ from catstream.base.errors import (
     ServiceError,
     StoreError,
 )
-from catstream.client.control import control
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Generation, Store
 from catstream.jobs.saved_model import SavedModel

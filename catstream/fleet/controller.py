@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Literal
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import CatstreamError
 from catstream.client.registry import RegistryServer
-from catstream.fleet import lifecycle as life
+from catstream.errors import CatstreamError
+from catstream.fleet import lifecycle
 from catstream.fleet.actor import Stream, given_model
 from catstream.fleet.lifecycle import Actor, Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
@@ -290,11 +290,11 @@ class Controller:
         import ray
 
         wanted, now, before = self._wanted(name), time.monotonic(), actor.state
-        happened = life.event(wanted, actor, self._nodes, now)
-        if happened is None or (step := life.TABLE.get((before, happened))) is None:
+        happened = lifecycle.event(wanted, actor, self._nodes, now)
+        if happened is None or (step := lifecycle.TABLE.get((before, happened))) is None:
             return
         after, action = step
-        _log.info("%s: %s, %s: %s %s", name, before, life.EVENTS[happened], after, action)
+        _log.info("%s: %s, %s: %s %s", name, before, lifecycle.EVENTS[happened], after, action)
         match action:
             case "start" if wanted is not None:
                 self._start(wanted, actor, now)
@@ -315,7 +315,7 @@ class Controller:
     def _start(self, spec: StreamSpec, actor: Actor, now: float) -> None:
         import ray
 
-        order = life.order(spec, self._nodes)
+        order = lifecycle.order(spec, self._nodes)
         with suppress(ValueError):  # the name is taken: the actor before it is not quite gone
             actor.handle = (
                 ray.remote(StreamActor)
@@ -326,7 +326,7 @@ class Controller:
                     num_cpus=spec.cores,
                     max_restarts=-1,
                     max_concurrency=4,
-                    label_selector=life.selector(spec, self._nodes) or None,
+                    label_selector=lifecycle.selector(spec, self._nodes) or None,
                     scheduling_strategy="SPREAD",
                 )
                 .remote(spec, self._clients, self._spec.store, self._spec.every)
@@ -342,7 +342,7 @@ class Controller:
             node = next((node.name for node in self._nodes if node.id == actor.node), "")
             quiet = now - actor.answered
             trouble = f"it has not answered for {quiet:.0f} s" if quiet > QUIET_SECONDS else last.trouble
-            leaves = self._phase == "up" and life.event(self._wanted(name), actor, self._nodes, now) == "unwanted"
+            leaves = self._phase == "up" and lifecycle.event(self._wanted(name), actor, self._nodes, now) == "unwanted"
             return replace(last, node=node, state="moving" if leaves else last.state, trouble=trouble)
         age = None if last.stored_seconds is None else last.stored_seconds + now - actor.answered
         last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age, trouble="")

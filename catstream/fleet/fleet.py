@@ -35,10 +35,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from catstream.base.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
 from catstream.base.files import is_locked, lock, state_home, write_atomically
 from catstream.base.names import UNNAMED, check_name
 from catstream.client.registry import REGISTRY_PORT
+from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
 from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors, nodes
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store

@@ -22,10 +22,10 @@ import msgspec
 from msgspec import Meta
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, FleetError
 from catstream.base.names import UNNAMED, boxes_by_name, check_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
+from catstream.errors import CatstreamError, FleetError
 from catstream.jobs.job import Job, changed_setting
 from catstream.video.source import is_live
 

@@ -48,8 +48,8 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from catstream.base.errors import FencedError, FleetError, ProtocolError, StoreError, require_extra
 from catstream.base.names import UNNAMED, check_name
+from catstream.errors import FencedError, FleetError, ProtocolError, StoreError, require_extra
 from catstream.fleet.spec import check_fleet_name
 from catstream.messages import storage
 

@@ -17,11 +17,11 @@ from typing import Any, get_type_hints
 import msgspec
 
 from catstream.base.box import Box
-from catstream.base.errors import ProtocolError, ServiceError, SettingsError
 from catstream.base.files import writing
 from catstream.base.names import UNNAMED, check_count, check_name
 from catstream.base.settings import Settings
 from catstream.base.text import listed
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 
 #: Files of saved models: of one object without a name, or by name.

@@ -17,7 +17,6 @@ from typing import Self
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
 from catstream.base.files import write_atomically, writing
 from catstream.base.names import check_name
 from catstream.base.settings import Settings
@@ -27,6 +26,7 @@ from catstream.compression.compressor import Compressor, sample_of
 from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
 from catstream.detection.similarity import Similarity
+from catstream.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.messages import storage
 from catstream.messages.heads import TREES

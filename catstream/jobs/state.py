@@ -20,13 +20,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from shlex import quote
 
-from catstream.base.errors import CatstreamError, ObjectError, ServiceError
 from catstream.base.files import descriptor, lock, write_atomically, writing
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
+from catstream.errors import CatstreamError, ObjectError, ServiceError
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 

@@ -20,8 +20,8 @@ from multiprocessing.connection import Connection
 from time import monotonic
 from typing import Any, Self, cast
 
-from catstream.base.errors import ServiceError
 from catstream.base.workers import SPAWN, die_with, sigint_blocked
+from catstream.errors import ServiceError
 from catstream.loadtest.rtsp import RtspConnection
 
 _TICKS_PER_SECOND = 1_000_000  # time base of the stream

@@ -18,8 +18,8 @@ import numpy as np
 import psutil
 
 from catstream.base.arrays import Float64
-from catstream.base.errors import SilenceError
 from catstream.client.subscription import Subscription
+from catstream.errors import SilenceError
 from catstream.evaluation.scores import overlaps
 from catstream.loadtest.camera import Schedule
 from catstream.loadtest.rtsp import due_time

@@ -14,11 +14,11 @@ import numpy as np
 
 from catstream.base.arrays import Float64
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.base.workers import SPAWN, die_with, sharing, sigint_blocked
 from catstream.client.control import control
+from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.loadtest import crowd
 from catstream.messages.kinds import End
 from catstream.pipeline import Pipeline

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 
 from catstream.base.arrays import Float64
-from catstream.base.errors import ServiceError, SettingsError
 from catstream.base.names import check_count
 from catstream.base.settings import Settings
 from catstream.base.text import counted
+from catstream.errors import ServiceError, SettingsError
 from catstream.loadtest.camera import Camera, Schedule
 from catstream.loadtest.latency import (
     PERCENTILES,

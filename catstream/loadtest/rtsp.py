@@ -18,7 +18,7 @@ from struct import pack
 from threading import Thread
 from typing import Any
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 
 _CLOCK = 90_000  # ticks per second of RTP time stamps of video
 _PERIOD = 2**32 / _CLOCK  # seconds

@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import Meta
 
 from catstream.base.box import Box, Window
-from catstream.base.errors import ProtocolError
+from catstream.errors import ProtocolError
 from catstream.messages.heads import GROUPS, HEADS, TREES
 from catstream.messages.schema import (
     LARGEST_INTEGER,

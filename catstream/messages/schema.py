@@ -20,8 +20,8 @@ import numpy as np
 from msgspec import Meta
 
 from catstream.base.arrays import is_finite
-from catstream.base.errors import ProtocolError
 from catstream.base.names import PATTERN
+from catstream.errors import ProtocolError
 
 #: The length that each letter of a shape stands for, in one message.
 _Lengths = dict[str, int]

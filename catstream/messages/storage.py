@@ -19,8 +19,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from catstream.base.errors import ProtocolError
 from catstream.base.files import remove_parts, sync
+from catstream.errors import ProtocolError
 
 #: Arrays by name.
 Arrays = dict[str, np.ndarray]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from sklearn.svm import OneClassSVM
 
-from catstream.base.errors import ProtocolError
+from catstream.errors import ProtocolError
 
 
 def one_class(rows: np.ndarray, origin: np.ndarray, nu: float = 0.5) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from catstream.base.errors import CatstreamError
+from catstream.errors import CatstreamError
 from catstream.jobs.job import Job
 from catstream.processes.options import PATH, with_object, with_part, with_settings
 from catstream.processes.process import run

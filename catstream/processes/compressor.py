@@ -7,10 +7,10 @@ from contextlib import ExitStack
 from dataclasses import replace
 from time import monotonic
 
-from catstream.base.errors import ServiceError
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
+from catstream.errors import ServiceError
 from catstream.jobs.saved_model import SavedModel, continued
 from catstream.jobs.state import TREES, locked
 from catstream.messages.kinds import End, Features, ModelFile, Position

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from catstream.base.errors import ObjectError
 from catstream.base.names import UNNAMED, check_count, check_name
 from catstream.base.text import listed
 from catstream.detection.objects import Detectors
+from catstream.errors import ObjectError
 from catstream.jobs.saved_model import check_sizes
 from catstream.messages.kinds import Answer, Command
 from catstream.processes.decisions import DesiredObject, DesiredState

@@ -13,8 +13,8 @@ from typing import Literal, Self
 import msgspec
 
 from catstream.base.box import Box
-from catstream.base.errors import ProtocolError
 from catstream.base.files import write_atomically
+from catstream.errors import ProtocolError
 from catstream.messages.kinds import DetectorState, Position
 
 #: Name of the file of the desired state, in the folder of the state.

@@ -16,9 +16,9 @@ from time import monotonic, sleep
 import cv2
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
+from catstream.errors import BoxError, CatstreamError, ObjectError, ProtocolError, VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import SEARCHED
 from catstream.messages.kinds import Answer, Command, End, Features, Model, Track, Tracks, run_state

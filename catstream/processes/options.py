@@ -15,9 +15,9 @@ from typing import Any
 
 import click
 
-from catstream.base.errors import ObjectError
 from catstream.base.names import boxes_by_name, split_name
 from catstream.base.settings import PRESETS, Settings
+from catstream.errors import ObjectError
 
 Command = Callable[..., Any]
 Decorator = Callable[[Command], Command]

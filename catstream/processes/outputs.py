@@ -10,8 +10,8 @@ from pathlib import Path
 from time import monotonic
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError
 from catstream.base.files import write_atomically
+from catstream.errors import CatstreamError
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import End, Features, Preview, Tracks
 from catstream.processes.decisions import DesiredObject

@@ -17,8 +17,8 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Self
 
-from catstream.base.errors import CatstreamError, StreamRewoundError
 from catstream.base.workers import die_with
+from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import Health, run_state
 from catstream.processes.start_server import reset_process
@@ -168,7 +168,7 @@ def run(
     reset_process()
     logging.basicConfig(format=f"{name}: %(message)s", level=logging.INFO, force=True)  # the supervisor selects by it
     try:
-        service = import_module(f"catstream.processes.{name}_process")
+        service = import_module(f"catstream.processes.{name}")
         job = Job.load(job) if isinstance(job, Path) else job
         job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
         process = Process(name, job, watchdog)

@@ -33,8 +33,8 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
-from catstream.base.errors import ServiceError
 from catstream.base.threads import limit_process
+from catstream.errors import ServiceError
 
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
@@ -225,7 +225,7 @@ def main(descriptor: int, program: int) -> None:
         ready = [each for each, _ in poll.poll(0 if to_import else None)]
         if not ready:
             with suppress(Exception):  # the process imports it again, and reports the error
-                import_module(f"catstream.processes.{to_import.pop(0)}_process")
+                import_module(f"catstream.processes.{to_import.pop(0)}")
         elif has_ended in ready:
             os.read(has_ended, 4096)
             while running and (ended := os.waitpid(-1, os.WNOHANG))[0]:
@@ -238,7 +238,7 @@ def main(descriptor: int, program: int) -> None:
             log, watchdog, answer_to = descriptors
             request = json.loads(data)
             with suppress(Exception):  # the process reports it
-                import_module(f"catstream.processes.{request['name']}_process")
+                import_module(f"catstream.processes.{request['name']}")
             gc.freeze()  # a later collection leaves the memory alone that all processes share
             parent = os.getpid()
             if not (pid := os.fork()):

@@ -20,7 +20,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
 
-from catstream.base.errors import ServiceError, VideoError
+from catstream.errors import ServiceError, VideoError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import End, Health, Track, Tracks
 from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS, Watchdog

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, Origin, TrackedFrame
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import VideoError, require_extra
 from catstream.base.files import check_file, writing
+from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.video.frames import RATE

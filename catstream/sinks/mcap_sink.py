@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from catstream.base.errors import SilenceError, VideoError
 from catstream.base.files import writing
 from catstream.client.subscription import Subscription
+from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Health, Model, Preview
 from catstream.sinks.destinations import Origin, TrackedFrame
 

@@ -23,8 +23,8 @@ from urllib.parse import SplitResult, unquote
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
-from catstream.base.errors import VideoError
 from catstream.base.text import counted
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame, redacted
 from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split

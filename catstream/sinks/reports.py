@@ -11,8 +11,8 @@ from contextlib import suppress
 from urllib.parse import SplitResult, urlsplit
 from uuid import uuid4
 
-from catstream.base.errors import SilenceError, VideoError
 from catstream.client.subscription import Subscription
+from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, redacted
 from catstream.sinks.events import Event, Events

@@ -22,9 +22,9 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from catstream.base.errors import CatstreamError, SilenceError, VideoError
 from catstream.base.text import counted
 from catstream.client.subscription import Subscription
+from catstream.errors import CatstreamError, SilenceError, VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, redacted

@@ -21,9 +21,9 @@ from typing import IO, get_args
 
 from catstream.base.addresses import without_password
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
 from catstream.base.files import writing
 from catstream.base.names import UNNAMED, check_name
+from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import State, Track
 from catstream.sinks.database import read_database

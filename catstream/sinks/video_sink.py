@@ -6,8 +6,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from catstream.base.errors import SilenceError, VideoError
 from catstream.client.subscription import subscribe
+from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, Sink, TrackedFrame
 from catstream.video.drawing import Colours, draw, drawn_size, preview_image

@@ -14,8 +14,8 @@ from queue import SimpleQueue
 from threading import Event, Thread
 from urllib.parse import unquote, urlunsplit
 
-from catstream.base.errors import VideoError
 from catstream.base.text import counted
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame
 from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split

@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from catstream.base.errors import ProtocolError
 from catstream.base.settings import Settings
+from catstream.errors import ProtocolError
 from catstream.messages.heads import BETWEEN_RIDGE, TREES, Head, Tree
 from catstream.messages.kinds import Model, Motion, Sample
 from catstream.numerics import ridge

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from catstream.base.arrays import is_finite
-from catstream.base.errors import FrameError, VideoError
+from catstream.errors import FrameError, VideoError
 
 if TYPE_CHECKING:
     from av import FFmpegError, VideoFrame

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 
 #: Suffixes of the files in a folder that are read as images.
 _IMAGES = "avif bmp dib hdr jfif jp2 jpe jpeg jpg pam pbm pfm pgm png pnm ppm ras sr tif tiff webp"

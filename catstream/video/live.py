@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING
 import cv2
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import VideoError
 from catstream.base.settings import RunSettings
+from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
 
 if TYPE_CHECKING:

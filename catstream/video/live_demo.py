@@ -21,7 +21,7 @@ from typing import cast
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.video import rendered
 from catstream.video.frames import Frame, Source
 

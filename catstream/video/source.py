@@ -40,8 +40,8 @@ import cv2
 import numpy as np
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import VideoError
 from catstream.base.settings import RunSettings
+from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
 from catstream.video.images import EXPECTED, IMAGES, ImageReader, first_pages, image_files, pages_of, visible
 from catstream.video.times import FrameClock

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 
 #: Steps of the video's time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100

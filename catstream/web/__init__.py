@@ -1,5 +1,5 @@
 """The web page of a pipeline or of a fleet: live view, control and metrics."""
 
-from catstream.base.errors import require_extra
+from catstream.errors import require_extra
 
 require_extra("view")

@@ -31,7 +31,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
+from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
 from catstream.video.drawing import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed

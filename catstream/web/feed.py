@@ -18,10 +18,10 @@ from typing import Any, cast
 
 from starlette.exceptions import HTTPException
 
-from catstream.base.errors import CatstreamError, SilenceError
 from catstream.client.control import Control
 from catstream.client.registry import Registry, address_of, locate
 from catstream.client.subscription import Subscription
+from catstream.errors import CatstreamError, SilenceError
 from catstream.messages.kinds import Answer, End
 from catstream.web.dashboard import Dashboard, FleetDashboard, Parts
 from catstream.wire.channels import CHANNELS

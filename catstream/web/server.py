@@ -19,7 +19,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.web.app import Site
 
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"

@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 
 import zmq
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.messages.kinds import DetectorState, End, Position
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint

@@ -30,7 +30,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args
 import msgspec
 import numpy as np
 
-from catstream.base.errors import ProtocolError
+from catstream.errors import ProtocolError
 from catstream.messages.kinds import Position
 from catstream.messages.schema import Integer, Text, check_message
 from catstream.wire.channels import CHANNELS, REGISTRY

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import ServiceError
 from catstream.base.files import descriptor, is_locked, lock, writing
+from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS, REGISTRY, Channel
 from catstream.wire.keys import Keys
 

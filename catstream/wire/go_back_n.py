@@ -27,7 +27,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from catstream.base.errors import ProtocolError, StreamRewoundError
+from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import Position
 
 PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the position; between two reports of a gap

@@ -24,8 +24,8 @@ from typing import Any, get_args
 
 import zmq
 
-from catstream.base.errors import ServiceError
 from catstream.base.files import create_atomically, write_atomically, writing
+from catstream.errors import ServiceError
 from catstream.wire.channels import Role
 
 #: The permissions of a client: each role includes those before it.

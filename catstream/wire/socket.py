@@ -25,7 +25,7 @@ import zmq
 import zmq.utils.garbage  # with the first message that is not copied, zmq would import it
 from zmq.utils import z85
 
-from catstream.base.errors import ProtocolError, ServiceError
+from catstream.errors import ProtocolError, ServiceError
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.endpoint import Endpoint

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 import catstream
-from catstream.base.errors import BoxError, FrameError
+from catstream.errors import BoxError, FrameError
 
 MOST = 100  # trackers that are kept
 Shape = list[float]  # left, top, right, bottom

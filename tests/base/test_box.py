@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError
+from catstream.errors import BoxError
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pickle
 import numpy as np
 import pytest
 
-from catstream.base.errors import SettingsError
 from catstream.base.settings import PRESETS, CoresetSettings, RunSettings, Settings
+from catstream.errors import SettingsError
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"coreset_size", b"x = " + b"[" * 100_000], ids=["bytes", "text", "nested"])

@@ -14,8 +14,8 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.base.errors import VideoError
 from catstream.cli.track import RunProgress
+from catstream.errors import VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
 from catstream.sinks.track_log import LineSink, read_frames

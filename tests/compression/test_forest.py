@@ -9,11 +9,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_equal
 
 from catstream.base.box import Box, Window
-from catstream.base.errors import ProtocolError, ServiceError, SettingsError
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
 from catstream.compression.tree import REDUCTIONS, CoresetTree
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.messages.heads import APPEARANCE, EXTENT, TREES
 from catstream.messages.kinds import DetectorState, Features, Motion, ObjectFeatures, Sample, TrainingRows

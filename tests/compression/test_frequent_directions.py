@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from catstream.base.errors import ProtocolError
 from catstream.compression.reduce import energy, shrink
 from catstream.compression.tree import CoresetTree, FrequentDirections
+from catstream.errors import ProtocolError
 from tests.learning import rows_of
 
 SIZE = 16

@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from catstream.base.errors import ProtocolError
 from catstream.compression.node import sample, spread
 from catstream.compression.reduce import energy, reduce
 from catstream.compression.tree import REDUCTIONS, CoresetTree
+from catstream.errors import ProtocolError
 from tests.learning import rows_of
 
 SIZE = 16

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import BoxError, ProtocolError
 from catstream.base.settings import Settings
 from catstream.detection.detector import Detector
 from catstream.detection.objects import Detectors
 from catstream.detection.similarity import Similarity
+from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import row_length
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import APPEARANCE, GROUPS

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, SettingsError, VideoError
 from catstream.base.settings import Settings
+from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import (
     FIRST,
     SHIFTS,

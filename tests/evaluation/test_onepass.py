@@ -13,9 +13,9 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.base.errors import CatstreamError, SettingsError
 from catstream.base.settings import Settings
 from catstream.base.workers import run_tasks, sigint_blocked
+from catstream.errors import CatstreamError, SettingsError
 from catstream.evaluation import onepass, runs
 from catstream.evaluation.accuracy import describe_flips, flips_of, mean_of, rows_of
 from catstream.evaluation.datasets import FIRST, Sequence, Start, jittered, spatial, temporal

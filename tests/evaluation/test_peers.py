@@ -9,8 +9,8 @@ from unittest.mock import create_autospec
 import cv2
 import pytest
 
-from catstream.base.errors import BoxError, SettingsError
 from catstream.base.settings import Settings
+from catstream.errors import BoxError, SettingsError
 from catstream.evaluation.onepass import evaluate, follow
 from catstream.evaluation.peers import MODELS, PEERS, Peer
 

@@ -7,8 +7,8 @@ import pytest
 from onnx import helper
 
 from catstream.base.box import Window
-from catstream.base.errors import MissingExtraError, SettingsError
 from catstream.base.settings import Settings
+from catstream.errors import MissingExtraError, SettingsError
 from catstream.features.cells import Cells
 from catstream.features.descriptor import descriptor_of
 from catstream.features.layout import EDGE, PLACES, WINDOW, row_length

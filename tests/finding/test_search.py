@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 import catstream
 from catstream.base.box import Box
-from catstream.base.errors import ProtocolError, ServiceError, SettingsError, VideoError
 from catstream.base.settings import RunSettings
+from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoError
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
 from catstream.finding.find import File, Reading, Scan, Search, Sighting, Step, find_files, load_models

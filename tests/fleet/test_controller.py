@@ -9,10 +9,9 @@ from importlib.machinery import ModuleSpec
 
 import pytest
 
-from catstream.base.errors import FleetError, SilenceError, StoreError
 from catstream.client.registry import Registry
+from catstream.errors import FleetError, SilenceError, StoreError
 from catstream.fleet import controller as module
-from catstream.fleet import lifecycle as life
 from catstream.fleet.controller import Controller
 from catstream.fleet.lifecycle import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
@@ -125,7 +124,7 @@ def spec(tmp_path):
 def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it as Ray
     """Starts a controller."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))  # no other fleet is found
-    monkeypatch.setattr(life, "_PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(lifecycle, "_PAUSE_SECONDS", 0.0)
     controllers = []
 
     def make():

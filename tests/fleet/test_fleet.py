@@ -14,8 +14,8 @@ import psutil
 import pytest
 
 import catstream
-from catstream.base.errors import FleetError, StoreError
 from catstream.client.registry import Registry
+from catstream.errors import FleetError, StoreError
 from catstream.fleet import fleet as module
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from catstream.fleet import lifecycle as life
+from catstream.fleet import lifecycle
 from catstream.fleet.lifecycle import TABLE, Actor, Node, event, order
 from catstream.fleet.spec import StreamSpec
 
@@ -71,14 +71,14 @@ def test_a_stream_whose_node_died_is_not_asked_to_stop_if_it_may_run_again_on_a_
 
 def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed():
     running = Actor("working", order=order(GATE, []), answered=10.0)
-    assert event(GATE, running, [], 10.0 + life.SILENT_SECONDS) is None
-    assert event(GATE, running, [], 11.0 + life.SILENT_SECONDS) == "silent"
+    assert event(GATE, running, [], 10.0 + lifecycle.SILENT_SECONDS) is None
+    assert event(GATE, running, [], 11.0 + lifecycle.SILENT_SECONDS) == "silent"
     stopping = replace(running, state="stopping", since=10.0)
-    assert event(GATE, stopping, [], 11.0 + life.STOPPING_SECONDS) == "silent"
+    assert event(GATE, stopping, [], 11.0 + lifecycle.STOPPING_SECONDS) == "silent"
     assert event(GATE, replace(running, state="pending"), [], 1e6) is None, "Ray waits for a node"
 
 
 def test_one_that_is_gone_at_once_is_started_again_after_a_pause():
     assert event(GATE, Actor(), [], 0.0) == "wanted"
-    assert event(GATE, Actor(started=10.0), [], 10.0 + life._PAUSE_SECONDS / 2) is None
-    assert event(GATE, Actor(started=10.0), [], 10.0 + life._PAUSE_SECONDS) == "wanted"
+    assert event(GATE, Actor(started=10.0), [], 10.0 + lifecycle._PAUSE_SECONDS / 2) is None
+    assert event(GATE, Actor(started=10.0), [], 10.0 + lifecycle._PAUSE_SECONDS) == "wanted"

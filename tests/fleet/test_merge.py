@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.base.errors import FleetError
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.compression.reduce import energy
+from catstream.errors import FleetError
 from catstream.features.layout import row_length
 from catstream.fleet.fleet import disjoint, merge_streams
 from catstream.fleet.store import Store

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from catstream.base.box import Box
-from catstream.base.errors import FleetError
+from catstream.errors import FleetError
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.video.live_demo import first_box
 

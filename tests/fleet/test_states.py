@@ -15,7 +15,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from catstream.base.errors import FencedError, StoreError
+from catstream.errors import FencedError, StoreError
 from catstream.fleet.store import Claim, States
 
 FOLDER = "streams/cam-7"

@@ -16,7 +16,7 @@ import obstore
 import pytest
 from obstore.store import S3Store
 
-from catstream.base.errors import FencedError, FleetError, StoreError
+from catstream.errors import FencedError, FleetError, StoreError
 from catstream.fleet import store as module
 from catstream.fleet.store import Contents, Store
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.base.box import Box
-from catstream.base.errors import ProtocolError, ServiceError
 from catstream.base.settings import Settings
+from catstream.errors import ProtocolError, ServiceError
 from catstream.jobs.job import Job, Results, SinkOptions
 from catstream.jobs.state import files, locked, restore
 from catstream.messages import storage

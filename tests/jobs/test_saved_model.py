@@ -7,10 +7,10 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from catstream.base.errors import ProtocolError, ServiceError, SettingsError
 from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.features.layout import row_length
 from catstream.jobs.saved_model import SavedModel, check_sizes, merge
 from catstream.messages import storage

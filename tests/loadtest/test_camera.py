@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.loadtest import camera, crowd
 from catstream.loadtest.camera import Broadcast, Schedule
 from catstream.loadtest.rtsp import due_time, encode

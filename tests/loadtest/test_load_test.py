@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from catstream.base.errors import ObjectError, ServiceError, SettingsError
 from catstream.base.settings import Settings
+from catstream.errors import ObjectError, ServiceError, SettingsError
 from catstream.loadtest import load_test as module
 from catstream.loadtest.latency import REST, Usage
 from catstream.loadtest.load import Video

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from catstream.base.errors import ProtocolError
 from catstream.base.files import is_locked, lock, write_atomically
+from catstream.errors import ProtocolError
 from catstream.messages import storage
 
 ARRAYS = {"rows": np.arange(-30, 30, dtype=np.float32).reshape(10, 6), "sum": np.linspace(0, 1, 6)}

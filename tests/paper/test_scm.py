@@ -12,7 +12,7 @@ from sklearn.decomposition import sparse_encode
 from sklearn.svm import OneClassSVM
 
 from catstream.base.box import Box
-from catstream.base.errors import ProtocolError
+from catstream.errors import ProtocolError
 from catstream.paper import scm
 from catstream.paper.one_class import one_class
 from catstream.paper.scm import SparseCollaborativeModel

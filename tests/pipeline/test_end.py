@@ -8,9 +8,9 @@ from itertools import islice
 import cv2
 import pytest
 
-from catstream.base.errors import VideoError
 from catstream.base.settings import Settings
 from catstream.client.subscription import subscribe
+from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
 from catstream.processes.supervisor import Child

@@ -4,9 +4,9 @@ from contextlib import suppress
 
 import pytest
 
-from catstream.base.errors import ServiceError, SilenceError
 from catstream.base.settings import Settings
 from catstream.client.subscription import subscribe
+from catstream.errors import ServiceError, SilenceError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
 

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from catstream.base.errors import ServiceError
 from catstream.base.settings import Settings
 from catstream.client.control import control
 from catstream.client.subscription import subscribe
+from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
 from catstream.video.live_demo import first_box
 

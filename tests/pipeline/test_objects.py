@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from catstream.base.errors import CommandRejectedError
 from catstream.base.settings import Settings
 from catstream.client.control import control
+from catstream.errors import CommandRejectedError
 from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline

@@ -9,8 +9,8 @@ import numpy as np
 import psutil
 import pytest
 
-from catstream.base.errors import BoxError, ServiceError, VideoError
 from catstream.base.settings import Settings
+from catstream.errors import BoxError, ServiceError, VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
 from catstream.wire.channels import HEALTH

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import SilenceError
 from catstream.client.subscription import subscribe
+from catstream.errors import SilenceError
 from catstream.processes.outputs import Previews
 from catstream.video.frames import Frame
 from catstream.video.rendered import render

@@ -14,9 +14,9 @@ import psutil
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import CatstreamError, ServiceError
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
+from catstream.errors import CatstreamError, ServiceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import TREES
 from catstream.messages.kinds import End, Track

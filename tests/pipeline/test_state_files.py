@@ -5,8 +5,8 @@ from itertools import islice
 
 import pytest
 
-from catstream.base.errors import ServiceError
 from catstream.base.settings import Settings
+from catstream.errors import ServiceError
 from catstream.jobs.state import files, last_seq, restore
 from catstream.pipeline import Pipeline
 from catstream.processes.decisions import DESIRED, DesiredState

@@ -10,7 +10,10 @@ import cv2
 import pytest
 import zmq
 
-from catstream.base.errors import (
+from catstream.base.settings import Settings
+from catstream.client.control import control
+from catstream.client.subscription import subscribe
+from catstream.errors import (
     CommandRejectedError,
     ObjectError,
     ProtocolError,
@@ -18,9 +21,6 @@ from catstream.base.errors import (
     SettingsError,
     SilenceError,
 )
-from catstream.base.settings import Settings
-from catstream.client.control import control
-from catstream.client.subscription import subscribe
 from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline

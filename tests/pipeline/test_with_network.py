@@ -7,7 +7,7 @@ import signal
 import onnx
 import pytest
 
-from catstream.base.errors import SettingsError
+from catstream.errors import SettingsError
 from catstream.finding.find import find
 from catstream.jobs.saved_model import SavedModel, merge
 from catstream.multi import MultiTracker

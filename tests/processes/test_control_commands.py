@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box, Window
-from catstream.base.errors import CatstreamError, ObjectError, SettingsError
 from catstream.base.settings import Settings
 from catstream.detection.objects import Detectors
+from catstream.errors import CatstreamError, ObjectError, SettingsError
 from catstream.messages.kinds import LARGEST_GIVEN_MODEL, Command, DetectorState, Model
 from catstream.processes.control_commands import carried_out, check_room, is_kept, object_of
 from catstream.processes.decisions import DesiredObject, DesiredState

@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.jobs.job import Job
 from catstream.processes import start_server as module
 from catstream.processes.process import STOPPED_EARLY, Watchdog

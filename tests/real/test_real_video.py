@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
 from catstream.base.settings import Settings
+from catstream.errors import VideoError
 from catstream.evaluation.datasets import Sequence, find_sequences
 from catstream.evaluation.onepass import evaluate
 from catstream.paper.scm import SparseCollaborativeModel

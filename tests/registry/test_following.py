@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import catstream
-from catstream.base.errors import ServiceError, SilenceError
 from catstream.client.registry import FollowedStream
 from catstream.client.subscription import wait_until_running
+from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from catstream.base.errors import ServiceError, SilenceError
 from catstream.client.registry import Registry, address_of, fleet_and_stream, locate
+from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import FleetStatus, Listing, NodeStatus, Question, StreamStatus
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
 from catstream.sinks.track_log import RunFiles, read_frames

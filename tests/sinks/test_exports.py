@@ -14,7 +14,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, Origin, TrackedFrame, export, export_of, open_sink
 

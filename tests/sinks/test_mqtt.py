@@ -15,7 +15,7 @@ import paho.mqtt.client as mqtt
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.sinks import mqtt_sink

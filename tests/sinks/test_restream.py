@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink

@@ -12,7 +12,7 @@ from threading import Event, Thread
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks import webhook

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.base.errors import ProtocolError
 from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
 from catstream.detection.detector import Detector
+from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Summary
 from catstream.training.trainer import Trainer

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from catstream.base.box import Box
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
 from catstream.reports.page import COLOURS
 from catstream.video.drawing import PALETTE, Colours, draw, drawn_size

@@ -8,7 +8,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from catstream.base.errors import FrameError, VideoError
+from catstream.errors import FrameError, VideoError
 from catstream.video.frames import Frame, Source, as_bgr, read_ahead
 
 

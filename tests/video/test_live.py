@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from catstream.base.addresses import without_password
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.video import live
 from catstream.video.source import open_source
 

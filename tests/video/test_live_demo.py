@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.video import live_demo, rendered
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from av.stream import Disposition
 
-from catstream.base.errors import VideoError
+from catstream.errors import VideoError
 from catstream.video.frames import Source, UprightConverter
 from catstream.video.source import open_source
 

@@ -20,7 +20,7 @@ import httpx
 import numpy as np
 import pytest
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.messages.kinds import Health
 from catstream.web import app
 from catstream.web.app import pipeline_site

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from catstream.base.box import Box, Window
-from catstream.base.errors import ProtocolError
 from catstream.base.settings import RunSettings, Settings
 from catstream.detection.objects import Detectors
+from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import (
     LARGEST_GIVEN_MODELS,

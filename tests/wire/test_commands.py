@@ -8,8 +8,8 @@ import pytest
 import zmq
 
 from catstream.base.box import Box
-from catstream.base.errors import CommandRejectedError, ProtocolError, SilenceError
 from catstream.client.control import Control
+from catstream.errors import CommandRejectedError, ProtocolError, SilenceError
 from catstream.messages.kinds import Answer, Command
 from catstream.wire import commands
 from catstream.wire.channels import CHANNELS, CONTROL

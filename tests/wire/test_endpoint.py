@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, find, note, private_folder, reserve_endpoint, running, source_at
 from catstream.wire.keys import Keys, create

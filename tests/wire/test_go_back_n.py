@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from catstream.base.errors import ProtocolError, StreamRewoundError
+from catstream.errors import ProtocolError, StreamRewoundError
 from catstream.messages.kinds import Position
 from catstream.wire.go_back_n import PATIENCE_SECONDS, ReceiveWindow, SendWindow
 

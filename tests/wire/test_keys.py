@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 import catstream
-from catstream.base.errors import ServiceError, SilenceError
+from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Answer, Command, End, Features, Position
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, CONTROL, FEATURES, MODELS, TRACKS

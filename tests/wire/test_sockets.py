@@ -16,7 +16,7 @@ import pytest
 import zmq
 
 import catstream
-from catstream.base.errors import ServiceError
+from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Position, Sample, Summary, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS

@@ -11,7 +11,7 @@ import pytest
 import zmq
 
 import catstream
-from catstream.base.errors import ObjectError, ServiceError, SilenceError
+from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
