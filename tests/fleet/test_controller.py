@@ -12,6 +12,7 @@ import pytest
 from catstream.client.registry import Registry
 from catstream.errors import FleetError, SilenceError, StoreError
 from catstream.fleet import controller as module
+from catstream.fleet import lifecycle
 from catstream.fleet.controller import Controller
 from catstream.fleet.lifecycle import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
