@@ -235,15 +235,6 @@ def test_every_test_that_a_page_names_exists():
         assert f"def {name}(" in tests, f"a page names {name}, but there is no such test"
 
 
-def test_no_test_of_a_guarantee_is_slow():
-    """`make test` and `make test-system` check every guarantee."""
-    promised = set(re.findall(r"`(test_\w+)`", page("docs/guarantees.md")))
-    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.glob("tests/**/test_*.py"))
-    functions = (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
-    slow = {node.name for node in functions if any("slow" in ast.unparse(mark) for mark in node.decorator_list)}
-    assert not promised & slow
-
-
 def test_every_extra_that_a_page_names_can_be_installed():
     extras = tomllib.loads(page("pyproject.toml"))["project"]["optional-dependencies"]
     assert set(re.findall(r"catstream\[(\w+)\]", everything())) <= set(extras), "pyproject.toml: add the extra"
