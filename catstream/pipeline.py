@@ -94,7 +94,7 @@ class Pipeline:
         Width and height of a frame.
     live : bool
         Whether the source is a camera or a stream.
-    source, part, settings
+    source, boxes, part, settings
         Those of the run, also if it is resumed; the path of a source is absolute.
     results, earlier_results : Results
         The files that the program writes, with those of the run that is resumed; and those of that run alone.
@@ -178,6 +178,7 @@ class Pipeline:
         network = digest_of(descriptor_of(settings, job.network))
         self._job = replace(job, source=path, size=self.size, settings=settings, network=network)
         self.source, self.part, self.settings, self.results = path, job.part, settings, job.results
+        self.boxes = job.boxes
         self.earlier_results = self._resumed_job.results if self._resumed_job is not None else Results()
         check_files(job.models, settings, network)
         if self._resumed_job is not None and self._state is not None:

@@ -78,7 +78,7 @@ IMPORTERS = {
         *("catstream/base/box.py", "catstream/messages"),
         *("catstream/processes/decisions.py", "catstream/compression/forest.py"),
         *("catstream/jobs/job.py", "catstream/evaluation/datasets.py"),
-        *("catstream/finding/found.py", "catstream/cli/attach.py"),
+        *("catstream/finding/found.py", "catstream/cli/attach.py", "catstream/sinks/destinations.py"),
     ],
     "threadpoolctl": ["catstream/base/threads.py", "catstream/reports/provenance.py"],
     "psutil": ["catstream/loadtest/latency.py"],

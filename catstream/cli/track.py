@@ -18,6 +18,7 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.table import Column
 from rich.text import Text
 
+from catstream.base.addresses import without_password
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted, listed
@@ -39,7 +40,7 @@ from catstream.processes.options import (
     with_part,
     with_reading,
 )
-from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.destinations import STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
@@ -252,8 +253,19 @@ class _Run:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
         check_used(self.options, places)
+        part, stride = pipeline.part, pipeline.part.step or 1
+        head = Head(
+            source=without_password(pipeline.source),
+            size=pipeline.size,
+            rate=pipeline.rate * stride,
+            frames=pipeline.frames,
+            start=part.start or 0,
+            stride=stride,
+            settings=tuple(pipeline.settings.changed()),
+            boxes=pipeline.boxes,
+        )
         origin = Origin(
-            pipeline.source, pipeline.part, settings.image_rate, keys=settings.keys, options=results.options
+            pipeline.source, part, settings.image_rate, keys=settings.keys, options=results.options, head=head
         )
         files = RunFiles(origin, results.output, places)
         files.check(overwrite=self.overwrite, earlier=places_of(pipeline.name, pipeline.earlier_results))

@@ -22,9 +22,9 @@ from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.processes.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, SINKS, About, Origin, TrackedFrame
+from catstream.sinks.destinations import EXPORTS, SINKS, About, Head, Origin, TrackedFrame
 from catstream.sinks.events import KINDS
-from catstream.sinks.track_log import LOGS, is_log, read_frames
+from catstream.sinks.track_log import LOGS, is_log, read_frames, read_head
 from catstream.video.source import open_source
 
 Command = Callable[..., Any]
@@ -177,7 +177,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
 @click.option(
     "--size",
     metavar="WIDTHxHEIGHT|SOURCE",
-    help="Size of the frames, or the video or folder of them; for coco, cvat and yolo, which cut boxes at its edges.",
+    help="Size of the frames, or the video or folder of them, for a LOG without a head, as a CSV file.",
 )
 @click.option("--label", default="", help="Class of all objects; by default, the name of each is its class.")
 @with_overwrite
@@ -197,8 +197,8 @@ def export(log: Path, dest: Path, name: str | None, size: str | None, label: str
     EXAMPLES
       catstream export out/walk.ndjson walk.sqlite
       catstream export out/walk.csv results --format otb
-      catstream export out/walk.ndjson walk.xml --size walk.mp4 --label person
-      catstream export out/walk.ndjson dataset --format yolo --size 640x360
+      catstream export out/walk.ndjson walk.xml --label person
+      catstream export out/walk.csv dataset --format yolo --size 640x360
     """
     row = destinations.export_of(dest, name)
     if not is_log(log) or not log.is_file():
@@ -207,7 +207,12 @@ def export(log: Path, dest: Path, name: str | None, size: str | None, label: str
         raise VideoError(f"{log} contains no tracks")
     if row.suffix:
         destinations.check_result(dest, overwrite=overwrite, source=str(log))
-    about = About(log.stem, None if size is None else _size(size), label)
+    head = read_head(log) or Head()
+    if head.size and size is not None and _size(size) != head.size:
+        raise VideoError(
+            f"--size {size} contradicts the head of {log}, whose frames are {head.size[0]}x{head.size[1]}: omit --size"
+        )
+    about = About(log.stem, head.size or (None if size is None else _size(size)), label, head)
     destinations.export((frame for frame, _ in read_frames(log)), dest, row, about)
 
 

@@ -165,6 +165,14 @@ class Job:
         except (AttributeError, KeyError, TypeError, msgspec.ValidationError) as error:
             raise ProtocolError(f"{file} is not a valid job of a pipeline ({error!r})") from None
 
+    def source_frame(self, frame: int) -> int:
+        """The number in the source of a tracked frame.
+
+        >>> Job(part=slice(100, None, 2)).source_frame(3)
+        106
+        """
+        return (self.part.start or 0) + frame * (self.part.step or 1)
+
     def check_fits(self, other: Job, folder: Path) -> None:
         """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
         if other._frames() != self._frames():

@@ -288,6 +288,7 @@ class Track:
     began          number of the object's first frame. If it differs from that of the track before, another object was
                    given this name, by a box or a saved model
     doubtful       whether the box should be looked at: the level of belief is "weak" or "redetected"
+    source_frame   number of the frame in its file or folder: start + stride * frame; `frame` for a live source
 
     >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
@@ -304,6 +305,11 @@ class Track:
     object: ObjectName = ""
     began: Integer = 0
     doubtful: bool = False
+    source_frame: Integer = -1
+
+    def __post_init__(self) -> None:
+        if self.source_frame < 0:
+            object.__setattr__(self, "source_frame", self.frame)
 
     def __repr__(self) -> str:
         name = f"object={self.object!r}, " if self.object else ""
@@ -331,6 +337,7 @@ class Track:
             "object": self.object,
             "began": int(self.began),
             "doubtful": bool(self.doubtful),
+            "source_frame": int(self.source_frame),
         }
 
 

@@ -245,7 +245,9 @@ class DetectorLoop:
         tracks, features = self.detectors.step(pyramid, frame.time, given)
         for name in self._arrived.keys() & tracks.tracks.keys():
             self.detectors.adopt(self._arrived.pop(name))
-        tracks = replace(tracks, tracks={name: replace(each, pts=frame.pts) for name, each in tracks.tracks.items()})
+        number = self._process.job.source_frame(frame.number)
+        numbered = {name: replace(track, pts=frame.pts, source_frame=number) for name, track in tracks.tracks.items()}
+        tracks = replace(tracks, tracks=numbered)
         models = {name: replace(features.objects[name], model=each.to_bytes()) for name, each in self._begun.items()}
         self._tracks, self._begun = tracks, {}
         self._show(tracks.frame, frame, tracks.tracks)

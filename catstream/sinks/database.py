@@ -12,7 +12,7 @@ from typing import Any
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import About, Origin, TrackedFrame
+from catstream.sinks.destinations import About, Head, Origin, TrackedFrame
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
 #: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.
@@ -20,7 +20,7 @@ COLUMNS = {
     **{"frame": "INTEGER NOT NULL", "seq": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
     **{"x": "REAL", "y": "REAL", "w": "REAL", "h": "REAL", "score": "REAL NOT NULL"},
     **{"model_version": "INTEGER NOT NULL", "pts": "REAL", "object": "TEXT NOT NULL"},
-    **{"began": "INTEGER NOT NULL", "doubtful": "INTEGER NOT NULL"},
+    **{"began": "INTEGER NOT NULL", "doubtful": "INTEGER NOT NULL", "source_frame": "INTEGER NOT NULL"},
 }
 _NAMES = ", ".join(COLUMNS)
 _TYPES = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
@@ -45,7 +45,7 @@ class SqliteSink:
             self._database.execute("PRAGMA journal_mode = WAL")  # nobody who reads makes the run wait
             self._database.execute("PRAGMA synchronous = NORMAL")
             with self._database:
-                self._database.execute(_CREATE)
+                create(self._database, origin.head)
                 self._database.execute("DELETE FROM tracks WHERE frame > ?", (origin.last,))
             (self.last,) = self._database.execute("SELECT ifnull(max(frame), -1) FROM tracks").fetchone()
             stack.pop_all()
@@ -60,10 +60,18 @@ class SqliteSink:
             self._database.close()
 
 
-def write_sqlite(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
+def create(database: sqlite3.Connection, head: Head) -> None:
+    """Create the tables of a log that has none yet."""
+    database.execute(_CREATE)
+    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'head'").fetchone():
+        database.execute("CREATE TABLE head (json TEXT NOT NULL) STRICT")
+        database.execute("INSERT INTO head VALUES (?)", (head.to_json(),))
+
+
+def write_sqlite(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
     path.unlink(missing_ok=True)  # left by a process that was killed
     with _errors(path), closing(sqlite3.connect(path)) as database, database:
-        database.execute(_CREATE)
+        create(database, about.head)
         database.executemany(_INSERT, rows(frames))
 
 
@@ -79,20 +87,28 @@ def read_database(path: Path) -> Iterator[TrackedFrame]:
             yield TrackedFrame([*each])
 
 
+def read_database_head(path: Path) -> Head | None:
+    """The head of the log in a database; None if it has none."""
+    with _errors(path, "read"), closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'head'").fetchone():
+            return None
+        return Head.from_json(database.execute("SELECT json FROM head").fetchone()[0])
+
+
 def rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of the table, in the order of the frames."""
     for track in (track for frame in frames for track in frame.tracks):
         box = track.box or [None] * 4
         yield (
             *(track.frame, track.seq, track.time, track.state, *box, track.score),
-            *(track.model_version, track.pts, track.object, track.began, int(track.doubtful)),
+            *(track.model_version, track.pts, track.object, track.began, int(track.doubtful), track.source_frame),
         )
 
 
 def _track(row: tuple[Any, ...]) -> Track:
-    frame, seq, seconds, state, x, y, w, h, score, version, pts, name, began, doubtful = row
+    frame, seq, seconds, state, x, y, w, h, score, version, pts, name, began, doubtful, source = row
     box = None if x is None else Box(x, y, w, h)
-    return Track(seq, frame, seconds, state, box, score, version, pts, name, began, bool(doubtful))
+    return Track(seq, frame, seconds, state, box, score, version, pts, name, began, bool(doubtful), source)
 
 
 @contextmanager

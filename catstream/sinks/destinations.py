@@ -7,14 +7,20 @@ function in a file of its own, and a line in docs/how-to/sinks.md.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
+from importlib.metadata import version
 from math import nan
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, Self, cast
+
+import msgspec
 
 from catstream.base.addresses import without_password
+from catstream.base.box import Box
 from catstream.base.files import check_file, writing
 from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
@@ -24,6 +30,9 @@ from catstream.video.source import ALL_FRAMES
 
 #: Stands for standard output.
 STDOUT = "-"
+
+#: Version of the format of a log, in its head.
+FORMAT = 1
 
 
 class TrackedFrame(NamedTuple):
@@ -41,6 +50,54 @@ class TrackedFrame(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class Head:
+    """The first line of an NDJSON log, as JSON, and the table `head` of a database: the run that its tracks are of.
+
+    catstream  version of the format of the log
+    source     path or address of the source, without a password; empty beside a running pipeline
+    size       width and height of a frame, pixels; None if unknown
+    rate       frames per second of the source; None if unknown
+    frames     number of frames that the run tracks; None if unknown, or if the source is live
+    start      number in the source of the first tracked frame
+    stride     the run tracks every `stride`-th frame of the source
+    version    version of the program
+    settings   NAME=VALUE of each setting that differs from its default
+    boxes      initial box of each object that the run started with, by name
+    """
+
+    catstream: int = FORMAT
+    source: str = ""
+    size: tuple[int, int] | None = None
+    rate: float | None = None
+    frames: int | None = None
+    start: int = 0
+    stride: int = 1
+    version: str = field(default_factory=partial(version, "catstream"))
+    settings: tuple[str, ...] = ()
+    boxes: dict[str, Box] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        return msgspec.json.encode(self).decode()
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Self | None:
+        """Read the head of a log; None if the text is none, VideoError if it is that of another version."""
+        try:
+            written = json.loads(text)["catstream"]
+        except (ValueError, TypeError, KeyError):
+            return None
+        if written != FORMAT:
+            raise VideoError(
+                f"the log has version {written} of its format, expected {FORMAT}: read it with the catstream that "
+                "wrote it"
+            )
+        try:
+            return msgspec.json.decode(text, type=cls)
+        except msgspec.ValidationError as error:
+            raise VideoError(f"the head of the log is invalid ({error})") from None
+
+
+@dataclass(frozen=True, slots=True)
 class Origin:
     """The run whose tracks a sink writes.
 
@@ -51,6 +108,7 @@ class Origin:
     keys        folder of the keys for this endpoint
     last        number of the last frame in the log of a run that is resumed; -1 for a new run
     options     of the destinations, beside their addresses
+    head        first line of a log
     """
 
     source: str | None = None
@@ -60,6 +118,7 @@ class Origin:
     keys: str = ""
     last: int = -1
     options: SinkOptions = field(default_factory=SinkOptions)
+    head: Head = field(default_factory=Head)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +128,13 @@ class About:
     name   that of the log, for the files in a folder
     size   width and height of a frame in pixels; None if it is not known
     label  the class of all objects; empty if the name of each is its class
+    head   head of the log; an empty one if the log has none
     """
 
     name: str
     size: tuple[int, int] | None = None
     label: str = ""
+    head: Head = field(default_factory=Head)
 
 
 class Sink(Protocol):
@@ -216,8 +277,8 @@ def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -
     make: Callable[[Iterable[TrackedFrame], Path, About], None] = row.load()
     if row.sized and about.size is None:
         raise VideoError(
-            f"this format needs the size of a frame, for {path}: give --size WIDTHxHEIGHT, or --size SOURCE with the "
-            "video or folder that was tracked"
+            f"the log has no head with the size of a frame, which {path} needs: pass --size WIDTHxHEIGHT, or --size "
+            "SOURCE with the video or folder that was tracked"
         )
     part = path.with_name(f"{path.name}.part")
     with writing(path, VideoError):

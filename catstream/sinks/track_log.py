@@ -26,8 +26,17 @@ from catstream.base.names import UNNAMED, check_name
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import State, Track
-from catstream.sinks.database import read_database
-from catstream.sinks.destinations import Origin, TrackedFrame, check_result, check_sink, is_file, open_sink, sink_of
+from catstream.sinks.database import read_database, read_database_head
+from catstream.sinks.destinations import (
+    Head,
+    Origin,
+    TrackedFrame,
+    check_result,
+    check_sink,
+    is_file,
+    open_sink,
+    sink_of,
+)
 from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
@@ -43,9 +52,6 @@ class LineSink(ABC):
     is the number of the last frame in it, -1 for none.
     """
 
-    #: The first line of a file, with its line end.
-    header = ""
-
     def __init__(self, place: str, origin: Origin) -> None:
         self.path, self.last, self._before = Path(place), -1, _FIRST
         end = 0
@@ -57,11 +63,15 @@ class LineSink(ABC):
             if end:
                 os.truncate(self.path, end)
             self._file = self._open("a" if end else "w")
-            if self.header and not end:  # a file for whose header the disk has no room is closed and removed
+            if (first := self.first_line(origin)) and not end:  # a file with no room for it is closed and removed
                 stack.callback(self.path.unlink)
                 stack.enter_context(self._file)
-                self._file.write(self.header)
+                self._file.write(f"{first}\n")
                 stack.pop_all()
+
+    @abstractmethod
+    def first_line(self, origin: Origin) -> str:
+        """Return the first line of a file, without its line end; empty for none."""
 
     @abstractmethod
     def line(self, track: Track, seconds: float) -> str:
@@ -89,7 +99,10 @@ class LineSink(ABC):
 
 
 class NdjsonSink(LineSink):
-    """Tracks as JSON objects, one on each line, as `Track.to_dict` gives them; a box is [x, y, w, h] or null."""
+    """After the head, a line of JSON for each track, as by `Track.to_dict`: a box is [x, y, w, h] or null."""
+
+    def first_line(self, origin: Origin) -> str:
+        return origin.head.to_json()
 
     def line(self, track: Track, _: float) -> str:
         return json.dumps(track.to_dict())
@@ -97,15 +110,19 @@ class NdjsonSink(LineSink):
     @staticmethod
     def parse(line: str) -> tuple[Track, float]:
         fields = json.loads(line)
-        return Track(**{**fields, "box": fields["box"] and Box(*fields["box"])}), nan
+        known = {name: value for name, value in fields.items() if name in Track.__dataclass_fields__}
+        return Track(**{**known, "box": fields["box"] and Box(*fields["box"])}), nan
 
 
 class StdoutSink(NdjsonSink):
-    """The same on standard output, where each frame is seen at once."""
+    """The tracks on standard output, without a head; each frame is seen at once."""
 
     def __init__(self, _: str, __: Origin) -> None:
         super().__init__("standard output", Origin())
         self.last = sys.maxsize  # what a run has printed before it was resumed is not repeated
+
+    def first_line(self, _: Origin) -> str:
+        return ""
 
     def _open(self, _: str) -> IO[str]:
         return os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", buffering=1)
@@ -114,21 +131,28 @@ class StdoutSink(NdjsonSink):
 class CsvSink(LineSink):
     """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known."""
 
-    header = "frame,seconds,state,x,y,w,h,score,model_version,object,processing\n"
+    header = "frame,seconds,state,x,y,w,h,score,model_version,object,source_frame,processing"
+
+    def first_line(self, _: Origin) -> str:
+        return self.header
 
     def line(self, track: Track, seconds: float) -> str:
         box = ",,," if track.box is None else ",".join(f"{side:.4f}" for side in track.box)
         took = "" if isnan(seconds) else f"{seconds:.6f}"
         score = f"{track.score:.6f},{track.model_version}"
-        return f"{track.frame},{track.time:.6f},{track.state},{box},{score},{track.object},{took}"
+        return f"{track.frame},{track.time:.6f},{track.state},{box},{score},{track.object},{track.source_frame},{took}"
 
     @staticmethod
     def parse(line: str) -> tuple[Track, float]:
         """The track has no `pts`, which is not in the file, and the `seq` of a run without a skipped frame."""
-        frame, seconds, state, x, y, w, h, score, version, name, took = line.removesuffix("\n").split(",")
+        frame, seconds, state, x, y, w, h, score, version, name, source, took = line.removesuffix("\n").split(",")
         box = Box(*map(float, (x, y, w, h))) if x else None
         number, name = int(frame), check_name(name)
-        track = Track(number + 1, number, float(seconds), _STATES[state], box, float(score), int(version), object=name)
+        track = Track(
+            *(number + 1, number, float(seconds), _STATES[state], box, float(score), int(version)),
+            object=name,
+            source_frame=int(source),
+        )
         return track, float(took or nan)
 
 
@@ -143,6 +167,22 @@ def is_log(path: Path) -> bool:
     return path.suffix in LOGS
 
 
+def read_head(path: Path) -> Head | None:
+    """Return the head of a log; None if it has none, as a CSV file.
+
+    VideoError if another version of the format wrote it.
+    """
+    if path.suffix == ".sqlite":
+        return read_database_head(path)
+    with path.open("rb") as file:
+        return Head.from_json(file.readline())
+
+
+def _is_first_line(line: bytes) -> bool:
+    """Whether a line is that before the tracks: the head, or the names of the columns."""
+    return line.startswith((b'{"catstream":', b"frame,"))
+
+
 def read_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
     """Yield each frame of a log, and the byte at which it ends, up to the first line that is incomplete."""
     if path.suffix == ".sqlite":
@@ -152,7 +192,8 @@ def read_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
     tracks: list[Track] = []
     seconds = nan
     with suppress(FileNotFoundError), path.open("rb") as file:
-        end = len(file.readline()) if kind.header else 0
+        end = len(first) if _is_first_line(first := file.readline()) else 0
+        file.seek(end)
         for line in file:
             try:
                 track, took = kind.parse(line.decode())

@@ -14,11 +14,12 @@ import numpy as np
 import psutil
 import pytest
 
+from catstream.base.box import Box
 from catstream.cli.track import RunProgress
 from catstream.errors import VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
-from catstream.sinks.track_log import LineSink, read_frames
+from catstream.sinks.track_log import LineSink, read_frames, read_head
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.ndjson"]
@@ -41,7 +42,9 @@ def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
     assert all(float(row["processing"]) >= 0 for row in rows)
     assert [int(row["frame"]) for row in rows] == list(range(32))
     assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
-    assert (out / "demo.ndjson").read_text() == (whole_run / "stdout").read_text()
+    head, *tracks = (out / "demo.ndjson").read_text().splitlines()
+    assert tracks == (whole_run / "stdout").read_text().splitlines()
+    assert head == read_head(out / "demo.ndjson").to_json()
     assert frames_of(out) == list(range(32))
     with open_source(out / "demo.mp4") as film:
         assert sum(1 for _ in film) == 32
@@ -55,6 +58,19 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
     rows = table(out / "demo.csv")
     assert [int(row["frame"]) for row in rows] == list(range(7))
     assert [float(row["seconds"]) for row in rows] == pytest.approx([k / 30 for k in range(4, 32, 4)], abs=1e-3)
+    assert [int(row["source_frame"]) for row in rows] == list(range(4, 32, 4))
+    head = read_head(out / "demo.ndjson")
+    assert (head.source, head.size, head.rate, head.frames, head.start, head.stride) == (
+        source,
+        (320, 240),
+        30,
+        7,
+        4,
+        4,
+    )
+    assert head.boxes == {"": Box.parse(box)}
+    for layout in ("coco", "cvat", "yolo"):  # they need the size
+        succeed("export", out / "demo.ndjson", tmp_path / layout, "--format", layout)
     with open_source(out / "demo.mp4") as film, open_source(source, part=slice(4, 32, 4)) as story:
         for drawn, frame in zip(film, story, strict=True):
             difference = cv2.absdiff(drawn.image[: len(frame.image)], frame.image)  # above the line of text

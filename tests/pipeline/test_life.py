@@ -174,4 +174,5 @@ def prints_well_and_is_ready_for_json(track):
     assert repr(track).startswith("Track(frame=0, time=0.000, state='bootstrapping', box=(")
     whole = {"seq": 1, "frame": 0, "time": 0.0, "state": "bootstrapping", "box": list(track.box), "score": track.score}
     whole |= {"model_version": 0, "pts": None, "object": "", "began": 0, "doubtful": False}
+    whole["source_frame"] = 0
     assert json.loads(json.dumps(track.to_dict())) == whole

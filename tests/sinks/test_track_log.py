@@ -46,11 +46,11 @@ def filled(path, stack):
 
 def test_each_track_is_in_the_files_at_once(tmp_path):
     with ExitStack() as stack:
-        objects = [json.loads(line) for line in filled(tmp_path / "t.ndjson", stack).read_text().splitlines()]
+        objects = [json.loads(line) for line in filled(tmp_path / "t.ndjson", stack).read_text().splitlines()[1:]]
         rows = list(csv.DictReader(filled(tmp_path / "t.csv", stack).read_text().splitlines()))
     assert objects == [{**asdict(each), "box": each.box and list(each.box)} for each in TRACKS]
     assert list(rows[0].values()) == ["0", "0.000000", "bootstrapping", "10.0000", "20.0000", "30.5000", "40.0000",
-                                      "1.000000", "0", "", "0.000000"]  # fmt: skip
+                                      "1.000000", "0", "", "0", "0.000000"]  # fmt: skip
     assert [row["state"] for row in rows] == [each.state for each in TRACKS]
     assert [row["processing"] for row in rows] == ["0.000000", "0.250000", "0.750000"]
     assert (rows[1]["x"], rows[1]["h"]) == ("", "")

@@ -137,4 +137,4 @@ def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and
     assert (told["status"]["phase"], told["status"]["source"], told["closed"]) == ("ended", str(source), True)
     assert told["tracks"]["frame"] == 39
     assert run.returncode == 0
-    assert len((tmp_path / "out" / "demo.ndjson").read_text().splitlines()) == 40
+    assert len((tmp_path / "out" / "demo.ndjson").read_text().splitlines()) == 1 + 40
