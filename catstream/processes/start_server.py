@@ -33,6 +33,7 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
+from catstream.base.forks import after_fork
 from catstream.base.threads import limit_process
 from catstream.errors import ServiceError
 
@@ -121,13 +122,12 @@ class StartServer:
     def __init__(self) -> None:
         if getattr(sys, "frozen", False) or not os.access(sys.executable or "", os.X_OK):
             raise ServiceError("a frozen program has no Python to start processes with: run it with python")
-        self.program = os.getpid()  # a copy of this process that is forked later has no server
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # If the program has closed its standard output, the socket may have its number.
         passed = fcntl.fcntl(theirs, fcntl.F_DUPFD_CLOEXEC, 3)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "catstream.processes.start_server", str(passed), str(self.program)],
+                [sys.executable, "-P", "-m", "catstream.processes.start_server", str(passed), str(os.getpid())],
                 env=os.environ | _MALLOC,
                 cwd="/",  # no entry of PYTHONPATH means the current folder of the program
                 stdin=subprocess.DEVNULL,
@@ -139,9 +139,7 @@ class StartServer:
         self.pid = self._process.pid
 
     def runs(self) -> bool:
-        """Whether it is of this process, and has not ended; ServiceError if it has ended with an error."""
-        if self.program != os.getpid():
-            return False
+        """Whether it has not ended; ServiceError if it has ended with an error."""
         if (code := self._process.poll()) is not None and code > 0:
             raise ServiceError(
                 f"{sys.executable} did not start the processes of a pipeline (exit code {code}): its error is above"
@@ -190,18 +188,18 @@ def start_server() -> StartServer:
 def close_start_server() -> None:
     """End the server of this program, if there is one."""
     global _server
-    if _server is not None and _server.program == os.getpid():
+    if _server is not None:
         _server.close()
     _server = None
 
 
-def _unlock() -> None:
-    """Replace the lock in a copy of this process, where another thread of the original may have held it."""
-    global _lock
-    _lock = threading.Lock()
+def _forget() -> None:
+    """Begin without a server in a copy of this process, where another thread of the original may have held the lock."""
+    global _lock, _server
+    _lock, _server = threading.Lock(), None
 
 
-os.register_at_fork(after_in_child=_unlock)
+after_fork(_forget)
 
 
 def main(descriptor: int, program: int) -> None:
