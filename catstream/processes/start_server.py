@@ -29,18 +29,21 @@ import subprocess
 import sys
 import threading
 import traceback
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 
 from catstream.base.forks import after_fork
 from catstream.base.threads import limit_process
+from catstream.base.workers import name_process
 from catstream.errors import ServiceError
 
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
 
 _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
+_EXIT_SECONDS = 1.0  # limit for a server that has closed its sockets to end
 _LONGEST = 1 << 16  # bytes of a request
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
@@ -63,11 +66,18 @@ class StartedProcess:
     lost  whether the server has ended before the process
     """
 
-    def __init__(self, answers: socket.socket) -> None:
-        self._answers, self._lock = answers, threading.Lock()
+    def __init__(self, server: subprocess.Popen[bytes], answers: socket.socket) -> None:
+        self._server, self._answers, self._lock = server, answers, threading.Lock()
         self._pid = 0
         self._code: int | None = None
         self.lost = False
+
+    @property
+    def server_code(self) -> int | None:
+        """Exit code of the server, None while it runs; if it is `lost`, it is waited for."""
+        with suppress(subprocess.TimeoutExpired):
+            return self._server.wait(_EXIT_SECONDS if self.lost else 0)
+        return None
 
     @property
     def pid(self) -> int:
@@ -156,13 +166,25 @@ class StartServer:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, suppress(ConnectionError):  # the server has just ended: so has the process
             socket.send_fds(self._requests, [json.dumps(request).encode()], [log, watchdog, theirs.fileno()])
-        return StartedProcess(ours)
+        return StartedProcess(self._process, ours)
 
     def close(self) -> None:
         """End the server, and its processes with it."""
         self._requests.close()
         self._process.kill()  # it may be in a long import
         self._process.wait()
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """A block that starts processes: an OSError in it, as that of a limit, becomes an error for a person."""
+    try:
+        yield
+    except OSError as error:
+        raise ServiceError(
+            f"cannot start the processes of a pipeline ({error.strerror}): end other programs, or raise the limits of "
+            "this one (ulimit -a)"
+        ) from None
 
 
 _server: StartServer | None = None
@@ -180,7 +202,8 @@ def start_server() -> StartServer:
             raise
         if _server is None or not runs:
             close_start_server()
-            _server = StartServer()
+            with starting():
+                _server = StartServer()
         return _server
 
 
@@ -208,6 +231,7 @@ def main(descriptor: int, program: int) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = os.fdopen(2, "w")
     reset_process()
+    name_process("catstream:start")
     limit_process()  # before anything imports numpy
     gc.disable()  # nothing of what is imported is garbage
     requests = socket.socket(fileno=descriptor)
