@@ -20,6 +20,7 @@ from typing import Literal, Self
 
 from catstream.base.addresses import without_password
 from catstream.base.files import check_file
+from catstream.base.forks import check_not_forked, forked, generation
 from catstream.base.names import Boxes, boxes_by_name, check_boxes
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
@@ -32,7 +33,6 @@ from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
 from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
 from catstream.wire.endpoint import private_folder, reserve_endpoint
-from catstream.wire.socket import check_owner
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _CLOSED = ExitStack()  # marks a pipeline that was closed
@@ -206,7 +206,7 @@ class Pipeline:
             self._supervisor = Supervisor(job, folder, self._start)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._stack = str(endpoint), stack.pop_all()
-            self._owner = os.getpid()  # a copy of this process that is forked later does not end the run
+            self._generation = generation()  # a copy of this process that is forked later does not end the run
         return self
 
     def _started(self, endpoint: str) -> Job:
@@ -229,7 +229,7 @@ class Pipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         stack, self._stack = self._stack, _CLOSED
-        if stack is not None and stack is not _CLOSED and self._owner == os.getpid():
+        if stack is not None and stack is not _CLOSED and not forked(self._generation):
             stack.__exit__(kind, error, trace)
 
     def close(self) -> None:
@@ -237,7 +237,7 @@ class Pipeline:
         self.__exit__(None, None, None)
 
     def __del__(self) -> None:
-        if getattr(self, "_stack", None) not in (None, _CLOSED) and self._owner == os.getpid():
+        if getattr(self, "_stack", None) not in (None, _CLOSED) and not forked(self._generation):
             text = f"{self!r} was not closed: use it in a `with`"
             self.close()
             warnings.warn(text, ResourceWarning, source=self, stacklevel=1)  # last: it may be an error
@@ -291,7 +291,7 @@ class Pipeline:
             raise ServiceError(_ONCE)
         if self._supervisor is None:
             raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
-        check_owner(self._owner)
+        check_not_forked(self._generation)
         return self._supervisor
 
     @property
@@ -343,7 +343,7 @@ class Pipeline:
         """Process ids of the running processes, by name."""
         if self._supervisor is None:
             return {}
-        check_owner(self._owner)
+        check_not_forked(self._generation)
         return self._supervisor.pids
 
     @property

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from catstream.base.forks import after_fork, forked, generation
 from catstream.errors import CatstreamError, ServiceError
 
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
@@ -109,12 +110,12 @@ def descriptor(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
 
     It is closed in a copy of this process that is forked, which would hold the lock for the rest of its own life.
     """
-    handle, owner = os.open(path, flags, 0o600), os.getpid()
+    handle, since = os.open(path, flags, 0o600), generation()
     _descriptors.add(handle)
     try:
         yield handle
     finally:
-        if owner == os.getpid():
+        if not forked(since):
             _descriptors.remove(handle)
             _flock(handle, fcntl.LOCK_UN)  # a copy that is just beginning may have it yet
             os.close(handle)
@@ -129,7 +130,7 @@ def _close_descriptors() -> None:
     _descriptors.clear()
 
 
-os.register_at_fork(after_in_child=_close_descriptors)
+after_fork(_close_descriptors)
 
 
 def lock(handle: int, seconds: float = 0.0) -> bool:

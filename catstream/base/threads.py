@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
+from catstream.base.forks import after_fork
+
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
@@ -153,4 +155,4 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_cores(), "catstream")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
+after_fork(_pool.cache_clear)  # threads do not survive a fork

@@ -14,15 +14,19 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import TypeVar
 
+from catstream.base.cgroup import oom_kills
 from catstream.errors import ServiceError
 
 _Result = TypeVar("_Result")
 
 _SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
+_SET_NAME = 15  # PR_SET_NAME
+_ARGUMENTS = slice(45, 47)  # of the fields after the name in /proc/self/stat: arg_start and arg_end
 
 #: The start method of all of them.
 SPAWN = multiprocessing.get_context("spawn")
@@ -33,6 +37,20 @@ def die_with(parent: int) -> None:
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # the parent ended before the call of prctl
         raise SystemExit(0)
+
+
+def name_process(name: str, command: str = "") -> None:
+    """Show a name in `top`, cut after 15 characters, and a command line in `ps`, cut to the length of the present one.
+
+    Every user of the machine can read them. Without a `command`, the present one stays.
+    """
+    ctypes.CDLL(None).prctl(_SET_NAME, name.encode(errors="replace"), 0, 0, 0)
+    if not command:
+        return
+    with suppress(OSError):  # there is no /proc
+        first, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[_ARGUMENTS])
+        text = command.encode(errors="replace")[: max(0, end - first - 1)]
+        ctypes.memmove(first, text.ljust(end - first, b"\0"), end - first)
 
 
 @contextmanager
@@ -74,7 +92,7 @@ def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]],
 
     If the caller stops early, for example on Ctrl-C, all workers are killed.
     """
-    others = set(multiprocessing.active_children())
+    others, kills = set(multiprocessing.active_children()), oom_kills()
     with sharing():
         made = ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),))
     with made as pool:
@@ -84,7 +102,10 @@ def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]],
             for future in as_completed(futures):
                 yield future.result()
         except BrokenProcessPool:
-            raise ServiceError("a process of the evaluation was killed (out of memory?): try fewer --jobs") from None
+            doubt = "" if oom_kills() > kills else "?"
+            raise ServiceError(
+                f"a process of the evaluation was killed (out of memory{doubt}): try fewer --jobs"
+            ) from None
         except BaseException:
             for worker in set(multiprocessing.active_children()) - others:
                 worker.kill()

@@ -177,9 +177,11 @@ class _Run:
         self._check_options()
         console = messages()
         if self.continues and self.state is not None and contains_run(self.state):
-            console.print(f"the run in {self.state} continues with the objects that it had")
-            replace(self, state=None, resume=self.state, continues=False, boxes={}, models={}).execute()
-            return
+            replace(self, state=None, resume=self.state, boxes={}, models={})._execute(console)
+        else:
+            self._execute(console)
+
+    def _execute(self, console: Console) -> None:
         pipeline = self._pipeline()
         files = self._files(pipeline)
         for line in self._doubts(pipeline):
@@ -286,6 +288,8 @@ class _Run:
             # The files are closed after the processes, which would track on meanwhile, for none of them.
             with ExitStack() as closed_last, pipeline, ExitStack() as stack:
                 files.make_folder()
+                if self.continues and self.resume is not None:
+                    console.print(f"the run in {self.resume} continues with the objects that it had")
                 if self.view is not None:
                     self._serve(pipeline, self.view, stack, console)
                 with progress.line(console) as line:
@@ -327,6 +331,7 @@ class _Run:
                 has_said = True
                 self._say_what_holds(pipeline, line.console)
             if not tracks:
+                progress.idle()
                 continue
             # New files are opened with the first track: a run that cannot start does not change older results. They are
             # checked again: while this one started or waited, another run may have written them.
@@ -395,7 +400,8 @@ class RunProgress:
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self._started = time.perf_counter()
+        self._held, self._looked = 0.0, time.perf_counter()  # seconds while the run was held, and until when
+        self._started = self._now()
         self._first = self._shown = 0.0
         self.frames = 0
         self._objects: dict[str, _Counted] = {}
@@ -408,9 +414,20 @@ class RunProgress:
         self._task = line.add_task("starting", total=self._pipeline.frames, figures="")
         return line
 
+    def _now(self) -> float:
+        """A clock, in seconds, which stands still while the run is paused, waits for a box, or has lost its source."""
+        return self._looked - self._held
+
+    def idle(self) -> None:
+        """Note a moment without a frame."""
+        before, self._looked = self._looked, time.perf_counter()
+        if self._pipeline.holding:
+            self._held += self._looked - before
+
     def show(self, line: Progress, tracks: Mapping[str, Track]) -> None:
         """Count and show the tracks of a frame."""
-        now = time.perf_counter()
+        self._looked = time.perf_counter()
+        now = self._now()
         self._first = self._first or now - self._started
         self.frames += 1
         for name, track in tracks.items():
@@ -426,7 +443,7 @@ class RunProgress:
             line.update(self._task, completed=self.frames, description=state, figures=self._figures(tracks))
 
     def _figures(self, tracks: Mapping[str, Track]) -> str:
-        figures = [f"{self._rate(time.perf_counter()):.0f} frames/s"]
+        figures = [f"{self._rate():.0f} frames/s"]
         if self._pipeline.live:
             figures.append(f"{self._detector('skipped'):.0f} skipped")
         if len(tracks) == 1:
@@ -438,9 +455,10 @@ class RunProgress:
 
     def summary(self, results: Sequence[str]) -> str:
         """The closing lines of the run."""
+        self.idle()
         rate = f"first track after {self._first:.2f} s"
-        if (now := time.perf_counter()) - self._started - self._first >= _SHORTEST_SECONDS:
-            rate = f"{self._rate(now):.0f} frames/s, {rate}"
+        if self._seconds() >= _SHORTEST_SECONDS:
+            rate = f"{self._rate():.0f} frames/s, {rate}"
         frames = counted(self.frames, "frame")
         if self._objects.keys() == {UNNAMED}:
             alone = self._objects[UNNAMED]
@@ -471,5 +489,9 @@ class RunProgress:
         """A counter of the detector: the final one, or before the end that of its last report."""
         return (self._pipeline.health.get("detector", {}) | self._pipeline.totals).get(counter, 0)
 
-    def _rate(self, now: float) -> float:
-        return (self.frames - 1) / max(now - self._started - self._first, 1e-9)
+    def _rate(self) -> float:
+        return (self.frames - 1) / max(self._seconds(), 1e-9)
+
+    def _seconds(self) -> float:
+        """Seconds since the first track."""
+        return self._now() - self._started - self._first

@@ -25,6 +25,7 @@ from typing import Any, Generic, Self, TypeVar, cast
 import zmq
 import zmq.asyncio
 
+from catstream.base.clock import RunningClock
 from catstream.base.names import check_name
 from catstream.client.registry import FollowedStream, described, follow
 from catstream.errors import ServiceError, SilenceError
@@ -108,6 +109,7 @@ class Subscription(Generic[Message]):
         self._ends: Subscriber[Any] | None = None
         self._health: Subscriber[Health] | None = None  # once `behind` was asked for, or nothing has arrived for long
         self._read = self._newest = 0.0  # times of the frame that was read last, and of the newest one that is known
+        self._clock = RunningClock()  # of the time limit
         self._state = ""  # of the pipeline, as a health report has said while a message is awaited
         self._has_run = False  # whether the pipeline was there before
         self._over = self._closed = False
@@ -196,7 +198,7 @@ class Subscription(Generic[Message]):
     def _deadline(self) -> float:
         """The end of the time-out of a message that is awaited from now on."""
         self._state = ""
-        return float("inf") if self.timeout is None else monotonic() + self.timeout
+        return float("inf") if self.timeout is None else self._clock() + self.timeout
 
     def _poller(self, poller: Any) -> Any:
         """A poller of the sockets, by their descriptors, which another thread may close meanwhile."""
@@ -207,8 +209,8 @@ class Subscription(Generic[Message]):
 
     def _milliseconds(self, deadline: float) -> float:
         """The time to wait for the sockets."""
-        until = self._close_time if self.end is not None else deadline
-        return 1000 * max(0.0, min(until - monotonic(), CHECK_SECONDS))
+        left = self._close_time - monotonic() if self.end is not None else deadline - self._clock()
+        return 1000 * max(0.0, min(left, CHECK_SECONDS))
 
     def _take(self, deadline: float) -> Message | None:
         """The next message if one has arrived, without waiting; what else is to be done before the next wait."""
@@ -221,9 +223,9 @@ class Subscription(Generic[Message]):
                 return message
             if self.end is None:
                 self._look_for_pipeline()
-            if self.end is None and (self.timeout or 0.0) >= REASON_SECONDS > deadline - monotonic():
+            if self.end is None and (self.timeout or 0.0) >= REASON_SECONDS > deadline - self._clock():
                 self._receive_health()
-            if self.end is None and monotonic() >= deadline:
+            if self.end is None and self._clock() >= deadline:
                 raise SilenceError(
                     f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {self._why_silent()}"
                 )

@@ -21,6 +21,7 @@ from pathlib import Path
 from shlex import quote
 
 from catstream.base.files import descriptor, lock, write_atomically, writing
+from catstream.base.forks import forked, generation
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.base.text import listed
@@ -139,11 +140,11 @@ def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterato
     """
     done: list[Path] = []
     errors: list[CatstreamError] = []
-    owner = os.getpid()
+    since = generation()
     try:
         yield done
     finally:
-        for name, file in files.items() if owner == os.getpid() else ():  # not in a copy that was forked during the run
+        for name, file in files.items() if not forked(since) else ():
             try:
                 learned(state, settings, name).save(file)
                 done.append(file)

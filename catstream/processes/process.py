@@ -17,7 +17,8 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Self
 
-from catstream.base.workers import die_with
+from catstream.base.addresses import without_password
+from catstream.base.workers import die_with, name_process
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import Health, run_state
@@ -171,6 +172,8 @@ def run(
         service = import_module(f"catstream.processes.{name}")
         job = Job.load(job) if isinstance(job, Path) else job
         job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
+        source = without_password(job.source)
+        name_process(f"{name}:{Path(source).name}" if source else name, f"catstream {name} {source}")
         process = Process(name, job, watchdog)
         try:
             service.main(process)

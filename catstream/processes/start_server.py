@@ -29,17 +29,21 @@ import subprocess
 import sys
 import threading
 import traceback
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 
+from catstream.base.forks import after_fork
 from catstream.base.threads import limit_process
+from catstream.base.workers import name_process
 from catstream.errors import ServiceError
 
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
 
 _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
+_EXIT_SECONDS = 1.0  # limit for a server that has closed its sockets to end
 _LONGEST = 1 << 16  # bytes of a request
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
@@ -62,11 +66,18 @@ class StartedProcess:
     lost  whether the server has ended before the process
     """
 
-    def __init__(self, answers: socket.socket) -> None:
-        self._answers, self._lock = answers, threading.Lock()
+    def __init__(self, server: subprocess.Popen[bytes], answers: socket.socket) -> None:
+        self._server, self._answers, self._lock = server, answers, threading.Lock()
         self._pid = 0
         self._code: int | None = None
         self.lost = False
+
+    @property
+    def server_code(self) -> int | None:
+        """Exit code of the server, None while it runs; if it is `lost`, it is waited for."""
+        with suppress(subprocess.TimeoutExpired):
+            return self._server.wait(_EXIT_SECONDS if self.lost else 0)
+        return None
 
     @property
     def pid(self) -> int:
@@ -121,13 +132,12 @@ class StartServer:
     def __init__(self) -> None:
         if getattr(sys, "frozen", False) or not os.access(sys.executable or "", os.X_OK):
             raise ServiceError("a frozen program has no Python to start processes with: run it with python")
-        self.program = os.getpid()  # a copy of this process that is forked later has no server
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # If the program has closed its standard output, the socket may have its number.
         passed = fcntl.fcntl(theirs, fcntl.F_DUPFD_CLOEXEC, 3)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "catstream.processes.start_server", str(passed), str(self.program)],
+                [sys.executable, "-P", "-m", "catstream.processes.start_server", str(passed), str(os.getpid())],
                 env=os.environ | _MALLOC,
                 cwd="/",  # no entry of PYTHONPATH means the current folder of the program
                 stdin=subprocess.DEVNULL,
@@ -139,9 +149,7 @@ class StartServer:
         self.pid = self._process.pid
 
     def runs(self) -> bool:
-        """Whether it is of this process, and has not ended; ServiceError if it has ended with an error."""
-        if self.program != os.getpid():
-            return False
+        """Whether it has not ended; ServiceError if it has ended with an error."""
         if (code := self._process.poll()) is not None and code > 0:
             raise ServiceError(
                 f"{sys.executable} did not start the processes of a pipeline (exit code {code}): its error is above"
@@ -158,13 +166,25 @@ class StartServer:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, suppress(ConnectionError):  # the server has just ended: so has the process
             socket.send_fds(self._requests, [json.dumps(request).encode()], [log, watchdog, theirs.fileno()])
-        return StartedProcess(ours)
+        return StartedProcess(self._process, ours)
 
     def close(self) -> None:
         """End the server, and its processes with it."""
         self._requests.close()
         self._process.kill()  # it may be in a long import
         self._process.wait()
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """A block that starts processes: an OSError in it, as that of a limit, becomes an error for a person."""
+    try:
+        yield
+    except OSError as error:
+        raise ServiceError(
+            f"cannot start the processes of a pipeline ({error.strerror}): end other programs, or raise the limits of "
+            "this one (ulimit -a)"
+        ) from None
 
 
 _server: StartServer | None = None
@@ -182,7 +202,8 @@ def start_server() -> StartServer:
             raise
         if _server is None or not runs:
             close_start_server()
-            _server = StartServer()
+            with starting():
+                _server = StartServer()
         return _server
 
 
@@ -190,18 +211,18 @@ def start_server() -> StartServer:
 def close_start_server() -> None:
     """End the server of this program, if there is one."""
     global _server
-    if _server is not None and _server.program == os.getpid():
+    if _server is not None:
         _server.close()
     _server = None
 
 
-def _unlock() -> None:
-    """Replace the lock in a copy of this process, where another thread of the original may have held it."""
-    global _lock
-    _lock = threading.Lock()
+def _forget() -> None:
+    """Begin without a server in a copy of this process, where another thread of the original may have held the lock."""
+    global _lock, _server
+    _lock, _server = threading.Lock(), None
 
 
-os.register_at_fork(after_in_child=_unlock)
+after_fork(_forget)
 
 
 def main(descriptor: int, program: int) -> None:
@@ -210,6 +231,7 @@ def main(descriptor: int, program: int) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         sys.stderr = os.fdopen(2, "w")
     reset_process()
+    name_process("catstream:start")
     limit_process()  # before anything imports numpy
     gc.disable()  # nothing of what is imported is garbage
     requests = socket.socket(fileno=descriptor)

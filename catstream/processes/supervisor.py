@@ -20,18 +20,19 @@ from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
 
+from catstream.base.cgroup import oom_kills
+from catstream.base.clock import RunningClock
 from catstream.errors import ServiceError, VideoError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import End, Health, Track, Tracks
 from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS, Watchdog
-from catstream.processes.start_server import NAMES, StartedProcess, start_server
+from catstream.processes.start_server import NAMES, StartedProcess, start_server, starting
 from catstream.video.source import is_live
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 from catstream.wire.results import ResultsReceiver
 
-STEP_SECONDS = 0.5  #: the most that counts between two looks at a process, as the program may have been suspended
 RESTART_SECONDS = 0.1  #: before the second restart in a minute; doubled for each further one
 RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and in which time
 APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is started again
@@ -84,6 +85,7 @@ class Child:
     """One process of a run, the file of whose job is `job`.
 
     process   None if it is to be started when it is `due`
+    hung      whether it was killed because it made no progress
     silent    seconds since its loop has last turned; or, once it has ended, since then
     restarts  moments of its restarts
     """
@@ -93,6 +95,8 @@ class Child:
         self.due = self.silent = self._turns = 0.0
         self.restarts: deque[float] = deque()
         self.process: StartedProcess | None = None
+        self.hung = False
+        self._oom_kills = oom_kills()  # before its start
         self.watchdog = Watchdog.opened()
         self.log = ProcessLog(name, (folder / f"{name}.log").open("w+b"))
 
@@ -107,6 +111,7 @@ class Child:
         self.watchdog.close()
         self.watchdog, self._turns, self.silent = Watchdog.opened(), 0.0, 0.0
         self.watchdog.after = self.watchdog.read = after
+        self.hung, self._oom_kills = False, oom_kills()
         self.log.begin()
         log, watchdog = self.log.fileno(), self.watchdog.handle
         self.process = start_server().start(self.name, self._job, log, watchdog, restarted=bool(self.restarts))
@@ -117,13 +122,24 @@ class Child:
         What another process kills has not logged why; what aborts has.
         """
         if code == STOPPED_EARLY:
-            return "as a signal asked it to end"
+            return "another program asked it to end with a signal"
+        if self.hung:
+            return "killed after it made no progress"
         if self.process is not None and self.process.lost:
-            return "with the start server"
-        name = signal.Signals(-code).name if -code in {*signal.Signals} else -code  # those for real time have no name
-        how = f"with signal {name}" if code < 0 else f"with exit code {code}"
+            server = self.process.server_code
+            return f"with the start server: {self._status(server)}" if server is not None else "with the start server"
         last = self.log.last_line() if code > 0 or code == -signal.SIGABRT else ""
-        return f"{how}: {last}" if last else how
+        return f"{self._status(code)}: {last}" if last else self._status(code)
+
+    def _status(self, code: int) -> str:
+        """An exit code in words; of SIGKILL, which catstream did not send here, the probable cause."""
+        if code >= 0:
+            return f"exit code {code}"
+        if code != -signal.SIGKILL:  # signals for real time have no name
+            return f"signal {signal.Signals(-code).name if -code in {*signal.Signals} else -code}"
+        if oom_kills() > self._oom_kills:
+            return "out of memory: the kernel sent SIGKILL"
+        return "signal SIGKILL, not sent by catstream; out of memory?"
 
     def check(self, seconds: float) -> bool:
         """Count the seconds without a turn of the loop; returns whether they are too many."""
@@ -170,11 +186,12 @@ class Supervisor:
         self._changed = threading.Condition()
         self._over: bool = False  # whether no further frames are received
         self._error: Exception | None = None
-        self._checked = time.monotonic()
+        self._clock = RunningClock()  # of the time without progress of a process
+        self._checked = self._clock()
         self._ending, self._hurries, self._ended = threading.Event(), threading.Event(), threading.Event()
         file = replace(job, state=job.state or folder, run=token_hex(8)).save(folder)
         endpoint = Endpoint.parse(job.endpoint, job.settings.run.keys)
-        with ExitStack() as stack:
+        with starting(), ExitStack() as stack:
             window = job.settings.run.unstored_frames
             self._results = stack.enter_context(ResultsReceiver(endpoint, window + 1, after))
             self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
@@ -273,12 +290,13 @@ class Supervisor:
             with self._changed:
                 self._frames.append(message)
                 self._changed.notify()
-        before, now = self._checked, time.monotonic()
+        before, now = self._checked, self._clock()
         if now - before >= TURN_SECONDS:
             self._checked = now
             self._receive_health()
             if self.end is None and not self._ending.is_set():
-                self._check_children(now, min(now - before, STEP_SECONDS))
+                with starting():
+                    self._check_children(now, now - before)
 
     def _receive_health(self) -> None:
         """Receive the health reports that have arrived, and log each new problem."""
@@ -303,9 +321,9 @@ class Supervisor:
             elif code is not None:
                 self._restart(child, code, now)
             elif child.check(seconds):
-                _log.warning("the %s hangs, and is killed: it has stood still for %.0f s", child.name, child.silent)
+                _log.warning("%s made no progress for %.0f s; killing it", child.name, child.silent)
                 child.process.send_signal(signal.SIGKILL)
-                child.silent = 0.0
+                child.silent, child.hung = 0.0, True
         if self._live:  # a source was lost or is available again
             for line in self._children["detector"].log.new_lines():
                 _log.warning("%s", line)
@@ -314,16 +332,16 @@ class Supervisor:
         """Restart a process that died with an exit code, or schedule that."""
         if not self._folder.exists():  # with the file of its job, and the sockets
             raise ServiceError(
-                f"the {child.name} died {child.ending(code)}, and cannot be restarted, as the folder {self._folder} "
-                "was removed during the run: start again, with TMPDIR set to a folder that nothing cleans"
+                f"the {child.name} died ({child.ending(code)}) and cannot be restarted: the folder {self._folder} was "
+                "removed during the run; start again, with TMPDIR set to a folder that nothing cleans"
             )
         if code == PERMANENT_FAILURE:
             raise ServiceError(child.log.last_line())
         child.restarts.append(now)
         recent = sum(now - moment < RECENT_SECONDS for moment in child.restarts)
         if recent > RESTARTS:
-            raise ServiceError(f"the {child.name} died {recent} times in a minute, the last time {child.ending(code)}")
-        _log.warning("the %s died %s; it is restarted", child.name, child.ending(code))
+            raise ServiceError(f"the {child.name} died {recent} times in a minute (last: {child.ending(code)})")
+        _log.warning("%s died (%s); restarting it", child.name, child.ending(code))
         if recent == 1:
             child.start(self._results.last)
         else:

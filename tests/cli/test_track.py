@@ -8,13 +8,16 @@ import signal
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import psutil
 import pytest
+from rich.console import Console
 
 from catstream.base.box import Box
+from catstream.cli import track as track_module
 from catstream.cli.track import RunProgress
 from catstream.errors import VideoError
 from catstream.jobs.saved_model import SavedModel
@@ -307,6 +310,21 @@ def test_a_run_that_starts_paused_says_how_to_resume_it(video, succeed, monkeypa
     _, errors = succeed("track", source, "--box", box, "--paused")
     assert errors.startswith("paused: to continue, catstream resume --endpoint")
     assert errors.count("\n") == 1, "no frame was tracked"
+
+
+def test_time_in_which_a_run_waits_counts_neither_for_its_first_track_nor_its_rate(monkeypatch):
+    seconds = [100.0]
+    monkeypatch.setattr(track_module.time, "perf_counter", lambda: seconds[0])
+    pipeline = SimpleNamespace(holding="", live=False, frames=9, health={}, totals={}, restarts=0)
+    progress, console = RunProgress(pipeline), Console(quiet=True)
+    track = SimpleNamespace(box=None, model_version=1, state="lost", score=0.0)
+    with progress.line(console) as line:
+        for passed, holding in [(0.5, ""), (190.0, "waiting"), (0.5, ""), (2.0, None), (60.0, "paused"), (2.0, None)]:
+            seconds[0] += passed
+            pipeline.holding = holding or ""
+            progress.idle() if holding is not None else progress.show(line, {"": track})
+    assert "2 frames, present in 0, 0 frames/s, first track after 3.00 s" in progress.summary([])
+    assert progress._seconds() == pytest.approx(2.0)
 
 
 def test_results_that_another_run_wrote_while_this_one_waited_are_not_replaced(video, catstream, succeed, tmp_path):

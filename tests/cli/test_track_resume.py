@@ -100,6 +100,15 @@ def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(kill
     assert frames(out) == list(range(32)), "a run that is complete gets no row more"
 
 
+def test_a_run_that_cannot_continue_is_not_said_to_continue(killed, video, fail):
+    kept, (source, box) = killed / "kept", video
+    command = ["track", source, "--box", box, "--state", kept, "--continue"]
+    with Pipeline(resume=kept):
+        assert "continues" not in fail(*command)
+    (kept / "job.safetensors").write_bytes(b"damaged")
+    assert "continues" not in fail(*command)
+
+
 def test_rows_left_incomplete_by_a_power_failure_are_removed_and_written_again(killed, succeed):
     out = killed / "out"
     for file, cut in [("demo.ndjson", 60), ("demo.csv", 100)]:

@@ -152,7 +152,7 @@ with catstream.Pipeline(sys.argv[1], sys.argv[2]) as pipeline, catstream.subscri
                     use()
                     os._exit(1)
                 except catstream.CatstreamError as error:
-                    assert "is a copy" in str(error)
+                    assert "fork" in str(error)
             use = tracks = pipeline = None
             gc.collect()
             os._exit(7)

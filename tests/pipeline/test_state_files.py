@@ -45,10 +45,22 @@ def test_a_file_that_is_not_of_a_state_is_not_written(name, tmp_path):
 
 
 @pytest.mark.parametrize(("changed", "held"), [({"paused": True}, "paused"), ({"objects": {}}, "waiting")])
-def test_a_run_that_was_paused_or_has_no_object_left_says_so_when_it_is_resumed(state, until, changed, held):
+def test_a_run_that_was_paused_or_has_no_object_says_so_when_it_is_resumed(video, tmp_path, until, changed, held):
+    path, truth = video
+    with Pipeline(path, truth[0], {"run.unstored_frames": 4}, state=tmp_path) as pipeline:
+        next(iter(pipeline))  # and not to its end
+    replace(DesiredState.load(tmp_path / DESIRED), **changed).save(tmp_path / DESIRED)
+    with Pipeline(resume=tmp_path) as pipeline:
+        until(lambda: pipeline.holding == held)
+        assert next(pipeline.by_frame(0.1)) == {}
+
+
+@pytest.mark.parametrize("changed", [{"paused": True}, {"objects": {}}])
+def test_a_run_at_its_end_ends_when_it_is_resumed_as_no_frame_is_left(state, changed):
     replace(DesiredState.load(state / DESIRED), **changed).save(state / DESIRED)
     with Pipeline(resume=state) as pipeline:
-        until(lambda: pipeline.holding == held)
+        assert list(pipeline) == []
+    assert (pipeline.reason, pipeline.totals["stored"]) == ("the source has ended", 12)
 
 
 @pytest.mark.parametrize("lockstep", [False, True])

@@ -5,6 +5,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from catstream.errors import ServiceError
 from catstream.jobs.job import Job
 from catstream.processes import start_server as module
+from catstream.processes import supervisor
 from catstream.processes.process import STOPPED_EARLY, Watchdog
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Child, ProcessLog
@@ -191,6 +193,42 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
         start_server()
 
 
+def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(start, folder):
+    job = Job("rtsp://me:secret@10.0.0.7/gate", endpoint=str(folder)).save(folder)
+    process, _, _ = start(job)
+    shown = psutil.Process(process.pid)
+    deadline = time.monotonic() + 60
+    while shown.name() != "trainer:gate" and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert Path(f"/proc/{process.pid}/comm").read_text() == "trainer:gate\n"
+    assert shown.cmdline()[0] == "catstream trainer rtsp://10.0.0.7/gate"[: len(shown.cmdline()[0])]
+    assert "secret" not in Path(f"/proc/{process.pid}/cmdline").read_text()
+
+
+@pytest.mark.parametrize(
+    ("kills", "cause"),
+    [
+        (0, "with the start server: signal SIGKILL, not sent by catstream; out of memory?"),
+        (1, "out of memory: the kernel"),
+    ],
+)
+def test_a_death_by_a_signal_that_catstream_did_not_send_names_the_cause(folder, tmp_path, monkeypatch, kills, cause):
+    counts = [0]
+    monkeypatch.setattr(supervisor, "oom_kills", lambda: counts[0])
+    monkeypatch.setattr(module, "_server", None)
+    with closing(Child("trainer", Job(endpoint=str(folder)).save(folder), tmp_path)) as child:
+        child.start(0)
+        assert child.process.pid
+        os.kill(start_server().pid if not kills else child.process.pid, signal.SIGKILL)
+        counts[0] += kills
+        while child.code is None:
+            time.sleep(0.01)
+        assert cause in child.ending(child.code)
+        child.hung = True
+        assert child.ending(child.code) == "killed after it made no progress"
+    module.close_start_server()
+
+
 def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
     with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
         file.write(b"detector: an earlier one\n")
@@ -216,11 +254,11 @@ def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_
 @pytest.mark.parametrize(
     ("code", "ending"),
     [
-        (-signal.SIGKILL, "with signal SIGKILL"),
-        (-signal.SIGABRT, "with signal SIGABRT: its last line"),
-        (-(signal.SIGRTMIN + 1), f"with signal {signal.SIGRTMIN + 1}"),
-        (1, "with exit code 1: its last line"),
-        (STOPPED_EARLY, "as a signal asked it to end"),
+        (-signal.SIGKILL, "signal SIGKILL, not sent by catstream; out of memory?"),
+        (-signal.SIGABRT, "signal SIGABRT: its last line"),
+        (-(signal.SIGRTMIN + 1), f"signal {signal.SIGRTMIN + 1}"),
+        (1, "exit code 1: its last line"),
+        (STOPPED_EARLY, "another program asked it to end with a signal"),
     ],
 )
 def test_the_reason_of_a_death_is_the_signal_and_what_the_process_itself_has_said_of_it(tmp_path, code, ending):

@@ -1,0 +1,27 @@
+"""Time limits while the process itself is stopped."""
+
+import pytest
+
+import catstream
+from catstream.base import clock
+from catstream.errors import SilenceError
+
+
+def test_a_clock_counts_the_time_between_calls_but_not_that_in_which_the_process_was_stopped(monkeypatch):
+    moments = iter([1000.0, 1000.2, 1000.4, 4000.0, 4000.1])
+    monkeypatch.setattr(clock, "monotonic", lambda: next(moments))
+    running = clock.RunningClock()
+    assert [running() for _ in range(4)] == pytest.approx([0.2, 0.4, 0.4 + clock.STEP_SECONDS, 1.0])
+
+
+def test_a_subscriber_that_was_stopped_waits_for_the_rest_of_its_timeout(folder, monkeypatch):
+    looks = [0]
+
+    def stopped_for_an_hour():
+        looks[0] += 1
+        return 0.1 * looks[0] + 3600 * (looks[0] > 20)
+
+    monkeypatch.setattr(clock, "monotonic", stopped_for_an_hour)
+    with catstream.subscribe(str(folder), "tracks", timeout=5) as tracks, pytest.raises(SilenceError):
+        next(tracks)
+    assert looks[0] > 40, "it went on to look"
