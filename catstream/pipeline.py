@@ -314,7 +314,7 @@ class Pipeline:
         And of the tracks that were received here (`rows`), and how often a process was restarted (`restarts`). If
         frames of a file were left out, how many were `damaged`, and if they had
         another size than the first one, how many were `scaled`; of a live source, how many frames were `skipped`, and
-        how often it was `reopened`.
+        its number of `reconnects`.
         """
         if self._supervisor is None or self._supervisor.end is None:
             return {}

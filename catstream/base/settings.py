@@ -80,7 +80,7 @@ class RunSettings(_Group):
         float, _about("Time-out for opening a camera or a stream, with its first frame.", ge=0.1, le=3600)
     ] = 10.0
     silent_seconds: Annotated[
-        float, _about("Time without a frame after which a camera or a stream is opened again.", ge=0.1, le=3600)
+        float, _about("Time without a frame after which a camera or a stream reconnects.", ge=0.1, le=3600)
     ] = 5.0
     poll_seconds: Annotated[
         float, _about("Time from one picture to the next at the http:// address of a still picture.", ge=0.01, le=3600)

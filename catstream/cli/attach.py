@@ -289,7 +289,7 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         "not_stored": int(detector["sent"] - detector["stored"]) if detector else None,
         **whole("detector", "model_version"),
         **whole("compressor", "level", "leaves", "nodes", "bytes"),
-        **whole("detector", "skipped", "reopened"),
+        **whole("detector", "skipped", "reconnects"),
         "lost_seconds": detector.get("lost_seconds"),
         "trouble": {name: report.trouble for name, report in newest.items() if report.trouble},
         "rejected": {name: int(counters[name].get("rejected", 0)) for name in reports},
@@ -314,8 +314,8 @@ def _format(summary: dict[str, Any]) -> str:
         lines["trees"] = f"{at['leaves']} leaves, {at['nodes']} nodes, level {at['level']}, {size:.1f} MB"
     if summary["skipped"] is not None:  # None for a file
         lines["source"] = f"{counted(summary['skipped'], 'frame')} skipped"
-        if summary["reopened"] is not None:  # a demo is never lost
-            lines["source"] += f", reopened {counted(summary['reopened'], 'time')}"
+        if summary["reconnects"] is not None:  # a demo is never lost
+            lines["source"] += f", {counted(summary['reconnects'], 'reconnect')}"
     lines["rejected"] = counted(sum(summary["rejected"].values()), "message")
     lines["reports"] = ", ".join(f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
     if summary["trouble"]:

@@ -469,8 +469,9 @@ class RunProgress:
                 present = f"present in {each.present} of {each.frames} frames"
                 lines.append(f"  {name or '(no name)'}: {present}, model version {each.version}")
         if self._pipeline.live:
-            skipped, again = counted(self._detector("skipped"), "frame"), counted(self._detector("reopened"), "time")
-            lines.append(f"live: {skipped} skipped, lost and opened again {again}")
+            skipped = counted(self._detector("skipped"), "frame")
+            reconnects = counted(self._detector("reconnects"), "reconnect")
+            lines.append(f"live: {skipped} skipped, {reconnects}")
         if damaged := self._detector("damaged"):
             lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
         if scaled := self._detector("scaled"):

@@ -444,7 +444,7 @@ class End:
     reason  description of why the stream ended
     failed  whether it ended because of an error
     totals  final counters, by name: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
-            and how often a live source was `reopened`
+            and the `reconnects` of a live source
     """
 
     seq: Integer

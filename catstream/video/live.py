@@ -1,18 +1,17 @@
-"""Live sources: cameras and network streams. They give the newest frame, and reconnect after a loss, without limit.
+"""Live sources: cameras and network streams. They return the newest frame, and reconnect after a loss, without limit.
 
-A thread reads and decodes continuously and keeps only the newest frame. A slow consumer therefore gets fewer frames,
-never old ones; the skipped frames are counted. If no frame arrives within a time-out, or the stream ends or fails, the
-source is closed and reopened with exponential backoff until it is back or the consumer closes it. The time-outs count
-frames: a camera whose sound goes on without its picture is lost, too.
+A thread reads and decodes continuously and stores only the newest frame. A slow consumer therefore gets fewer frames,
+never old ones; the skipped frames are counted. If no frame arrives within a timeout, or the stream ends or fails, the
+source reconnects with exponential backoff until it succeeds or the consumer closes it. The timeouts apply to frames: a
+camera that still sends audio but no video is lost, too. `catstream.video.reconnect` decides how to connect again.
 
-HTTP has three special cases. The address of a still picture is fetched again and again. MJPEG that FFmpeg's demuxer for
-it rejects, because a part has another type or none, is read by the one that looks for JPEGs only. HLS sends segments of
-some seconds at once; their frames are returned at the pace of their time stamps.
+HTTP has three special cases. The address of a still picture is polled. MJPEG that FFmpeg's demuxer for it rejects,
+because a part has another content type or none, is read by the demuxer that searches for JPEGs only. HLS delivers
+segments of some seconds at once; their frames are returned at the pace of their time stamps.
 """
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import logging
 import math
@@ -21,7 +20,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator
 from time import monotonic
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 
@@ -29,34 +28,35 @@ from catstream.base.addresses import without_password
 from catstream.base.settings import RunSettings
 from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
+from catstream.video.reconnect import Attempt, Loss, next_attempt
 
 if TYPE_CHECKING:
-    from av import VideoFrame
+    from av import Packet, VideoFrame
     from av.container import InputContainer
 
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.25, 8.0
 _IDLE_SECONDS = 0.1
-_QUIET_SECONDS = 600.0  # the same reason of a loss is not logged again before
+_QUIET_SECONDS = 600.0  # between two log lines with the same reason
 _LONGEST_SEGMENT, _LONGEST_PLAYLIST = 20.0, 60.0  # seconds; of a segment, HLS recommends 6
 _SLOW = "check the camera; if it is slow, raise run.open_seconds or run.silent_seconds"
-_ENDED, _SILENT, _NO_FRAME = "it ended", f"nothing arrives: {_SLOW}", f"data arrives, but no picture: {_SLOW}"
+_ENDED, _INVALID = "end of stream", "no readable video"
+_SILENT, _NO_FRAME = f"no data: {_SLOW}", f"data without video frames: {_SLOW}"
 
 # TCP first, because over UDP a lost packet damages the picture; a camera without TCP is still received over UDP.
 _OPTIONS = {"rtsp_flags": "prefer_tcp", "analyzeduration": "500000"}
-#: To look for JPEGs: FFmpeg would wait for several of them, and invent time stamps.
+#: For the demuxer that searches for JPEGs: FFmpeg would wait for several of them, and invent time stamps.
 _JPEG_OPTIONS = {"probesize": "32", "analyzeduration": "1", "fflags": "nofillin"}
 
-_LATE_SECONDS, _CAUGHT_UP_SECONDS = 2.0, 0.5  # of a picture, from which frames are left out, and are not any more
+_LATE_SECONDS, _CAUGHT_UP_SECONDS = 2.0, 0.5  # latency at which dropping packets begins, and ends
 
 _log = logging.getLogger(__name__)
 
 
 class LiveSource(Source):
-    """A camera or a stream; each iteration gives its newest frame. `catstream.video.source.open_source` opens one.
+    """A camera or a stream; each iteration returns its newest frame. `catstream.video.source.open_source` opens one.
 
     Iteration waits for a frame that was not returned yet. If the source reconnects with another image size, its frames
-    are scaled to the size of the first one. VideoError from the constructor, if the source cannot be opened and no
-    `idle` was given; never later.
+    are scaled to the size of the first one. Without `idle`, the constructor raises VideoError if the source cannot be
+    opened; iteration never does.
     """
 
     live = True
@@ -65,22 +65,21 @@ class LiveSource(Source):
         self, text: str, start: int, settings: RunSettings, *, since: float | None, idle: Callable[[], bool] | None
     ) -> None:
         super().__init__(_name(text), RATE, (0, 0))
-        self.skipped = self.reopened = 0
-        protocol, mark, place = text.partition("://")
-        self._text = protocol.lower() + mark + place  # FFmpeg knows its protocols in small letters
+        self.skipped = self.reconnects = 0
+        protocol, mark, path = text.partition("://")
+        self._text = protocol.lower() + mark + path  # FFmpeg's names of protocols are in lower case
         self._address, self._settings = without_password(text), settings
-        self._format: str | None = None  # for the next connection; None if FFmpeg finds it out
-        self._shown = (-math.inf, 0.0)  # time stamp of the last frame of a segment, and when it was returned
+        self._paced = (-math.inf, 0.0)  # time stamp of the last frame of a segment, and when it was returned
         self._number, self._zero, self._idle = start, since, idle
         self._upright = UprightConverter()
         self._condition = threading.Condition()  # guards the fields below
         self._newest: tuple[float, VideoFrame] | None = None
-        self._problem = ""  # why the source is lost; empty while it is not
-        self._logged: dict[str, float] = {}  # when each reason of a loss was logged
-        self._is_logged = False  # whether a reason of this loss was
+        self._problem = ""  # why the source is lost; empty while it is connected
+        self._log_times: dict[str, float] = {}  # of the last log line with each reason
+        self._is_logged = False  # whether this loss was logged
         self._last_frame_time = monotonic()
         self._closed = False
-        self._was_open = idle is not None  # without `idle`, a source that was never open is an error and not a loss
+        self._was_open = idle is not None  # without `idle`, a first failure is an error, not a loss
         self._thread = threading.Thread(target=self._read, name=f"reader of {self.name}", daemon=True)
         self._thread.start()
         self._first: Frame | None = None
@@ -89,13 +88,13 @@ class LiveSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`skipped`: frames that were replaced by a newer one before they were returned; `reopened`: number of times
-        that the source came back; `lost_seconds`: seconds since it was lost, 0 while it is not."""
+        """`skipped`: frames that were replaced by a newer one before they were returned; `reconnects`: successful
+        reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected."""
         silent = monotonic() - self._last_frame_time
-        # FFmpeg has no time-out for a device that hangs, so a long silence counts as a loss too.
+        # FFmpeg has no timeout for a device that hangs, so a long silence counts as a loss, too.
         limits = self._settings.open_seconds, self._settings.silent_seconds, self._settings.poll_seconds
         lost = silent if self._problem or silent > sum(limits) else 0.0
-        return {"skipped": self.skipped, "reopened": self.reopened, "lost_seconds": lost}
+        return {"skipped": self.skipped, "reconnects": self.reconnects, "lost_seconds": lost}
 
     def __next__(self) -> Frame:
         if self._first is not None:
@@ -110,7 +109,7 @@ class LiveSource(Source):
         with self._condition:
             self._closed, self._first, self._newest = True, None, None
             self._condition.notify_all()
-        # The thread of a device that hangs is not waited for: it ends with its time-out or with the process.
+        # The thread of a device that hangs is not waited for: it ends with its timeout or with the process.
         self._thread.join(1.0)
 
     def _first_frame(self) -> Frame:
@@ -119,12 +118,10 @@ class LiveSource(Source):
             if self._problem:
                 self.close()
                 hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
-                problem, _, advice = self._problem.partition(": ")  # what to do about it, if that is known
-                what = (
-                    "its user and password" if re.search("40[13]", problem) else "that it is running, and its address"
-                )
-                advice = advice or f"check {what}{hint}"
-                raise VideoError(f"cannot open {self._address!r} ({problem}): {advice}")
+                problem, _, advice = self._problem.partition(": ")
+                unauthorized = re.search("40[13]", problem)
+                cause = "its user and password" if unauthorized else "that it is running, and its address"
+                raise VideoError(f"cannot open {self._address!r} ({problem}): {advice or f'check {cause}{hint}'}")
         return self._frame(*newest)
 
     def _wait_for_newest(self) -> tuple[float, VideoFrame] | None:
@@ -150,56 +147,58 @@ class LiveSource(Source):
 
     def _read(self) -> None:
         """Read frames and keep the newest; reconnect after each loss."""
+        attempt, begin = Attempt(), monotonic()
+        while not self._closed:
+            loss = self._connect(attempt, begin)
+            attempt = next_attempt(attempt, loss, is_http=_is_http(self._text))
+            if attempt.begin == "at once":  # within the time of the first attempt, unless that was a success
+                begin = monotonic() if loss.frames else begin
+                continue
+            with self._condition:
+                if attempt.begin == "poll":
+                    wait = begin + self._settings.poll_seconds - monotonic()
+                else:
+                    wait = attempt.backoff * random.uniform(0.5, 1)
+                    self._report_loss(loss.reason)
+                self._condition.wait_for(lambda: self._closed, wait)
+            begin = monotonic()
+
+    def _connect(self, attempt: Attempt, begin: float) -> Loss:
+        """Connect once, and store the frames until the connection is lost."""
         import av
 
-        pause, opened = _FIRST_PAUSE, 0.0
-        is_known = False  # whether frames came by this way of reading
-        while not self._closed:
-            opened, count, problem, is_other, is_invalid = opened or monotonic(), 0, _ENDED, False, False
-            try:
-                for decoded in self._decoded(opened, is_known):
-                    self._store_newest(monotonic(), decoded)
-                    pause, count, is_known = _FIRST_PAUSE, count + 1, True
-            except av.FFmpegError as error:
-                is_invalid = isinstance(error, av.InvalidDataError)
-                # A connection that was closed is an error of input and output if no length was stated.
-                is_end = count and (isinstance(error, EOFError) or error.errno == errno.EIO)
-                problem = _ENDED if is_end else ffmpeg_reason(error)
-                if monotonic() - max(opened, self._last_frame_time) >= self._settings.silent_seconds:
-                    is_invalid, problem = False, _SILENT  # FFmpeg's messages for a time-out are unclear
-                is_other, is_known = is_invalid or (problem == _SILENT and not is_known), is_known and not is_invalid
-            except TimeoutError as error:
-                problem, is_other = str(error), not is_known
-            except Exception as error:  # an unexpected error must not end the thread silently
-                problem = str(error).replace(self._text, self._address)
-            if is_other and self._format is None and _is_http(self._text):
-                self._format, opened = "mjpeg", 0.0 if count else opened
-                continue
-            if is_invalid or (self._format and not count and problem == _ENDED):  # a page, for example
-                problem = "it sends no video that can be read"
-            self._format = self._format if is_known else None
-            with self._condition:
-                if problem == _ENDED and count == 1 and _is_http(self._text):  # a still picture
-                    wait = opened + self._settings.poll_seconds - monotonic()
-                else:
-                    self._report_loss(problem)
-                    wait, pause = pause * random.uniform(0.5, 1), min(2 * pause, _LONGEST_PAUSE)
-                self._condition.wait_for(lambda: self._closed, wait)
-            opened = 0.0
+        frames = 0
+        try:
+            for decoded in self._decoded(attempt, begin):
+                self._store_newest(monotonic(), decoded)
+                frames += 1
+        except av.FFmpegError as error:
+            if monotonic() - max(begin, self._last_frame_time) >= self._settings.silent_seconds:
+                return Loss("silent", frames, _SILENT)  # FFmpeg's messages for a timeout are unclear
+            if isinstance(error, av.InvalidDataError):
+                return Loss("invalid", frames, _INVALID)
+            # A connection that was closed is an error of input and output if no length was stated.
+            if not (frames and (isinstance(error, EOFError) or error.errno == errno.EIO)):
+                return Loss("failed", frames, ffmpeg_reason(error))
+        except TimeoutError as error:
+            return Loss("silent", frames, str(error))
+        except Exception as error:  # an unexpected error must not end the thread silently
+            return Loss("failed", frames, str(error).replace(self._text, self._address))
+        if attempt.demuxer and not frames:  # an HTML page, for example
+            return Loss("invalid", frames, _INVALID)
+        return Loss("ended", frames, _ENDED)
 
-    def _decoded(self, opened: float, is_known: bool) -> Iterator[VideoFrame]:
+    def _decoded(self, attempt: Attempt, begin: float) -> Iterator[VideoFrame]:
         """Yield the undamaged frames of one connection, until it ends.
 
-        If no frame came before, a part of the time is left for the other way of reading MJPEG. TimeoutError, with the
-        reason, if data arrives without frames, or a packet was cut off because nothing arrives.
+        While it is unknown whether FFmpeg's probing succeeds, a part of the time is reserved for the other demuxer.
+        TimeoutError, with the reason, if data arrives without frames, or a packet was cut off because nothing arrives.
         """
-        import av
-
-        settings, due = self._settings, opened + self._settings.open_seconds
-        if _is_http(self._text) and self._format is None and not is_known:
+        settings, due = self._settings, begin + self._settings.open_seconds
+        if _is_http(self._text) and not attempt.demuxer and not attempt.proven:
             due -= settings.open_seconds / 5
         timeouts = max(1.0, due - monotonic()), settings.silent_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
-        with _open_container(self._text, self._format, timeouts, settings.hardware) as container:
+        with _open_container(self._text, attempt.demuxer, timeouts, settings.hardware) as container:
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
@@ -210,32 +209,28 @@ class LiveSource(Source):
                     return
                 if now > due:
                     raise TimeoutError(_SILENT if now - before > 0.9 * settings.silent_seconds else _NO_FRAME)
-                if packet.stream_index != stream.index:  # sound may go on while the picture does not
+                if packet.stream_index != stream.index:  # audio, which may continue without the video
                     continue
                 sent = None if packet.pts is None or is_segmented else float(packet.pts * packet.time_base)
-                if backlog.arrives(now, sent, is_key=packet.is_keyframe):
+                if backlog.drops(now, sent, is_key=packet.is_keyframe):
                     self.skipped += 1
                     due = now + settings.silent_seconds
                     continue
-                decoded: list[VideoFrame] = []
-                with contextlib.suppress(av.FFmpegError):  # the packet is damaged; the next may be whole
-                    decoded = stream.codec_context.decode(packet)
-                for frame in decoded:
-                    if not frame.is_corrupt:
-                        if not is_segmented or self._is_next(frame):
-                            yield frame
-                        due = monotonic() + settings.silent_seconds + is_segmented * _LONGEST_SEGMENT
-                backlog.is_done(monotonic())
+                for frame in _undamaged(stream, packet):
+                    if not is_segmented or self._is_next(frame):
+                        yield frame
+                    due = monotonic() + settings.silent_seconds + is_segmented * _LONGEST_SEGMENT
+                backlog.is_decoded(monotonic())
 
     def _is_next(self, frame: VideoFrame) -> bool:
-        """Wait until a frame of a segment is due; returns False if a segment was fetched again, and it was shown."""
-        (time, moment), now = self._shown, monotonic()
+        """Wait until a frame of a segment is due. Returns False for a frame that was returned with the same segment."""
+        (time, moment), now = self._paced, monotonic()
         ahead = (frame.time or 0.0) - time
         if -_LONGEST_PLAYLIST < ahead <= 0:
             return False
         # The time stamps of the next segment may begin again.
         moment = max(now, moment + ahead) if 0 < ahead < _LONGEST_SEGMENT else now
-        self._shown = frame.time or 0.0, moment
+        self._paced = frame.time or 0.0, moment
         with self._condition:
             self._condition.wait_for(lambda: self._closed, moment - now)
         return True
@@ -245,78 +240,95 @@ class LiveSource(Source):
             if self._closed:
                 return
             if self._problem:
-                self.reopened += 1
+                self.reconnects += 1
                 if self._is_logged:
-                    _log.warning("the source %s is back after %.1f s", self.name, moment - self._last_frame_time)
+                    _log.warning("reconnected to source %s after %.1f s", self.name, moment - self._last_frame_time)
             self.skipped += self._newest is not None
             self._newest, self._last_frame_time, self._problem, self._was_open = (moment, decoded), moment, "", True
             self._is_logged = False
             self._condition.notify()
 
     def _report_loss(self, problem: str) -> None:
-        """Log the reason of a loss, once for each reason: a source may be lost for days, or again and again."""
+        """Log a loss, but a reason at most once in ten minutes: a source may be lost for days, or again and again."""
         now = monotonic()
-        if self._was_open and not self._closed and now - self._logged.get(problem, -math.inf) > _QUIET_SECONDS:
-            _log.warning("the source %s is lost (%s); it is reopened until it is back", self.name, problem)
-            self._logged[problem], self._is_logged = now, True
+        if self._was_open and not self._closed and now - self._log_times.get(problem, -math.inf) > _QUIET_SECONDS:
+            _log.warning("lost source %s (%s); reconnecting", self.name, problem)
+            self._log_times[problem] = now
+            self._is_logged = True
         self._problem = problem
 
 
 class Backlog:
-    """Which packets of a stream are left out, because they arrive faster than they are decoded.
+    """Decides which packets of a stream to drop because they arrive faster than they are decoded.
 
-    The picture would be ever older. If it is late by some seconds, only key frames are decoded until it is not: nothing
-    refers to what is left out. It is not late if decoding mostly waits for packets, whatever the clock of the camera
-    says.
+    The latency would grow without limit. From two seconds on, only key frames are decoded until it is small again,
+    because no other frame refers to what was dropped. The latency is not measured by the camera's clock, which may
+    drift: a stream whose decoder mostly waits for packets is on time.
     """
 
     def __init__(self) -> None:
         self._is_late = False
-        self._least = math.inf  # age of a packet that did not wait: its arrival less its time stamp
-        self._done: float | None = None  # when the packet before was decoded
-        self._key, self._waited = 0.0, 0.0  # arrival of the last key frame, and seconds without a packet since then
+        self._min_age = math.inf  # arrival less time stamp of a packet on time
+        self._decoded: float | None = None  # when the last packet was decoded
+        self._key = 0.0  # arrival of the last key frame
+        self._waited = 0.0  # seconds without a packet since then
 
-    def arrives(self, now: float, time: float | None, *, is_key: bool) -> bool:
-        """Return whether a packet with this time stamp, which arrives now, is left out."""
+    def drops(self, now: float, time: float | None, *, is_key: bool) -> bool:
+        """Return whether to drop a packet that arrives now, with this time stamp."""
         if time is None:
             return False
-        wait, self._done, age = now - (now if self._done is None else self._done), now, now - time
+        wait = now - (now if self._decoded is None else self._decoded)
+        age = now - time
+        self._decoded = now
         self._waited += wait
-        self._least = min(self._least, age)
-        if wait > _LATE_SECONDS / 2:  # the network stood still, and what it held back arrives now
-            self._least = age
+        self._min_age = min(self._min_age, age)
+        if wait > _LATE_SECONDS / 2:  # the network stalled, and the delayed packets arrive now
+            self._min_age = age
         if is_key:
             if self._waited > (now - self._key) / 2:
-                self._least = age
-            self._is_late = self._is_late and age - self._least > _CAUGHT_UP_SECONDS
-            self._key, self._waited = now, 0.0
-        self._is_late = self._is_late or age - self._least > _LATE_SECONDS
+                self._min_age = age
+            self._is_late = self._is_late and age - self._min_age > _CAUGHT_UP_SECONDS
+            self._key = now
+            self._waited = 0.0
+        self._is_late = self._is_late or age - self._min_age > _LATE_SECONDS
         return self._is_late and not is_key
 
-    def is_done(self, now: float) -> None:
-        self._done = now
+    def is_decoded(self, now: float) -> None:
+        """Record when the last packet was decoded."""
+        self._decoded = now
+
+
+def _undamaged(stream: Any, packet: Packet[Any]) -> list[VideoFrame]:
+    """Decode a packet. Damaged frames, and the frames of a damaged packet, are left out."""
+    import av
+
+    try:
+        return [frame for frame in stream.codec_context.decode(packet) if not frame.is_corrupt]
+    except av.FFmpegError:
+        return []
 
 
 def _is_http(text: str) -> bool:
     return text.startswith(("http:", "https:"))
 
 
-def _open_container(text: str, form: str | None, timeouts: tuple[float, float], hardware: str) -> InputContainer:
+def _open_container(text: str, demuxer: str | None, timeouts: tuple[float, float], hardware: str) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     is_address = "://" in text
     container = open_video(
         f"/dev/video{text}" if text.isdigit() else text,
         hardware,
-        format=form if is_address else "v4l2",
-        options=_JPEG_OPTIONS if form else _OPTIONS,
+        format=demuxer if is_address else "v4l2",
+        options=_JPEG_OPTIONS if demuxer else _OPTIONS,
         timeout=timeouts,
     )
-    problem, kind = "", container.format.name
+    problem = ""
+    kind = container.format.name
     has_end = container.duration if kind in ("hls", "dash") else (container.size or 0) > 0
     if video_stream(container) is None:
-        problem = "it has no video"
+        problem = "no video stream"
     elif _is_http(text) and has_end and not kind.endswith(("_pipe", "image2", "mjpeg", "mpjpeg")):
-        problem = "it is a recording: download it, and give the file"
+        problem = "a recording: download it, and pass the file"
     if problem:
         container.close()
         raise VideoError(problem)
@@ -324,7 +336,7 @@ def _open_container(text: str, form: str | None, timeouts: tuple[float, float], 
 
 
 def _name(text: str) -> str:
-    """Return the name for results: the last part of the address, or the host; without user and password.
+    """Return the name of a source for results: the last part of its address, or the host; no user, no password.
 
     >>> [_name(text) for text in ("0", "/dev/video2", "rtsp://me:sec[ret@10.0.0.7:554/cam/one.sdp?x=1", "http://10.0.0.7")]
     ['video0', 'video2', 'one', '10.0.0.7']

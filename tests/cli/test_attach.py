@@ -173,11 +173,11 @@ def test_the_lines_of_status_that_depend_on_the_source_and_the_trees():
     counters = {"sent": 9.0, "processed": 9.0, "stored": 9.0, "skipped": 2.0}
     reports = {"detector": [Health("detector", 1.0, counters)], "compressor": [Health("compressor", 1.0, {"seq": 1.0})]}
     lines = _format(_summary("run", reports)).splitlines()
-    assert "source     2 frames skipped" in lines, "a demo is never opened again"
+    assert "source     2 frames skipped" in lines, "a demo never reconnects"
     assert not [line for line in lines if line.startswith("trees")], "there are none before the first box"
-    counters["reopened"] = counters["skipped"] = 1.0
+    counters["reconnects"] = counters["skipped"] = 1.0
     trees = {"leaves": 7.0, "nodes": 5.0, "level": 1.0, "bytes": 4.6e6}
     reports["compressor"] = [Health("compressor", 1.0, trees)]
     lines = _format(_summary("run", reports)).splitlines()
-    assert "source     1 frame skipped, reopened 1 time" in lines
+    assert "source     1 frame skipped, 1 reconnect" in lines
     assert "trees      7 leaves, 5 nodes, level 1, 4.6 MB" in lines

@@ -107,16 +107,16 @@ def test_tracking_resumes_with_the_learned_model_after_a_server_freezes_and_dies
         server.send_signal(signal.SIGSTOP)
         run.until(lambda counters: counters.get("lost_seconds", 0) > 0)
         server.send_signal(signal.SIGCONT)
-        run.until(lambda counters: counters["reopened"] == 1)
+        run.until(lambda counters: counters["reconnects"] == 1)
         server.kill()
         server.wait()
         learned = run.until(lambda counters: counters.get("lost_seconds", 0) > 0)["model_version"]
         rtsp(port)
-        run.until(lambda counters: counters["reopened"] == 2 and counters["model_version"] >= learned + 5)
+        run.until(lambda counters: counters["reconnects"] == 2 and counters["model_version"] >= learned + 5)
         rows, errors = run.stopped()
-    assert "the source one is lost (nothing arrives: " in errors
-    assert errors.count("the source one is back after") == 2
-    assert "lost and opened again 2 times" in errors
+    assert "lost source one (no data: " in errors
+    assert errors.count("reconnected to source one after") == 2
+    assert "skipped, 2 reconnects" in errors
     assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
     versions = [int(row["model_version"]) for row in rows]
     assert versions == sorted(versions), "what was learned is kept"
@@ -188,11 +188,11 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
         code, status, _ = said("status", "--endpoint", tmp_path / "run")
         assert code == 0, "the processes are well"
         assert re.search(r"^state +source lost for \d+ s$", status, re.MULTILINE)
-        assert re.search(r"^source +\d+ frames? skipped, reopened 0 times$", status, re.MULTILINE)
+        assert re.search(r"^source +\d+ frames? skipped, 0 reconnects$", status, re.MULTILINE)
         rows, errors = run.stopped()
         assert len(list(tracks)) < len(rows)
         assert (tracks.end.reason, tracks.end.failed) == ("it was stopped", False)
-    assert "the source one is lost" in errors
+    assert "lost source one" in errors
     assert "the results so far are kept" in errors
 
 

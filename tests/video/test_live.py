@@ -15,7 +15,7 @@ import pytest
 
 from catstream.base.addresses import without_password
 from catstream.errors import VideoError
-from catstream.video import live
+from catstream.video import live, reconnect
 from catstream.video.source import open_source
 
 
@@ -99,34 +99,34 @@ def test_times_are_relative_to_the_given_moment(camera):
         assert 1000 <= next(source).time < 1030
 
 
-def test_a_camera_that_disconnects_is_reopened(camera, until):
+def test_a_camera_that_disconnects_is_reconnected(camera, until):
     cam = camera(numbered)
     with open_source(cam.url) as source:
         next(source)
         cam.leave()
         until(lambda: source.counters["lost_seconds"] > 0)
         camera(numbered, cam.port)
-        before = source.reopened
+        before = source.reconnects
         frames = [next(source) for _ in range(3)]
-        until(lambda: source.reopened == before + 1)
+        until(lambda: source.reconnects == before + 1)
         assert source.counters["lost_seconds"] == 0
     assert [frame.number for frame in frames] == [1, 2, 3]
 
 
-def test_a_camera_that_sends_no_frames_is_reopened(camera, caplog, until):
+def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
     cam = camera(numbered)
     with open_source(cam.url, silent_seconds=0.5) as source:
         next(source)
         cam.sends.clear()
         until(lambda: source.counters["lost_seconds"] > 0.5)
         cam.sends.set()
-        until(lambda: source.reopened == 1)
+        until(lambda: source.reconnects == 1)
         next(source)
-    assert "one is lost (nothing arrives: check the camera" in caplog.text
-    assert "one is back after" in caplog.text
+    assert "lost source one (no data: check the camera" in caplog.text
+    assert "reconnected to source one after" in caplog.text
 
 
-def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_path, served, caplog, until):
+def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reconnected(tmp_path, served, caplog, until):
     with av.open(str(tmp_path / "a.ts"), "w") as container:
         picture, tone = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=48000)
         picture.width, picture.height, picture.pix_fmt = 128, 96, "yuv420p"
@@ -149,13 +149,13 @@ def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reopened(tmp_pa
 
     with open_source(f"{served(send)}/a.ts", silent_seconds=1) as source:
         began = time.monotonic()
-        until(lambda: source.reopened)
+        until(lambda: source.reconnects)
         assert time.monotonic() - began < 20, "the sound lasts longer"
-    assert "(data arrives, but no picture: check the camera" in caplog.text
+    assert "(data without video frames: check the camera" in caplog.text
 
 
 def test_the_reason_of_a_loss_is_logged_once(camera, monkeypatch, caplog, until):
-    monkeypatch.setattr(live, "_LONGEST_PAUSE", 0.01)
+    monkeypatch.setattr(reconnect, "_LONGEST_BACKOFF", 0.01)
     cam, tried = camera(numbered), []
 
     def refuse(*arguments):
@@ -176,7 +176,7 @@ def test_a_camera_that_returns_with_another_size_is_scaled_to_the_first_size(cam
         next(source)
         cam.leave()
         camera(lambda number: numbered(number, width=256), cam.port)
-        while source.reopened == 0:
+        while source.reconnects == 0:
             frame = next(source)
         assert frame.image.shape == (96, 128, 3)
 
@@ -187,7 +187,7 @@ def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     with pytest.raises(VideoError, match=r"cannot open 'http://127.*connection refused.*check") as error:
         open_source(cam.url.replace("//", "//me:secr@t@"))
     assert "secr" not in str(error.value)
-    assert not caplog.records, "what never was there is not lost, and not opened again"
+    assert not caplog.records, "a first failure is an error, not a loss"
 
 
 @pytest.mark.parametrize(
@@ -198,12 +198,12 @@ def test_a_stream_that_is_decoded_too_slowly_is_never_far_behind_and_goes_on_at_
     backlog, moment, left, ages, broken = live.Backlog(), 0.0, 0, [], False
     for number in range(3000):  # two minutes, with a key frame every second
         moment, is_key = max(moment, number / 25), number % 25 == 0
-        if backlog.arrives(moment, number / 25, is_key=is_key):
+        if backlog.drops(moment, number / 25, is_key=is_key):
             left, broken = left + 1, True
             continue
         assert is_key or not broken, "a frame refers to the one before"
         broken, moment = False, moment + seconds
-        backlog.is_done(moment)
+        backlog.is_decoded(moment)
         ages.append(moment - number / 25)
     low, high = left_out
     assert low <= left / 3000 <= high
@@ -214,9 +214,9 @@ def test_nothing_is_left_out_after_the_network_stood_still():
     backlog, moment = live.Backlog(), 0.0
     for number in range(1000):
         moment = max(moment, number / 25, 23.0 if number >= 510 else 0.0)  # 510 was due at 20.4
-        assert not backlog.arrives(moment, number / 25, is_key=number % 250 == 0)
+        assert not backlog.drops(moment, number / 25, is_key=number % 250 == 0)
         moment += 0.005
-        backlog.is_done(moment)
+        backlog.is_decoded(moment)
 
 
 def test_a_camera_that_does_not_exist_is_an_error():
@@ -259,7 +259,7 @@ def test_a_url_of_a_video_file_is_an_error(tmp_path, served):
         for number in range(50):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
         container.mux(stream.encode(None))
-    with pytest.raises(VideoError, match=r"\(it is a recording\): download it, and give the file$"):
+    with pytest.raises(VideoError, match=r"\(a recording\): download it, and pass the file$"):
         open_source(f"{served(tmp_path)}/walk.mp4")
 
 
@@ -270,7 +270,7 @@ def test_a_file_without_a_duration_is_a_recording_too(tmp_path, served):
         for number in range(9):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24")))
         container.mux(stream.encode(None))
-    with pytest.raises(VideoError, match="it is a recording"):
+    with pytest.raises(VideoError, match="a recording"):
         open_source(f"{served(tmp_path)}/walk.h264")
 
 
@@ -320,7 +320,7 @@ def test_a_text_part_is_no_loss_also_long_after_the_beginning(served, caplog):
     with open_source(f"{served(send)}/video", open_seconds=1) as source:
         for _ in range(100):
             next(source)
-        assert source.reopened == 0
+        assert source.reconnects == 0
     assert not caplog.records
 
 
@@ -340,7 +340,7 @@ def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, stat
 
     with open_source(f"{served(send)}/now{suffix}", poll_seconds=0.05) as source:
         seen = [number_of(next(source).image) for _ in range(5)]
-        assert (source.reopened, source.counters["lost_seconds"]) == (0, 0)
+        assert (source.reconnects, source.counters["lost_seconds"]) == (0, 0)
     assert seen == sorted(set(seen))
     assert not caplog.records
 
@@ -355,11 +355,11 @@ def test_hls_is_returned_at_the_pace_of_its_pictures_and_none_twice(tmp_path, se
         container.mux(stream.encode(None))
     monkeypatch.setattr(live, "_LONGEST_SEGMENT", 0.2)
     url, is_over = f"{served(tmp_path)}/live.m3u8", lambda: source.counters["lost_seconds"] > 2
-    with open_source(url, idle=is_over, silent_seconds=0.3) as source:  # it is opened again after its last segment
+    with open_source(url, idle=is_over, silent_seconds=0.3) as source:  # it reconnects after its last segment
         times = [frame.pts for frame in source]
     assert len(times) > 25, "a segment is not skipped"
     assert times == sorted(set(times))
-    assert caplog.text.count("is lost") == 1
+    assert caplog.text.count("lost source") == 1
 
 
 ADDRESSES = [
