@@ -23,7 +23,7 @@ from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
 from catstream.jobs.state import TREES
-from catstream.sinks.track_log import read_frames
+from catstream.sinks.track_log import Log
 from catstream.video.rendered import write
 
 _REST = 200  # frames after the last kill: a fast pipeline continues until the kill takes effect
@@ -44,8 +44,8 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     seconds = [watched(resumed, out, chance.randrange(most)) for _ in range(moments - 1)]
     seconds.append(watched(resumed, out, None))
 
-    log = read_frames(out / f"{video.stem}.csv")
-    rows = [(track.frame, track.object) for frame, _ in log for track in frame.tracks]
+    log = Log(out / f"{video.stem}.csv").frames()
+    rows = [(track.frame, track.object) for frame in log for track in frame.tracks]
     lost, twice = frames * len(boxes) - len(set(rows)), len(rows) - len(set(rows))
     stored = CheckpointStore(kept / TREES).load(Settings()).seq
     columns = ("killed", "frames", "objects", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")

@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 from catstream.base.addresses import without_password
-from catstream.base.files import check_file
+from catstream.base.files import check_distinct, check_file
 from catstream.base.forks import check_not_forked, forked, generation
 from catstream.base.names import Boxes, boxes_by_name, check_boxes
 from catstream.base.settings import Settings
@@ -148,7 +148,7 @@ class Pipeline:
         self._state = Path(state or resume or "").absolute() if state or resume else None
         boxes = {} if box is None else boxes_by_name(box)
         models = {name: file.absolute() for name, file in files_by_name(model).items()}
-        job = self._resumed_job or Job(started=time.time())
+        job = self._resumed_job or Job()
         job = replace(
             job,
             boxes=boxes or job.boxes,
@@ -162,6 +162,7 @@ class Pipeline:
         saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
         for file in saved_models.values():
             check_file(file)
+        check_distinct((f"the saved model of {name or 'the object'}", file) for name, file in saved_models.items())
         if not job.source:
             raise SettingsError("a new run needs a source: give one")
         if job.settings.run.lockstep and is_live(job.source):
@@ -212,11 +213,12 @@ class Pipeline:
     def _started(self, endpoint: str) -> Job:
         """The job for the processes that are started now.
 
-        The times of a live run go on after those before, also if the clock of the machine was set back since.
+        The times of a live run go on after those before. A pause between two parts of it does not count: nothing
+        measures it if the clock of the machine was set meanwhile.
         """
-        passed = max(0.0, time.time() - self._job.started)
+        passed = 0.0
         if self.live and self._resumed_job is not None and self._state is not None:
-            passed = max(passed, last_time(self._state) + self.settings.run.checkpoint_seconds)
+            passed = last_time(self._state) + self.settings.run.checkpoint_seconds
         return replace(
             self._job,
             endpoint=endpoint,

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import glob
 import os
+import re
 import secrets
 import shutil
+import stat
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import IO, Any
 
 from catstream.base.forks import after_fork, forked, generation
 from catstream.errors import CatstreamError, ServiceError
@@ -147,12 +151,66 @@ def is_locked(handle: int) -> bool:
 
 
 def _flock(handle: int, kind: int) -> bool:
-    """Lock an open file or folder without waiting; returns False if another process has locked it."""
+    """Lock an open file or folder without waiting; returns False if another process has locked it.
+
+    A file system without locks, as some network drives, lets everybody lock.
+    """
     try:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+            raise
     return True
+
+
+def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int | None = 0, **options: Any) -> IO[Any]:
+    """Open a file to append to it, and lock it until it is closed; `options` are those of `open`.
+
+    size  number of its first bytes that remain, 0 for a new file; None for all
+
+    An error of this kind if another process has locked it, or if it cannot be written.
+    """
+    with writing(path, kind), contextlib.ExitStack() as stack:
+        file: IO[Any] = stack.enter_context(path.open(**{"mode": "a", **options}))
+        if not lock(file.fileno()):
+            raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
+        if size is not None and stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            file.truncate(size)
+        stack.pop_all()
+    return file
+
+
+def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> None:
+    """Raise an error of this kind if another process has locked a file."""
+    with contextlib.suppress(FileNotFoundError, PermissionError), descriptor(path) as handle:
+        if is_locked(handle):
+            raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
+
+
+def _holder(path: Path) -> str:
+    """The process that has locked a file, for an error; the kernel lists those of this machine."""
+    with contextlib.suppress(OSError):
+        locks = Path("/proc/locks").read_text()
+        if entry := re.search(rf"FLOCK +ADVISORY +WRITE +([1-9]\d*) \S+:{path.stat().st_ino} ", locks):
+            return f"process {entry[1]}"
+    return "another process"
+
+
+def check_distinct(files: Iterable[tuple[str, Path]], kind: type[CatstreamError] = ServiceError) -> None:
+    """Raise an error of this kind if two files, each after its purpose, are the same, also through links.
+
+    >>> check_distinct([("the results", Path("a.csv")), ("the model of anna", Path("./a.csv"))])
+    Traceback (most recent call last):
+    catstream.errors.ServiceError: a.csv is both the results and the model of anna: pass different files
+    """
+    purposes: dict[object, str] = {}
+    for purpose, path in files:
+        key = (path.stat().st_dev, path.stat().st_ino) if path.exists() else path.resolve()
+        if key in purposes:
+            raise kind(f"{path} is both {purposes[key]} and {purpose}: pass different files")
+        purposes[key] = purpose
 
 
 def sync(path: Path) -> None:

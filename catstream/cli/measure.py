@@ -347,7 +347,7 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
 
     from catstream.cli.track import track
     from catstream.evaluation.scores import score
-    from catstream.sinks.track_log import read_frames
+    from catstream.sinks.track_log import Log
     from catstream.video.rendered import write
 
     with line_of(messages()) as bar:
@@ -360,7 +360,7 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
     arguments = [str(video), "--box", str(boxes[0]), "--output", str(tracks), "--video", "--overwrite"]
     track.main(arguments, prog_name="catstream track", standalone_mode=False)
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
-    tracked = [frame.tracks[0].box for frame, _ in read_frames(tracks / "demo.ndjson")]
+    tracked = [frame.tracks[0].box for frame in Log(tracks / "demo.ndjson").frames()]
     found = np.array([box or (np.nan,) * 4 for box in tracked])
     result = score(found, truth)
     click.echo(f"success rate: {result.success:.3f} (overlap with the ground truth above 0.5)")

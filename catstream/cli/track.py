@@ -27,7 +27,7 @@ from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.cli.write import check_used, with_sink_options, with_table
 from catstream.errors import require_extra
 from catstream.jobs.job import Results, SinkOptions
-from catstream.jobs.state import contains_run
+from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.processes.options import (
@@ -51,8 +51,9 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @click.command()
 @click.argument("source", required=False)
 @click.option("--output", type=PATH, help="Folder for the results.")
-@click.option("--video", is_flag=True, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
+@click.option("--video/--no-video", default=None, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
 @click.option("--write", multiple=True, metavar="DEST", help="Also write the tracks to DEST; may be repeated.")
+@click.option("--no-write", is_flag=True, help="With --resume: drop the destinations of --write.")
 @with_sink_options
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
@@ -159,8 +160,9 @@ class _Run:
     given: dict[str, object]
     part: slice
     output: Path | None
-    video: bool
+    video: bool | None
     write: tuple[str, ...]
+    no_write: bool
     options: SinkOptions
     overwrite: bool
     saved: dict[str, Path]
@@ -187,14 +189,20 @@ class _Run:
         for line in self._doubts(pipeline):
             console.print(line)
         if self.resume is not None:
-            pipeline.after = files.position()
+            pipeline.after = files.position(skip_damaged=pipeline.settings.run.skip_damaged)
         progress = RunProgress(pipeline)
         try:
             interrupted = self._run(pipeline, files, progress, console)
         finally:
             if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
-                output = [] if files.output is None else [str(files.output)]
-                console.print(progress.summary([*output, *map(redacted, pipeline.results.write)]))
+                results = [] if files.output is None else [str(files.output)]
+                results += map(redacted, pipeline.results.write or ())
+                missing = files.missing()
+                console.print(
+                    progress.summary([place for place in results if not is_file(place) or Path(place).exists()])
+                )
+                if missing:
+                    console.print(f"missing results, which another program removed: {', '.join(missing)}")
         if self.resume is not None and not progress.frames and not interrupted:
             console.print(
                 f"no frames were left to track, the run in {self.resume} is complete: to track the source again, "
@@ -207,8 +215,12 @@ class _Run:
             unsaved = [str(file) for file in pipeline.results.models.values() if file not in saved]
             lost = f"; not saved: {', '.join(unsaved)}" if unsaved else ""
             folder = self.state or self.resume
-            hint = f"; to continue: catstream track --resume {quote(str(folder))}" if folder is not None else ""
-            stopped(f"the results so far are kept{lost}{hint}")
+            hint = ""
+            if folder is not None and contains_run(folder):
+                hint = f"; to continue: catstream track --resume {quote(str(folder))}"
+            elif folder is not None:
+                hint = f"; the state in {folder} was removed, so the run cannot be resumed"
+            stopped(f"{'some results are missing' if files.missing() else 'the results so far are kept'}{lost}{hint}")
 
     def _check_options(self) -> None:
         """Raise UsageError if the options contradict each other."""
@@ -223,6 +235,8 @@ class _Run:
             raise click.UsageError(
                 f"{option} continues the existing results, and --overwrite replaces them: give one of them"
             )
+        if self.write and self.no_write:
+            raise click.UsageError("--write and --no-write are mutually exclusive")
         if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
             raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
 
@@ -240,11 +254,16 @@ class _Run:
             results=Results(  # absolute, to resume from any folder
                 output=self.output and self.output.absolute(),
                 video=self.video,
-                write=tuple(str(Path(it).absolute()) if is_file(it) else it for it in self.write if it != STDOUT),
+                write=() if self.no_write else self._destinations(),
                 models={name: file.absolute() for name, file in self.saved.items()},
                 options=self.options,
             ),
         )
+
+    def _destinations(self) -> tuple[str, ...] | None:
+        """The destinations of `--write`, but standard output; None if there are none."""
+        places = (place for place in self.write if place != STDOUT)
+        return tuple(str(Path(place).absolute()) if is_file(place) else place for place in places) or None
 
     def _files(self, pipeline: Pipeline) -> RunFiles:
         """Everything that the tracks are written to; raise an error if one of the run's files could not be written."""
@@ -270,7 +289,10 @@ class _Run:
             pipeline.source, part, settings.image_rate, keys=settings.keys, options=results.options, head=head
         )
         files = RunFiles(origin, results.output, places)
-        files.check(overwrite=self.overwrite, earlier=places_of(pipeline.name, pipeline.earlier_results))
+        others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
+        if folder := self.state or self.resume:
+            others |= files_of_state(folder)
+        files.check(overwrite=self.overwrite, earlier=places_of(pipeline.name, pipeline.earlier_results), others=others)
         for file in self.saved.values():
             check_result(file, overwrite=self.overwrite, source=pipeline.source, made=files.output)
         return files
@@ -324,7 +346,9 @@ class _Run:
     ) -> None:
         """Write every track to all files, which the stack closes, and show it."""
         endpoint, has_said = pipeline.endpoint, False
-        write = stack.enter_context(files.opened(endpoint, resume=True)) if self.resume is not None else None
+        write, skip_damaged = None, pipeline.settings.run.skip_damaged
+        if self.resume is not None:
+            write = stack.enter_context(files.opened(endpoint, resume=True, skip_damaged=skip_damaged))
         moment = time.perf_counter()
         for tracks in pipeline.by_frame(_REFRESH_SECONDS):
             if not has_said and "detector" in pipeline.health:  # it answers commands from now on

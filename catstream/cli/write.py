@@ -24,7 +24,7 @@ from catstream.processes.options import PATH, NumberRange, combined, with_overwr
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, SINKS, About, Head, Origin, TrackedFrame
 from catstream.sinks.events import KINDS
-from catstream.sinks.track_log import LOGS, is_log, read_frames, read_head
+from catstream.sinks.track_log import LOGS, Log, is_log
 from catstream.video.source import open_source
 
 Command = Callable[..., Any]
@@ -180,9 +180,12 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
     help="Size of the frames, or the video or folder of them, for a LOG without a head, as a CSV file.",
 )
 @click.option("--label", default="", help="Class of all objects; by default, the name of each is its class.")
+@click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of LOG.")
 @with_overwrite
 @with_table(sinks=False)
-def export(log: Path, dest: Path, name: str | None, size: str | None, label: str, overwrite: bool) -> None:
+def export(
+    log: Path, dest: Path, name: str | None, size: str | None, label: str, skip_damaged: bool, overwrite: bool
+) -> None:
     """Make another format from the log of a run.
 
     LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream sink`. The
@@ -203,17 +206,20 @@ def export(log: Path, dest: Path, name: str | None, size: str | None, label: str
     row = destinations.export_of(dest, name)
     if not is_log(log) or not log.is_file():
         raise VideoError(f"{log} is no log of a run: give one of its files, {', '.join(LOGS)}")
-    if next(read_frames(log), None) is None:
-        raise VideoError(f"{log} contains no tracks")
     if row.suffix:
         destinations.check_result(dest, overwrite=overwrite, source=str(log))
-    head = read_head(log) or Head()
+    content = Log(log, skip_damaged=skip_damaged)
+    if next(content.frames(), None) is None:
+        raise VideoError(f"{log} contains no tracks")
+    head = content.head() or Head()
     if head.size and size is not None and _size(size) != head.size:
         raise VideoError(
             f"--size {size} contradicts the head of {log}, whose frames are {head.size[0]}x{head.size[1]}: omit --size"
         )
     about = About(log.stem, head.size or (None if size is None else _size(size)), label, head)
-    destinations.export((frame for frame, _ in read_frames(log)), dest, row, about)
+    destinations.export(content.frames(), dest, row, about)
+    if content.damaged:
+        click.echo(f"{counted(content.damaged, 'damaged line')} of {log} skipped", err=True)
 
 
 def _size(text: str) -> tuple[int, int]:

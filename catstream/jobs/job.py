@@ -62,7 +62,9 @@ class SinkOptions:
 class Results:
     """The files that `catstream track` writes for a run; a resumed run continues the same files.
 
-    output      folder of the results files, None for none
+    None stands for no file in a new run, and for the earlier ones in a resumed run.
+
+    output      folder of the results files
     video       whether an annotated video is among the results files
     write       further destinations of tracks, see `catstream.sinks.destinations`
     models      files for what was learned of each object, by name; a file without a name is for the only object
@@ -70,8 +72,8 @@ class Results:
     """
 
     output: Path | None = None
-    video: bool = False
-    write: tuple[str, ...] = field(default=(), repr=False)  # an address may contain a password
+    video: bool | None = None
+    write: tuple[str, ...] | None = field(default=None, repr=False)  # an address may contain a password
     models: dict[str, Path] = field(default_factory=dict)
     options: SinkOptions = field(default_factory=SinkOptions)
 
@@ -79,8 +81,8 @@ class Results:
         """These files, and of a kind of which there is none those of the earlier part of the run."""
         return Results(
             output=self.output or earlier.output,
-            video=self.video or earlier.video,
-            write=self.write or earlier.write,
+            video=earlier.video if self.video is None else self.video,
+            write=earlier.write if self.write is None else self.write,
             models=self.models or earlier.models,
             options=self.options if self.options != SinkOptions() else earlier.options,
         )
@@ -96,7 +98,6 @@ class Job:
     part      the frames of the source that are followed
     settings  all settings
     size      width and height of a frame, None if that is not known yet
-    started   seconds since 1970 at which the run first started
     results   files that `catstream track` writes
     paused    whether the run starts paused, until the command `resume`
     network   digest of the file `features.network`, empty if there is none, or the processes were started by hand
@@ -117,7 +118,6 @@ class Job:
     part: slice = field(default_factory=lambda: slice(None))
     settings: Settings = field(default_factory=Settings)
     size: tuple[int, int] | None = None
-    started: float = 0.0
     results: Results = Results()
     paused: bool = False
     network: str = ""

@@ -50,6 +50,11 @@ def contains_run(folder: Path) -> bool:
     return (folder / _SMALL[0]).exists()
 
 
+def files_of_state(folder: Path) -> dict[str, Path]:
+    """The folder and the files in it that nothing else may write, by their purpose."""
+    return {"the state folder": folder} | {f"{name} of the state": folder / name for name in (*_SMALL, TREES)}
+
+
 def last_seq(folder: Path) -> int:
     """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
     return CheckpointStore(folder / TREES).position()[0]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from itertools import groupby
@@ -10,9 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from catstream.base.box import Box
+from catstream.base.files import open_locked, writing
+from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, Head, Origin, TrackedFrame
+from catstream.sinks.reports import Warnings
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
 #: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.
@@ -28,36 +33,100 @@ _CREATE = f"CREATE TABLE IF NOT EXISTS tracks ({_TYPES}, PRIMARY KEY (frame, obj
 _INSERT = f"INSERT OR REPLACE INTO tracks ({_NAMES}) VALUES ({', '.join('?' for _ in COLUMNS)})"
 
 
+#: Frames that wait for a locked database at most.
+_MOST_WAITING = 1 << 16
+
+_CLOSE_SECONDS = 5.0  # wait for a locked database at the end
+
+
+class _LockedError(VideoError):
+    """Another program has locked the database."""
+
+
 class SqliteSink:
     """A table with the tracks of each frame at once; what was written remains, however this process ends.
 
-    An existing file is replaced; if the run is resumed, the frames after `origin.last` are deleted. `last` is the
-    number of the last frame in it, -1 for none.
+    An existing file is replaced, unless it is a log that is continued. While another program locks the database, frames
+    wait in memory, `_MOST_WAITING` at most; the oldest ones beyond that are missed. If the file is removed or renamed,
+    that is logged, and a new one continues.
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
-        self._place = place
-        if origin.last < 0:
+        self._place, self._head, self._warnings = place, origin.head, Warnings(place)
+        self._waiting: deque[TrackedFrame] = deque()
+        self._missed = 0
+        self._database: sqlite3.Connection | None = None
+        self._lock = open_locked(Path(place), VideoError, None)
+        if origin.last is None:
             for part in ("", "-wal", "-shm"):
                 Path(f"{place}{part}").unlink(missing_ok=True)
-        with _errors(place), ExitStack() as stack:
-            self._database = stack.enter_context(closing(sqlite3.connect(place)))
-            self._database.execute("PRAGMA journal_mode = WAL")  # nobody who reads makes the run wait
-            self._database.execute("PRAGMA synchronous = NORMAL")
-            with self._database:
-                create(self._database, origin.head)
-                self._database.execute("DELETE FROM tracks WHERE frame > ?", (origin.last,))
-            (self.last,) = self._database.execute("SELECT ifnull(max(frame), -1) FROM tracks").fetchone()
-            stack.pop_all()
+            self._lock.close()
+            self._lock = open_locked(Path(place), VideoError)
+        self._flush()
 
     def write(self, frame: TrackedFrame) -> None:
-        """Add the rows of a frame, all or none."""
-        with _errors(self._place), self._database:
-            self._database.executemany(_INSERT, rows([frame]))
+        """Add the rows of a frame, all or none, after those that wait."""
+        self._waiting.append(frame)
+        if len(self._waiting) > _MOST_WAITING:
+            self._waiting.popleft()
+            self._missed += 1
+        self._flush()
 
     def close(self) -> None:
-        with _errors(self._place):
+        """Close the database; VideoError if it is still locked after some seconds."""
+        try:
+            self._flush(_CLOSE_SECONDS)
+            if lost := len(self._waiting) + self._missed:
+                raise VideoError(
+                    f"{self._place} lacks {counted(lost, 'frame')}, as another program locked it: if the run has an "
+                    "NDJSON log, catstream export makes it again"
+                )
+        finally:
+            with _errors(self._place), self._lock:
+                if self._database is not None:
+                    self._database.close()
+
+    def _flush(self, seconds: float = 0.0) -> None:
+        """Write the frames that wait; a locked database is tried for some seconds."""
+        try:
+            with _errors(self._place):
+                self._follow()
+                self._database = self._database or self._connect()
+                self._database.execute(f"PRAGMA busy_timeout = {1000 * seconds:.0f}")
+                with self._database:
+                    self._database.executemany(_INSERT, rows(self._waiting))
+        except _LockedError:
+            self._warnings.warn("locked by another program; frames wait in memory")
+            return
+        except VideoError:
+            self._waiting.clear()
+            raise
+        self._waiting.clear()
+        self._warnings.warn("")
+
+    def _connect(self) -> sqlite3.Connection:
+        with ExitStack() as stack:
+            database = stack.enter_context(closing(sqlite3.connect(self._place, timeout=0)))
+            database.execute("PRAGMA journal_mode = WAL")  # nobody who reads makes the run wait
+            database.execute("PRAGMA synchronous = NORMAL")
+            with database:
+                create(database, self._head)
+            stack.pop_all()
+        return database
+
+    def _follow(self) -> None:
+        """Open a new file if another program has removed or renamed the file."""
+        path = Path(self._place)
+        if path.exists() and os.path.samestat(path.stat(), os.fstat(self._lock.fileno())):
+            return
+        self._warnings.tell("removed or renamed by another program; the log goes on there without the rows before")
+        if self._database is not None:
             self._database.close()
+        self._database = None
+        self._lock.close()
+        with writing(path, VideoError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = open_locked(path, VideoError, None)
 
 
 def create(database: sqlite3.Connection, head: Head) -> None:
@@ -116,4 +185,6 @@ def _errors(place: str | Path, what: str = "write") -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
+        if error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED) and what == "write":
+            raise _LockedError(f"{place} is locked by another program: close it there") from None
         raise VideoError(f"cannot {what} {place}: {error}") from None

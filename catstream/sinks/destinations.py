@@ -21,12 +21,13 @@ import msgspec
 
 from catstream.base.addresses import without_password
 from catstream.base.box import Box
-from catstream.base.files import check_file, writing
+from catstream.base.files import check_file, check_unlocked, writing
 from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.video.frames import RATE
-from catstream.video.source import ALL_FRAMES
+from catstream.video.images import IMAGES
+from catstream.video.source import ALL_FRAMES, VIDEOS
 
 #: Stands for standard output.
 STDOUT = "-"
@@ -54,6 +55,7 @@ class Head:
     """The first line of an NDJSON log, as JSON, and the table `head` of a database: the run that its tracks are of.
 
     catstream  version of the format of the log
+    frame      -1: a program that reads the number of the frame in each line meets the head before frame 0
     source     path or address of the source, without a password; empty beside a running pipeline
     size       width and height of a frame, pixels; None if unknown
     rate       frames per second of the source; None if unknown
@@ -66,6 +68,7 @@ class Head:
     """
 
     catstream: int = FORMAT
+    frame: int = -1
     source: str = ""
     size: tuple[int, int] | None = None
     rate: float | None = None
@@ -106,7 +109,8 @@ class Origin:
     image_rate  frames per second of a folder of images
     endpoint    of the running pipeline, for a sink that receives other messages, too
     keys        folder of the keys for this endpoint
-    last        number of the last frame in the log of a run that is resumed; -1 for a new run
+    last        last frame of the file if it is a log that is continued; None for a new file
+    size        number of bytes up to the end of that frame
     options     of the destinations, beside their addresses
     head        first line of a log
     """
@@ -116,7 +120,8 @@ class Origin:
     image_rate: float = RATE
     endpoint: str = ""
     keys: str = ""
-    last: int = -1
+    last: TrackedFrame | None = None
+    size: int = 0
     options: SinkOptions = field(default_factory=SinkOptions)
     head: Head = field(default_factory=Head)
 
@@ -140,9 +145,8 @@ class About:
 class Sink(Protocol):
     """Takes the frames in their order; made as `Class(place, origin)`.
 
-    A sink may have the attribute `last`, the number of the last frame that it holds, -1 for none: when a run is
-    resumed, it gets all later frames of the log first. Its class may have a function `check(place, options)`, which
-    raises VideoError before the run if the address or an option is not valid.
+    Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
+    option is not valid.
     """
 
     def write(self, frame: TrackedFrame) -> None:
@@ -156,12 +160,12 @@ class Sink(Protocol):
 class Row:
     """A row of the table.
 
-    home     the class of a sink, or the function `export(frames, path, about)`
-    meaning  a line of the help
-    suffix   of the file of an export; empty for a folder
-    sized    whether an export needs the size of a frame
-    extra    the extra that it needs
-    repeats  whether a sink can be continued, or made again from the log, when a run is resumed
+    home         the class of a sink, or the function `export(frames, path, about)`
+    meaning      a line of the help
+    suffix       of the file of an export; empty for a folder
+    sized        whether an export needs the size of a frame
+    extra        the extra that it needs
+    follows_log  whether a file is a log, or is made again from the log when a run is resumed
     """
 
     home: str
@@ -169,7 +173,7 @@ class Row:
     suffix: str = ""
     sized: bool = False
     extra: str = ""
-    repeats: bool = True
+    follows_log: bool = False
 
     def load(self) -> Any:
         """Import the class or function; raises MissingExtraError if its extra is not installed."""
@@ -181,16 +185,18 @@ class Row:
 
 #: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
 SINKS = {
-    ".ndjson": Row("track_log.NdjsonSink", "one JSON object per line, with the fields of a track"),
-    STDOUT: Row("track_log.StdoutSink", "the same, on standard output", repeats=False),
-    ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
-    ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
-    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
+    ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a head", follows_log=True),
+    STDOUT: Row("track_log.StdoutSink", "the same, without the head, on standard output"),
+    ".csv": Row(
+        "track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ...", follows_log=True
+    ),
+    ".sqlite": Row(
+        "database.SqliteSink", "the table tracks of a database, which others read meanwhile", follows_log=True
+    ),
+    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in", follows_log=True),
     "rtsp://": Row("restream.StreamSink", "the pictures with their boxes, live, to an RTSP server, as H.264"),
     "rtmp://": Row("restream.StreamSink", "the same to an RTMP server"),
-    ".mcap": Row(
-        "mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap", repeats=False
-    ),
+    ".mcap": Row("mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap"),
     "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker", extra="mqtt"),
     "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt"),
     "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
@@ -238,9 +244,12 @@ def is_file(place: str) -> bool:
 
 
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
-    """Raise VideoError if a file is the source of the frames, or as `storage.check_file` does."""
+    """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does."""
     if source and path.exists() and Path(source).exists() and path.samefile(source):
         raise VideoError(f"{path} is the source, which would be lost: give another name or folder")
+    if Path(source).is_dir() and path.exists() and path.suffix in VIDEOS | IMAGES and Path(source) in path.parents:
+        raise VideoError(f"{path} is in the folder of the source, and may be its video: give another name or folder")
+    check_unlocked(path, VideoError)
     check_file(path, overwrite=overwrite, made=made, kind=VideoError)
 
 

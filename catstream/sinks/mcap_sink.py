@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from catstream.base.files import writing
+from catstream.base.files import open_locked, writing
 from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Health, Model, Preview
@@ -38,8 +38,7 @@ class McapSink:
 
         self._place = place
         with ExitStack() as stack:
-            with writing(place, VideoError):
-                file = stack.enter_context(Path(place).open("wb"))
+            file = stack.enter_context(open_locked(Path(place), VideoError, mode="ab"))
             self._writer = Writer(file)
             self._writer.start("catstream")
             self._topics: dict[str, int] = {}

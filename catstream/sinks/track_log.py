@@ -1,4 +1,7 @@
-"""The log of tracks, NDJSON and CSV files that grow line by line, and all files of a run, which it continues.
+"""The log of tracks: NDJSON and CSV files that grow line by line, and all results of a run, which it continues.
+
+NDJSON is the log. CSV, SQLite and the annotated video follow it while the run goes on, and are made again from it when
+the run is resumed; only if a run writes no NDJSON, the database or the CSV file is its log.
 
 A power cut or a full disk can cut a file within a frame of several objects. In each frame, the objects that were not in
 the frame before come first, so a last frame that has all objects of the frame before it is whole. Any other last frame
@@ -7,22 +10,25 @@ counts as not written: it is cut, and tracked again.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
-from math import isnan, nan
+from itertools import groupby, pairwise
+from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import IO, get_args
 
 from catstream.base.addresses import without_password
 from catstream.base.box import Box
-from catstream.base.files import writing
+from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
+from catstream.base.text import listed
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import State, Track
@@ -30,6 +36,7 @@ from catstream.sinks.database import read_database, read_database_head
 from catstream.sinks.destinations import (
     Head,
     Origin,
+    Sink,
     TrackedFrame,
     check_result,
     check_sink,
@@ -37,6 +44,7 @@ from catstream.sinks.destinations import (
     open_sink,
     sink_of,
 )
+from catstream.sinks.reports import Warnings
 from catstream.video.source import is_live
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
@@ -44,30 +52,24 @@ _STATES: dict[str, State] = {state: state for state in get_args(State)}
 #: Stands for the objects of the frame before the first one: an object without a name is written last.
 _FIRST = frozenset({UNNAMED})
 
+_COLUMNS = (
+    *("frame", "seconds", "state", "x", "y", "w", "h"),
+    *("score", "model_version", "object", "source_frame", "processing"),
+)
+_OPTIONAL = {"source_frame", "processing"}
+
 
 class LineSink(ABC):
     """A file with a line for each track. What was written remains, however this process ends.
 
-    An existing file is replaced; if the run is resumed, it is cut after the frame `origin.last` and continued. `last`
-    is the number of the last frame in it, -1 for none.
+    An existing file is replaced, or continued after its first `origin.size` bytes. If it is removed, renamed or
+    truncated meanwhile, that is logged, and a file with a first line of its own continues.
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
-        self.path, self.last, self._before = Path(place), -1, _FIRST
-        end = 0
-        for frame, after in whole_frames(self.path) if origin.last >= 0 else ():
-            if frame.number > origin.last:
-                break
-            self.last, self._before, end = frame.number, _objects(frame), after
-        with writing(self.path, VideoError), ExitStack() as stack:
-            if end:
-                os.truncate(self.path, end)
-            self._file = self._open("a" if end else "w")
-            if (first := self.first_line(origin)) and not end:  # a file with no room for it is closed and removed
-                stack.callback(self.path.unlink)
-                stack.enter_context(self._file)
-                self._file.write(f"{first}\n")
-                stack.pop_all()
+        self.path, self._origin = Path(place), origin
+        self._before = _FIRST if origin.last is None else _objects(origin.last)
+        self._open(origin.size)
 
     @abstractmethod
     def first_line(self, origin: Origin) -> str:
@@ -77,25 +79,44 @@ class LineSink(ABC):
     def line(self, track: Track, seconds: float) -> str:
         """Return the line of a track, without its line end."""
 
-    @staticmethod
-    @abstractmethod
-    def parse(line: str) -> tuple[Track, float]:
-        """Return what `line` got; raise ValueError, KeyError or TypeError if it is no such line."""
-
     def write(self, frame: TrackedFrame) -> None:
         """Add the lines of a frame, in one write."""
+        self._follow()
         tracks = sorted(frame.tracks, key=lambda track: track.object in self._before)
         self._before = _objects(frame)
         with writing(self.path, VideoError):
             self._file.write("".join(f"{self.line(track, frame.seconds)}\n" for track in tracks))
+        self._status = os.fstat(self._file.fileno())
 
     def close(self) -> None:
         """Close the file; a line for which the disk had no room is tried again."""
         with writing(self.path, VideoError):
             self._file.close()
 
-    def _open(self, mode: str) -> IO[str]:
-        return self.path.open(mode, encoding="utf-8", buffering=1)
+    def _open(self, size: int) -> None:
+        self._file: IO[str] = open_locked(self.path, VideoError, size, encoding="utf-8", buffering=1)
+        with writing(self.path, VideoError), ExitStack() as stack:
+            if (first := self.first_line(self._origin)) and not size:  # a file with no room for it is removed
+                stack.callback(self.path.unlink)
+                stack.enter_context(self._file)
+                self._file.write(f"{first}\n")
+                stack.pop_all()
+        self._status = os.fstat(self._file.fileno())
+
+    def _follow(self) -> None:
+        """Open a new file if another program has removed, renamed or truncated the file."""
+        rest, problem = 0, "removed or renamed"
+        with suppress(OSError):
+            status = self.path.stat()
+            if os.path.samestat(status, self._status):
+                if status.st_size >= self._status.st_size:
+                    return
+                rest, problem = self.path.read_bytes().rfind(b"\n") + 1, "truncated"
+        Warnings(str(self.path)).tell(f"{problem} by another program; the log goes on there without the rows before")
+        self._file.close()
+        with writing(self.path, VideoError):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._open(rest)
 
 
 class NdjsonSink(LineSink):
@@ -107,34 +128,28 @@ class NdjsonSink(LineSink):
     def line(self, track: Track, _: float) -> str:
         return json.dumps(track.to_dict())
 
-    @staticmethod
-    def parse(line: str) -> tuple[Track, float]:
-        fields = json.loads(line)
-        known = {name: value for name, value in fields.items() if name in Track.__dataclass_fields__}
-        return Track(**{**known, "box": fields["box"] and Box(*fields["box"])}), nan
-
 
 class StdoutSink(NdjsonSink):
     """The tracks on standard output, without a head; each frame is seen at once."""
 
-    def __init__(self, _: str, __: Origin) -> None:
-        super().__init__("standard output", Origin())
-        self.last = sys.maxsize  # what a run has printed before it was resumed is not repeated
+    def __init__(self, _: str, origin: Origin) -> None:
+        super().__init__("standard output", origin)
 
     def first_line(self, _: Origin) -> str:
         return ""
 
-    def _open(self, _: str) -> IO[str]:
-        return os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", buffering=1)
+    def _open(self, _: int) -> None:
+        self._file = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", buffering=1)
+
+    def _follow(self) -> None:
+        pass
 
 
 class CsvSink(LineSink):
     """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known."""
 
-    header = "frame,seconds,state,x,y,w,h,score,model_version,object,source_frame,processing"
-
     def first_line(self, _: Origin) -> str:
-        return self.header
+        return ",".join(_COLUMNS)
 
     def line(self, track: Track, seconds: float) -> str:
         box = ",,," if track.box is None else ",".join(f"{side:.4f}" for side in track.box)
@@ -142,21 +157,6 @@ class CsvSink(LineSink):
         score = f"{track.score:.6f},{track.model_version}"
         return f"{track.frame},{track.time:.6f},{track.state},{box},{score},{track.object},{track.source_frame},{took}"
 
-    @staticmethod
-    def parse(line: str) -> tuple[Track, float]:
-        """The track has no `pts`, which is not in the file, and the `seq` of a run without a skipped frame."""
-        frame, seconds, state, x, y, w, h, score, version, name, source, took = line.removesuffix("\n").split(",")
-        box = Box(*map(float, (x, y, w, h))) if x else None
-        number, name = int(frame), check_name(name)
-        track = Track(
-            *(number + 1, number, float(seconds), _STATES[state], box, float(score), int(version)),
-            object=name,
-            source_frame=int(source),
-        )
-        return track, float(took or nan)
-
-
-_LOGS: dict[str, type[LineSink]] = {".ndjson": NdjsonSink, ".csv": CsvSink}
 
 #: The suffixes of all logs; of several, a run is continued after the first one that exists.
 LOGS = (".ndjson", ".sqlite", ".csv")
@@ -167,56 +167,153 @@ def is_log(path: Path) -> bool:
     return path.suffix in LOGS
 
 
-def read_head(path: Path) -> Head | None:
-    """Return the head of a log; None if it has none, as a CSV file.
+class Log:
+    """A log, from which the tracks of a run are read. It may grow meanwhile.
 
-    VideoError if another version of the format wrote it.
+    A line that was cut at the end of the file counts as not written. VideoError for any other line that is no track,
+    with its number; if `skip_damaged`, such lines are skipped.
+
+    damaged  number of lines that were skipped
     """
-    if path.suffix == ".sqlite":
-        return read_database_head(path)
-    with path.open("rb") as file:
-        return Head.from_json(file.readline())
+
+    def __init__(self, path: Path, *, skip_damaged: bool = False) -> None:
+        self.path, self.damaged, self._skip = path, 0, skip_damaged
+
+    def head(self) -> Head | None:
+        """Read the head; None if there is none, as in a CSV file. VideoError if another version has written it."""
+        if self.path.suffix == ".sqlite":
+            return read_database_head(self.path)
+        with self.path.open("rb") as file:
+            return Head.from_json(file.readline())
+
+    def frames(self) -> Iterator[TrackedFrame]:
+        """Yield the frames in their order, in whichever order the rows are; none if there is no file.
+
+        VideoError if an object has two rows in a frame.
+        """
+        if self.path.suffix == ".sqlite":
+            yield from read_database(self.path)
+            return
+        rows: Iterator[tuple[Track, float]] = ((track, seconds) for track, seconds, _ in self._rows())
+        if any(one.frame > other.frame for (one, _), (other, _) in pairwise(rows)):
+            rows = iter(sorted(((track, seconds) for track, seconds, _ in self._rows()), key=lambda row: row[0].frame))
+        else:
+            rows = ((track, seconds) for track, seconds, _ in self._rows())
+        for number, group in groupby(rows, lambda row: row[0].frame):
+            tracks, seconds = zip(*group, strict=True)
+            names = [track.object for track in tracks]
+            if twice := {name for name in names if names.count(name) > 1}:
+                raise VideoError(f"{self.path} has two rows of {listed(sorted(twice))} in frame {number}: remove one")
+            yield TrackedFrame([*tracks], seconds[-1])
+
+    def whole_frames(self) -> Iterator[tuple[TrackedFrame, int]]:
+        """Yield each frame, and the byte at which it ends; except for a last one that may be incomplete."""
+        if self.path.suffix == ".sqlite":  # a frame is one transaction
+            yield from ((frame, 0) for frame in read_database(self.path))
+            return
+        last: tuple[TrackedFrame, int] | None = None
+        before = _FIRST
+        for _, group in groupby((row for row in self._rows() if row[2]), lambda row: row[0].frame):
+            if last is not None:
+                yield last
+                before = _objects(last[0])
+            rows = [*group]
+            last = TrackedFrame([track for track, _, _ in rows]), rows[-1][2]
+        if last is not None and before <= _objects(last[0]):
+            yield last
+
+    def last_whole_frame(self) -> tuple[TrackedFrame | None, int]:
+        """Return the last one of them, None if there is none, and the byte at which it ends."""
+        return next(iter(deque(self.whole_frames(), maxlen=1)), (None, 0))
+
+    def _rows(self) -> Iterator[tuple[Track, float, int]]:
+        """Yield each track, the processing time of its frame, and the byte at which its line ends; 0 without an end."""
+        self.damaged = 0
+        if not self.path.exists():
+            return
+        parse, end, problem, is_cut = self._parser(), 0, "", False
+        with self.path.open("rb") as file:
+            for number, line in enumerate(file, 1):
+                end += len(line)
+                if number == 1 and _is_first_line(self.path, line):
+                    continue
+                if problem:
+                    self._report(problem)
+                    problem = ""
+                try:
+                    track, seconds = parse(line.decode())
+                except (KeyError, TypeError, ValueError) as error:
+                    problem = f"{self.path}, line {number} is no track ({error})"
+                    is_cut = not line.endswith(b"\n") or not line.strip()
+                else:
+                    yield track, seconds, end if line.endswith(b"\n") else 0
+        if problem and not is_cut:
+            self._report(problem)
+
+    def _report(self, problem: str) -> None:
+        """Count a damaged line, or raise an error if they are not to be skipped."""
+        if not self._skip:
+            raise VideoError(f"{problem}: pass --skip-damaged to continue after it")
+        self.damaged += 1
+
+    def _parser(self) -> Callable[[str], tuple[Track, float]]:
+        """Return the function that parses a line; VideoError if the names of the columns of a CSV file are wrong."""
+        if self.path.suffix != ".csv":
+            return _parse_json
+        with self.path.open(encoding="utf-8-sig", errors="replace") as file:
+            first = file.readline().strip()
+        separator = max(",;\t", key=first.count)
+        columns = [column.strip().lower() for column in next(csv.reader([first], delimiter=separator), [])]
+        if first and (missing := [column for column in _COLUMNS if column not in (*columns, *_OPTIONAL)]):
+            raise VideoError(f"{self.path} lacks the column {listed(missing)}: its first line has to name the columns")
+
+        def parse(line: str) -> tuple[Track, float]:
+            values = next(csv.reader([line.strip("\r\n")], delimiter=separator), [])
+            if len(values) < len(columns):
+                raise ValueError(f"{len(values)} values for {len(columns)} columns")
+            return _parse_row(dict(zip(columns, values, strict=False)))
+
+        return parse
 
 
-def _is_first_line(line: bytes) -> bool:
-    """Whether a line is that before the tracks: the head, or the names of the columns."""
-    return line.startswith((b'{"catstream":', b"frame,"))
+def _is_first_line(path: Path, line: bytes) -> bool:
+    """Whether the first line of a file is the head, or the names of the columns."""
+    return path.suffix == ".csv" or Head.from_json(line) is not None
 
 
-def read_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
-    """Yield each frame of a log, and the byte at which it ends, up to the first line that is incomplete."""
-    if path.suffix == ".sqlite":
-        yield from ((frame, 0) for frame in read_database(path))
-        return
-    kind = _LOGS[path.suffix]
-    tracks: list[Track] = []
-    seconds = nan
-    with suppress(FileNotFoundError), path.open("rb") as file:
-        end = len(first) if _is_first_line(first := file.readline()) else 0
-        file.seek(end)
-        for line in file:
-            try:
-                track, took = kind.parse(line.decode())
-            except (KeyError, TypeError, ValueError):  # a power cut can leave zeros at the end
-                break
-            if not line.endswith(b"\n"):
-                break
-            if tracks and track.frame != tracks[0].frame:
-                yield TrackedFrame(tracks, seconds), end
-                tracks = []
-            tracks.append(track)
-            seconds, end = took, end + len(line)
-        if tracks:
-            yield TrackedFrame(tracks, seconds), end
+def _parse_json(line: str) -> tuple[Track, float]:
+    """The track of a line; raise ValueError, KeyError or TypeError if it is none. Other fields are ignored."""
+    fields = json.loads(line)
+    known = {name: value for name, value in fields.items() if name in Track.__dataclass_fields__}
+    return Track(**{**known, "box": fields["box"] and Box(*fields["box"])}), nan
 
 
-def whole_frames(path: Path) -> Iterator[tuple[TrackedFrame, int]]:
-    """Yield the same, except for a last frame that may be incomplete."""
-    before = _FIRST
-    for each, later in pairwise(chain(read_frames(path), [None])):
-        if each is not None and (later is not None or before <= _objects(each[0])):
-            yield each
-            before = _objects(each[0])
+def _parse_row(row: Mapping[str, str]) -> tuple[Track, float]:
+    """The same of a row of a CSV file. The track has no `pts`, `began` and `doubtful`, which are not in the file."""
+    box = Box(*(_number(row[side]) for side in "xywh")) if row["x"] else None
+    frame = _integer(row["frame"])
+    track = Track(
+        *(frame + 1, frame, _number(row["seconds"]), _STATES[row["state"]], box, _number(row["score"])),
+        model_version=_integer(row["model_version"]),
+        object=check_name(row["object"]),
+        source_frame=_integer(row.get("source_frame") or "-1"),
+    )
+    return track, _number(row["processing"]) if row.get("processing") else nan
+
+
+def _number(text: str) -> float:
+    if "," in text:
+        raise ValueError(f"{text!r} has a decimal comma: save the table with decimal points")
+    if not isfinite(number := float(text)):
+        raise ValueError(f"{text!r} is no number")
+    return number
+
+
+def _integer(text: str) -> int:
+    """A whole number, which pandas writes as 5.0 if other rows lack it."""
+    if not (number := _number(text)).is_integer():
+        raise ValueError(f"{text!r} is no whole number")
+    return int(number)
 
 
 def _objects(frame: TrackedFrame) -> frozenset[str]:
@@ -227,16 +324,15 @@ def places_of(name: str, results: Results) -> list[str]:
     """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
     kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
     own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
-    return [*dict.fromkeys([*own, *results.write])]
+    return [*dict.fromkeys([*own, *(results.write or ())])]
 
 
 @dataclass(frozen=True, slots=True)
 class RunFiles:
     """All destinations of a run.
 
-    A resumed run continues after the last frame that its log holds whole: an NDJSON file or a database, which have all
-    digits, or else a CSV file. All its logs are cut after that frame; one that is shorter or new gets the frames that
-    it lacks from the first one, and a video is drawn again.
+    A resumed run continues after the last whole frame of its log: the NDJSON file, or without one the database or the
+    CSV file. The other files are made again from the log.
 
     origin  the source of the run, and the frames that are tracked
     output  folder of the results, which is made; None for none
@@ -247,12 +343,15 @@ class RunFiles:
     output: Path | None
     places: list[str]
 
-    def check(self, *, overwrite: bool, earlier: list[str]) -> None:
+    def check(self, *, overwrite: bool, earlier: list[str], others: Mapping[str, Path] | None = None) -> None:
         """Raise VideoError or MissingExtraError before the run if a destination cannot be written, or must not be.
 
-        If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued.
+        If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued. All files,
+        also the `others` that the run writes, by their purpose, have to be different.
         """
         source = self.origin.source or ""
+        files = [(f"the destination {place}", Path(place)) for place in self.places if is_file(place)]
+        check_distinct([*files, *(others or {}).items()], VideoError)
         for place in self.places:
             row = sink_of(place)
             check_sink(place, self.origin.options)
@@ -261,15 +360,24 @@ class RunFiles:
                     f"a video needs its frames once more, but {without_password(source)} is live: omit the video"
                 )
             if is_file(place):
-                continued = place in earlier and row.repeats and self._log() is not None
+                continued = place in earlier and row.follows_log and self._log() is not None
                 if place in earlier and not continued and Path(place).exists():
                     raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
                 check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
 
-    def position(self) -> int | None:
-        """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log."""
-        log = self._log()
-        return None if log is None else max((frame.number + 1 for frame, _ in whole_frames(log)), default=0)
+    def position(self, *, skip_damaged: bool = False) -> int | None:
+        """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log.
+
+        VideoError if the log is damaged, unless damaged lines are skipped.
+        """
+        if (path := self._log()) is None:
+            return None
+        last, _ = Log(path, skip_damaged=skip_damaged).last_whole_frame()
+        return 0 if last is None else last.number + 1
+
+    def missing(self) -> list[str]:
+        """Return the files that do not exist, as another program has removed them."""
+        return [place for place in self.places if is_file(place) and not Path(place).exists()]
 
     def make_folder(self) -> None:
         """Make the folder of the results, in which other files of the run may be, too."""
@@ -278,25 +386,32 @@ class RunFiles:
                 self.output.mkdir(parents=True, exist_ok=True)
 
     @contextmanager
-    def opened(self, endpoint: str, *, resume: bool = False) -> Iterator[Callable[[TrackedFrame], None]]:
+    def opened(
+        self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False
+    ) -> Iterator[Callable[[TrackedFrame], None]]:
         """Yield a function that writes a frame everywhere; at the end, everything is closed.
 
         If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
         raise VideoError if a destination cannot be written any more.
         """
-        log = self._log() if resume else None  # before new ones exist, too
-        last = max((frame.number for frame, _ in whole_frames(log)), default=-1) if log is not None else -1
-        origin = replace(self.origin, endpoint=endpoint, last=last)
+        origin = replace(self.origin, endpoint=endpoint)
+        path = self._log() if resume else None  # before new ones exist, too
+        log = None if path is None else Log(path, skip_damaged=skip_damaged)
+        last, size = (None, 0) if log is None else log.last_whole_frame()
         with ExitStack() as stack:
-            sinks = [stack.enter_context(closing(open_sink(place, origin))) for place in self.places]
-            behind = [(sink, sink.last) for sink in sinks if hasattr(sink, "last") and sink.last < last]
-            for frame, _ in read_frames(log) if log is not None and behind else ():
-                for sink, its_last in behind:
-                    if its_last < frame.number:
-                        sink.write(frame)
+
+            def opened(place: str) -> Sink:
+                continued = replace(origin, last=last, size=size) if Path(place) == path else origin
+                return stack.enter_context(closing(open_sink(place, continued)))
+
+            sinks = {place: opened(place) for place in self.places}
+            followers = [sink for place, sink in sinks.items() if sink_of(place).follows_log and Path(place) != path]
+            for frame in log.frames() if log is not None and last is not None and followers else ():
+                for sink in followers:
+                    sink.write(frame)
 
             def write(frame: TrackedFrame) -> None:
-                for sink in sinks:
+                for sink in sinks.values():
                     sink.write(frame)
 
             yield write

@@ -22,7 +22,7 @@ from catstream.cli.track import RunProgress
 from catstream.errors import VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
-from catstream.sinks.track_log import LineSink, read_frames, read_head
+from catstream.sinks.track_log import LineSink, Log
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.ndjson"]
@@ -34,7 +34,7 @@ def table(path):
 
 def frames_of(folder, name="demo"):
     """The frames whose tracks are in the log."""
-    return [frame.number for frame, _ in read_frames(folder / f"{name}.ndjson")]
+    return [frame.number for frame in Log(folder / f"{name}.ndjson").frames()]
 
 
 def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
@@ -47,7 +47,7 @@ def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
     assert {row["state"] for row in rows} <= {"bootstrapping", "present", "absent"}
     head, *tracks = (out / "demo.ndjson").read_text().splitlines()
     assert tracks == (whole_run / "stdout").read_text().splitlines()
-    assert head == read_head(out / "demo.ndjson").to_json()
+    assert head == Log(out / "demo.ndjson").head().to_json()
     assert frames_of(out) == list(range(32))
     with open_source(out / "demo.mp4") as film:
         assert sum(1 for _ in film) == 32
@@ -62,7 +62,7 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
     assert [int(row["frame"]) for row in rows] == list(range(7))
     assert [float(row["seconds"]) for row in rows] == pytest.approx([k / 30 for k in range(4, 32, 4)], abs=1e-3)
     assert [int(row["source_frame"]) for row in rows] == list(range(4, 32, 4))
-    head = read_head(out / "demo.ndjson")
+    head = Log(out / "demo.ndjson").head()
     assert (head.source, head.size, head.rate, head.frames, head.start, head.stride) == (
         source,
         (320, 240),

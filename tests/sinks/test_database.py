@@ -13,8 +13,8 @@ import pytest
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
-from catstream.sinks.track_log import RunFiles, read_frames
+from catstream.sinks.destinations import Head, Origin, TrackedFrame, open_sink
+from catstream.sinks.track_log import Log, RunFiles
 
 TRACKS = [
     Track(1, 0, 0.0, "bootstrapping", Box(1 / 3, 20.0, 30.5, 40.0), 1.0, 0),
@@ -26,16 +26,16 @@ KILLED = """
 import json, os, signal, sys
 from pathlib import Path
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
-from catstream.sinks.track_log import NdjsonSink
+from catstream.sinks.track_log import Log
 sink = open_sink(sys.argv[1], Origin())
-for fields in json.loads(Path(sys.argv[2]).read_text()):
-    sink.write(TrackedFrame([NdjsonSink.parse(json.dumps(fields))[0]]))
+for frame in Log(Path(sys.argv[2])).frames():
+    sink.write(frame)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def read(path):
-    return [frame.tracks for frame, _ in read_frames(path)]
+    return [frame.tracks for frame in Log(path).frames()]
 
 
 def test_each_frame_is_in_the_database_at_once_for_others_who_do_not_block_it(tmp_path):
@@ -54,14 +54,13 @@ def test_each_frame_is_in_the_database_at_once_for_others_who_do_not_block_it(tm
 
 def test_a_database_alone_is_continued_after_the_last_frame_of_a_run_that_was_killed(tmp_path):
     path = tmp_path / "t.sqlite"
-    with (tmp_path / "tracks.json").open("w") as file:
-        json.dump([each.to_dict() for each in (*TRACKS[:2], replace(TRACKS[2], object="ben"))], file)
-    killed = subprocess.run([sys.executable, "-P", "-c", KILLED, path, file.name], check=False)
+    log = tmp_path / "tracks.ndjson"
+    log.write_text("".join(f"{json.dumps(track.to_dict())}\n" for track in TRACKS[:2]))
+    killed = subprocess.run([sys.executable, "-P", "-c", KILLED, path, log], check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert len(read(path)) == 3
     run = RunFiles(Origin(), None, [str(path)])
     run.check(overwrite=False, earlier=run.places)
-    assert run.position() == 2, "the last frame lacks anna, and is tracked again"
+    assert run.position() == 2
     more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
     with more.opened("", resume=True) as write:
         assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS[:2]]
@@ -108,3 +107,41 @@ def test_another_database_is_no_log(tmp_path):
     (tmp_path / "t.sqlite").write_text("no database, but long enough" * 9)
     with pytest.raises(VideoError, match=r"cannot read .*: file is not a database"):
         read(tmp_path / "t.sqlite")
+
+
+def test_frames_wait_while_another_program_locks_the_database_and_are_written_after_it(tmp_path, caplog):
+    path = tmp_path / "t.sqlite"
+    with closing(open_sink(str(path), Origin())) as sink:
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            for track in TRACKS:
+                sink.write(TrackedFrame([track]))
+            assert read(path) == []
+        sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
+        assert [frame.number for frame in Log(path).frames()] == [0, 1, 3, 9]
+    assert [message.rpartition(": ")[2] for message in caplog.messages] == [
+        "locked by another program; frames wait in memory",
+        "is back",
+    ]
+
+
+def test_frames_beyond_those_that_wait_are_counted_and_reported_at_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("catstream.sinks.database._MOST_WAITING", 2)
+    monkeypatch.setattr("catstream.sinks.database._CLOSE_SECONDS", 0.0)
+    path = tmp_path / "t.sqlite"
+    sink = open_sink(str(path), Origin())
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        for track in TRACKS:
+            sink.write(TrackedFrame([track]))
+    sink.write(TrackedFrame([replace(TRACKS[0], frame=9)]))
+    with pytest.raises(VideoError, match="lacks 2 frames, as another program locked it"):
+        sink.close()
+    assert [frame.number for frame in Log(path).frames()] == [3, 9]
+
+
+def test_a_database_has_the_head_of_the_run_and_an_export_keeps_it(tmp_path):
+    head = Head(source="walk.mp4", size=(320, 240), start=100, stride=2)
+    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin(head=head))) as sink:
+        sink.write(TrackedFrame(TRACKS[:1]))
+    assert Log(tmp_path / "t.sqlite").head() == head

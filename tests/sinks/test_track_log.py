@@ -3,8 +3,10 @@
 import csv
 import json
 import os
+import subprocess
+import sys
 import tempfile
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from math import isnan
 from pathlib import Path
@@ -18,7 +20,7 @@ from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
-from catstream.sinks.track_log import RunFiles, places_of, read_frames
+from catstream.sinks.track_log import Log, RunFiles, places_of
 from catstream.video.rendered import write
 from catstream.video.source import open_source
 
@@ -62,12 +64,12 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
         path = filled(tmp_path / f"t{suffix}", stack)
         kept = [replace(each, seq=each.frame + 1, pts=None) for each in TRACKS] if suffix == ".csv" else TRACKS
         whole = path.read_bytes()
-        for torn in (b"", whole.splitlines()[-1][:9] + bytes(7), whole.splitlines()[-1]):
+        for torn in (b"", whole.splitlines()[-1][:9] + bytes(7), bytes(4096), b"\n"):
             path.write_bytes(whole + torn)
-            found = [frame for frame, _ in read_frames(path)]
-            assert [frame.tracks for frame in found] == [[each] for each in kept]
+            found = list(Log(path).frames())
+            assert [frame.tracks for frame in found] == [[track] for track in kept]
         assert isnan(found[1].seconds) if suffix == ".ndjson" else found[1].seconds == 0.25
-    assert list(read_frames(tmp_path / f"none{suffix}")) == []
+    assert list(Log(tmp_path / f"none{suffix}").frames()) == []
 
 
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
@@ -78,7 +80,7 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
     for last in (lambda: sink.write(TrackedFrame(TRACKS[1:2])), sink.close):  # which tries it once more
         with pytest.raises(VideoError, match=rf"cannot write '.*/{name}' \(No space left on device\)"):
             last()
-    assert len(list(read_frames(tmp_path / name))) == 1
+    assert len(list(Log(tmp_path / name).frames())) == 1
 
 
 @pytest.mark.parametrize("disk", [4096], indirect=True)
@@ -137,7 +139,7 @@ def test_an_ndjson_file_that_is_new_when_a_run_is_resumed_gets_the_frames_of_its
     more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
     add(more, [[""]] * 9, first=7, resume=True)
     for place in more.places:
-        assert [frame.number for frame, _ in read_frames(Path(place))] == list(range(9))
+        assert [frame.number for frame in Log(Path(place)).frames()] == list(range(9))
     assert RunFiles(Origin(), None, ["-"]).position() is None, "nothing says which frames there were"
 
 
@@ -204,3 +206,154 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
     sink.close()
     with open_source(str(tmp_path / "walk.mp4")) as frames:
         assert sum(1 for _ in frames) == len(TRACKS)
+
+
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
+@pytest.mark.parametrize("damage", [b"\n", b"\0\0\0\n", b'{"frame": 7}\n', b"7,0.2\n"])
+def test_a_damaged_line_before_the_end_is_an_error_with_its_number_or_skipped(tmp_path, name, damage):
+    log = tmp_path / name
+    add(RunFiles(Origin(), None, [str(log)]), [[""]] * 9)
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join([*lines[:5], damage, *lines[5:]]))
+    for read in (lambda: list(Log(log).frames()), RunFiles(Origin(), None, [str(log)]).position):
+        with pytest.raises(VideoError, match=rf"{name}, line 6 is no track .*--skip-damaged"):
+            read()
+    skipping = Log(log, skip_damaged=True)
+    assert [frame.number for frame in skipping.frames()] == list(range(9))
+    assert skipping.damaged == 1
+    assert RunFiles(Origin(), None, [str(log)]).position(skip_damaged=True) == 9
+
+
+COLUMNS = [
+    "frame",
+    "seconds",
+    "state",
+    "x",
+    "y",
+    "w",
+    "h",
+    "score",
+    "model_version",
+    "object",
+    "source_frame",
+    "processing",
+]
+
+
+def table(path, columns, separator=",", change=lambda rows: rows, encoding="utf-8", ending="\n"):
+    """A CSV log of two objects that a table program has written."""
+    rows = [
+        dict(zip(COLUMNS, [frame, frame / 25, "present", x, 20, 30, 40, 0.9, 1, name, 2 * frame, ""], strict=True))
+        for frame in range(5)
+        for x, name in ((10 + frame, "anna"), (200, "ben"))
+    ]
+    lines = [columns, *([str(row.get(column, "?")) for column in columns] for row in change(rows))]
+    path.write_bytes(ending.join(map(separator.join, lines)).encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        {"columns": COLUMNS[::-1]},
+        {"columns": ["", *COLUMNS[:-1], "note"]},
+        {"columns": COLUMNS, "separator": ";", "encoding": "utf-8-sig"},
+        {"columns": COLUMNS, "separator": "\t", "ending": "\r\n"},
+        {"columns": COLUMNS, "change": lambda rows: sorted(rows, key=lambda row: row["object"])},
+        {"columns": COLUMNS, "change": lambda rows: rows[::-1]},
+        {"columns": COLUMNS, "change": lambda rows: [row | {"frame": f"{row['frame']}.0", "model_version": "1.0"} for row in rows]},
+        {"columns": [f'"{column}"' for column in COLUMNS], "change": lambda rows: [{f'"{k}"': f'"{v}"' for k, v in row.items()} for row in rows]},
+    ],
+)  # fmt: skip
+def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp_path, form):
+    frames = list(Log(table(tmp_path / "t.csv", **form)).frames())
+    assert [frame.number for frame in frames] == list(range(5))
+    for frame in frames:
+        boxes = {track.object: track.box for track in frame.tracks}
+        assert boxes == {"anna": Box(10 + frame.number, 20, 30, 40), "ben": Box(200, 20, 30, 40)}
+        assert {track.source_frame for track in frame.tracks} == {2 * frame.number}
+
+
+@pytest.mark.parametrize(
+    ("form", "words"),
+    [
+        ({"columns": COLUMNS[1:]}, "lacks the column frame"),
+        ({"columns": [*COLUMNS[:3], *COLUMNS[5:]]}, "lacks the column x and y"),
+        ({"columns": COLUMNS, "separator": ";", "change": lambda rows: [row | {"x": "1,5"} for row in rows]},
+         "line 2 is no track .*decimal comma"),
+        ({"columns": COLUMNS, "change": lambda rows: [*rows, rows[3]]}, "two rows of ben in frame 1"),
+        ({"columns": COLUMNS, "change": lambda rows: [row | {"frame": 0.5} for row in rows]}, "'0.5' is no whole number"),
+        ({"columns": COLUMNS, "change": lambda rows: [row | {"x": "nan"} for row in rows]}, "line 2 is no track"),
+    ],
+)  # fmt: skip
+def test_a_csv_file_that_is_ambiguous_is_an_error_that_says_what_is_wrong(tmp_path, form, words):
+    with pytest.raises(VideoError, match=words):
+        list(Log(table(tmp_path / "t.csv", **form)).frames())
+
+
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
+def test_a_log_that_another_process_writes_is_refused_with_its_number(tmp_path, name):
+    program = (
+        "import sys; from catstream.sinks.destinations import Origin, open_sink\n"
+        "sink = open_sink(sys.argv[1], Origin()); print('open', flush=True); sys.stdin.read()"
+    )
+    path = tmp_path / name
+    command = [sys.executable, "-P", "-c", program, path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as writer:
+        writer.stdout.readline()
+        run = RunFiles(Origin(), None, [str(path)])
+        for refused in (lambda: run.check(overwrite=True, earlier=[]), lambda: open_sink(str(path), Origin())):
+            with pytest.raises(VideoError, match=rf"{name} is being written by process {writer.pid}: stop it"):
+                refused()
+        writer.kill()
+    run.check(overwrite=True, earlier=[])
+    open_sink(str(path), Origin()).close()
+
+
+@pytest.mark.parametrize("name", ["t.ndjson", "t.csv", "t.sqlite"])
+@pytest.mark.parametrize("change", ["removed", "renamed", "replaced", "folder", "truncated"])
+def test_a_log_that_is_removed_or_truncated_is_written_anew_and_that_is_said_once(tmp_path, caplog, name, change):
+    if (name, change) == ("t.sqlite", "truncated"):
+        pytest.skip("SQLite itself reports a truncated database")
+    path = tmp_path / "out" / name
+    path.parent.mkdir()
+    with closing(open_sink(str(path), Origin())) as sink:
+        for number in range(6):
+            sink.write(TrackedFrame([track(number)]))
+            if number == 2:
+                {
+                    "removed": path.unlink,
+                    "renamed": lambda: path.rename(tmp_path / "t.old"),
+                    "replaced": lambda: (path.unlink(), path.touch()),
+                    "folder": lambda: path.parent.rename(tmp_path / "old"),
+                    "truncated": lambda: os.truncate(path, 0),
+                }[change]()
+    assert [frame.number for frame in Log(path).frames()] == [3, 4, 5]
+    assert b"\0" not in path.read_bytes() or name == "t.sqlite"
+    (message,) = caplog.messages
+    assert "truncated by another program" in message or "removed or renamed by another program" in message
+
+
+def test_csv_and_database_are_made_again_from_the_ndjson_log_when_a_run_is_resumed(tmp_path):
+    places = [str(tmp_path / name) for name in ("t.csv", "t.sqlite", "t.ndjson")]
+    run = RunFiles(Origin(), None, places)
+    add(run, [[""]] * 5)
+    Path(places[0]).write_text("whatever a power cut has left")
+    Path(places[1]).unlink()
+    add(run, [[""]] * 9, first=run.position(), resume=True)
+    for place in places:
+        assert [frame.number for frame in Log(Path(place)).frames()] == list(range(9))
+
+
+def test_all_files_of_a_run_are_different_also_through_links(tmp_path):
+    log = tmp_path / "t.csv"
+    log.touch()
+    for other in (tmp_path / "sub" / ".." / "t.csv", tmp_path / "soft", tmp_path / "hard"):
+        (tmp_path / "sub").mkdir(exist_ok=True)
+        {"soft": lambda path: path.symlink_to(log), "hard": lambda path: path.hardlink_to(log)}.get(other.name, str)(
+            other
+        )
+        with pytest.raises(VideoError, match=r"is both the destination .*t\.csv and the saved model of anna"):
+            RunFiles(Origin(), None, [str(log)]).check(
+                overwrite=True, earlier=[], others={"the saved model of anna": other}
+            )
