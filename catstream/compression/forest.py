@@ -96,10 +96,13 @@ class Forest:
         self._states.append((self.seq, states))
         return samples
 
-    def states_at(self, seq: int) -> dict[str, DetectorState]:
-        """The state of each object's detector after message `seq`, by name; after the nearest one that is kept."""
-        known = [states for number, states in self._states if number <= seq][-1:]
-        return (known or [states for _, states in self._states] or [{}])[0]
+    def states_at(self, seq: int | None) -> dict[str, DetectorState]:
+        """The state of each object's detector after message `seq`, or the newest one, by name.
+
+        If that is not stored any more, after the nearest message of which it is.
+        """
+        before = [states for number, states in self._states if seq is None or number <= seq][-1:]
+        return (before or [states for _, states in self._states] or [{}])[0]
 
     def _add(self, sample: Sample | None, samples: list[Sample]) -> None:
         """Add a sample, if there is one, to those of a frame."""

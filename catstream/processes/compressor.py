@@ -43,7 +43,7 @@ def main(process: Process) -> None:
         if end is None:
             loop.stop()
         else:
-            process.source_failed, process.has_ended = end.failed, True
+            process.ending.receive(end)
 
 
 class CompressorLoop:
@@ -68,7 +68,8 @@ class CompressorLoop:
     def must_stop(self) -> bool:
         """Whether the process was asked to end, and a connected detector did not send its end in time."""
         window = self._features.window
-        return self._process.seconds_since_stop >= (_SENDER_SECONDS if window.connected and not window.ended else 0)
+        seconds = _SENDER_SECONDS if window.connected and not window.ended else 0
+        return self._process.ending.seconds_since_signal >= seconds
 
     def receive(self) -> Features | End | None:
         """The next message, None if none arrives in a tenth of a second."""
@@ -91,7 +92,7 @@ class CompressorLoop:
         before, seq = self._position, self._forest.seq
         is_end = isinstance(message, End)
         features = self._features
-        urgent = is_end or features.window.half_full or bool(features.asking)
+        urgent = is_end or features.window.half_full or bool(features.pending_restarts)
         interval = self._process.settings.run.checkpoint_seconds
         if seq > self._stored and (urgent or checkpoint_is_due(monotonic() - self._tried, self._took, interval)):
             self._store(urgent)

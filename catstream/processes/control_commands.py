@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from catstream.base.names import UNNAMED, check_count, check_name
@@ -15,51 +16,85 @@ from catstream.processes.decisions import DesiredObject, DesiredState
 #: The reason of a stream's end, if a command stopped it.
 STOPPED = "it was stopped by a command"
 
+#: The desired state after a command, and the answer to it.
+Outcome = tuple[DesiredState, Answer]
 
-def carried_out(
+
+def execute(
     command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None = None
-) -> tuple[DesiredState, Answer]:
+) -> Outcome:
     """The desired state after a command that needs no frame, and the answer; `model` begins an object for `search`.
 
-    ObjectError or SettingsError if it cannot be carried out. The `detectors` are not changed.
+    ObjectError or SettingsError if it cannot be executed. The `detectors` are not changed.
     """
-    name, seq, seconds = command.object, detectors.seq, command.seconds or 0.0
-    after = f"after frame {seq - 1}" if seq else "before the first frame"
-    match command.verb:
-        case "pause" if desired.paused or command.seconds is None:
-            desired, effect = replace(desired, paused=True), f"paused {after}"
-        case "pause" if seconds > 0:  # it ends by itself, and changes nothing that is kept
-            effect = f"paused for {seconds:g} s {after}"
-        case "pause" | "resume":
-            desired = replace(desired, paused=False)
-            effect = "waiting for a box" if desired.holds else f"resumed {after}"
-        case "stop":
-            desired, effect = replace(desired, stopped=True), f"the stream ends {after}"
-        case "search":
-            name = object_of(command, desired)
-            check_room(name, desired, detectors.settings.run.objects_most)
-            if model is None:
-                raise ObjectError("a search needs a saved model: give the file of one")
-            desired = desired.begun(name, replace(model, begins=seq + 1))
-            check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
-            effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
-        case "forget":
-            name = _tracked(command, desired)
-            desired = desired.without(name)
-            waits = "" if desired.objects else ": no object is left, so the run waits for a box"
-            effect = f"{listed([name])} is no longer tracked {after}{waits}"
-            return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
-        case _:  # "save": the client writes the file
-            name = _tracked(command, desired)
-            known = detectors.detectors.get(name)
-            if known is None or known.state is None or not known.model.version:
-                why = "nothing was learned of the object yet: try again once there is a model (catstream status)"
-                return desired, answer(command, detectors, False, why, name)
-            if known.state.is_sought:
-                why = "the object of the saved model was not found yet: try again once it was"
-                return desired, answer(command, detectors, False, why, name)
-            effect = f"model {known.model.version} {after}"
+    return _VERBS[command.verb](command, desired, detectors, model)
+
+
+def _pause(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Outcome:
+    if desired.paused or command.seconds is None:
+        return replace(desired, paused=True), answer(command, detectors, True, f"paused {_moment(detectors)}")
+    if command.seconds > 0:  # it ends by itself, and changes nothing that is stored
+        effect = f"paused for {command.seconds:g} s {_moment(detectors)}"
+        return desired, answer(command, detectors, True, effect)
+    return _resume(command, desired, detectors, model)
+
+
+def _resume(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
+    effect = f"resumed {_moment(detectors)}" if desired.objects else "waiting for a box"
+    return replace(desired, paused=False), answer(command, detectors, True, effect)
+
+
+def _stop(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
+    effect = f"the stream ends {_moment(detectors)}"
+    return replace(desired, stopped=True), answer(command, detectors, True, effect)
+
+
+def _search(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Outcome:
+    name, seq = object_of(command, desired), detectors.seq
+    check_room(name, desired, detectors.settings.run.objects_most)
+    if model is None:
+        raise ObjectError("missing saved model: search needs the file of one")
+    desired = desired.begun(name, replace(model, begins=seq + 1))
+    check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
+    effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
     return desired, answer(command, detectors, True, effect, name)
+
+
+def _forget(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
+    name = _tracked(command, desired)
+    desired = desired.without(name)
+    waits = "" if desired.objects else ": no object is left, so the run waits for a box"
+    effect = f"{listed([name])} is no longer tracked {_moment(detectors)}{waits}"
+    return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
+
+
+def _save(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
+    """The client writes the file."""
+    name = _tracked(command, desired)
+    detector = detectors.detectors.get(name)
+    if detector is None or detector.state is None or not detector.model.version:
+        problem = "nothing was learned of the object yet: try again once there is a model (catstream status)"
+    elif detector.state.is_sought:
+        problem = "the object of the saved model was not found yet: try again once it was"
+    else:
+        effect = f"model {detector.model.version} {_moment(detectors)}"
+        return desired, answer(command, detectors, True, effect, name)
+    return desired, answer(command, detectors, False, problem, name)
+
+
+_VERBS: dict[str, Callable[..., Outcome]] = {
+    "pause": _pause,
+    "resume": _resume,
+    "stop": _stop,
+    "search": _search,
+    "forget": _forget,
+    "save": _save,
+}
+
+
+def _moment(detectors: Detectors) -> str:
+    """When a command was executed, in words."""
+    return f"after frame {detectors.seq - 1}" if detectors.seq else "before the first frame"
 
 
 def answer(
@@ -68,18 +103,18 @@ def answer(
     """The answer to a command for the object `name`, by default that of the command."""
     name = command.object if name is None else name
     frame = max(detectors.seq - 1, 0) if frame is None else frame
-    known = detectors.detectors.get(name)
-    box, version = (known.box, known.model.version) if known is not None else (None, 0)
+    detector = detectors.detectors.get(name)
+    box, version = (detector.box, detector.model.version) if detector is not None else (None, 0)
     return Answer(command.id, done, reason, frame, box, version, name)
 
 
 def object_of(command: Command, desired: DesiredState) -> str:
-    """The name of the object that a command is for: without a name, the object that has none, or the only one."""
+    """The name of the object of a command: without a name, the object that has none, or the only one."""
     names = desired.objects
     if command.object or not names or UNNAMED in names:
         return check_name(command.object)
     if len(names) > 1:
-        raise ObjectError(f"which object? This run has {listed(names)}: give a name")
+        raise ObjectError(f"ambiguous object: this run tracks {listed(names)}; pass a name")
     return next(iter(names))
 
 
@@ -89,17 +124,17 @@ def check_room(name: str, desired: DesiredState, most: int) -> None:
         check_count(len(desired.objects) + 1, most)
 
 
-def is_kept(command: Command, name: str, desired: DesiredState, detectors: Detectors) -> bool:
-    """Whether a box is for the same object; one without a model has nothing that could be kept."""
-    known, each = detectors.detectors.get(name), desired.objects.get(name)
-    return command.keep and bool(known and known.model.version and each and each.begins <= detectors.seq)
+def continues(command: Command, name: str, desired: DesiredState, detectors: Detectors) -> bool:
+    """Whether a box continues the same object; one without a model begins again."""
+    detector, current = detectors.detectors.get(name), desired.objects.get(name)
+    return command.keep and bool(detector and detector.model.version and current and current.begins <= detectors.seq)
 
 
 def _tracked(command: Command, desired: DesiredState) -> str:
     """The name of the object that a command is for; ObjectError if there is no such object."""
     name, names = object_of(command, desired), desired.objects
     if not names:
-        raise ObjectError("no object is tracked yet: give one a box first (set-box), or a saved model (search)")
+        raise ObjectError("no object is tracked yet: set the box of one (set-box), or search for a saved model")
     if name not in names:
-        raise ObjectError(f"there is no object {name!r}: the objects are {listed(names)}")
+        raise ObjectError(f"there is no object {name!r}: this run tracks {listed(names)}")
     return name

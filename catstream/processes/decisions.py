@@ -5,6 +5,7 @@ The desired state is what commands have set. It is kept on disk, for a detector 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from catstream.messages.kinds import DetectorState, Position
 #: Name of the file of the desired state, in the folder of the state.
 DESIRED = "desired_state.json"
 
+_MOST_SAMPLES = 65536  # changes of the newest samples that are remembered until they are due
 _REST = 9.0  # from one checkpoint to the next, times the duration of the last one
 
 
@@ -29,7 +31,7 @@ class DesiredObject:
 
     box     the object in its first frame; the last box in the saved model if the object begins with one
     begins  seq of the message of its first frame
-    model   name of the saved model that it begins with, see `catstream.processes.outputs.ModelFiles`; empty without one
+    model   name of the saved model that it begins with, see `catstream.processes.model_files`; empty without one
     size    bytes of the saved model
     version of the saved model
     """
@@ -53,11 +55,6 @@ class DesiredState:
     objects: dict[str, DesiredObject] = field(default_factory=dict)
     paused: bool = False
     stopped: bool = False
-
-    @property
-    def holds(self) -> bool:
-        """Whether no frames are tracked: the run is paused, or waits for a box."""
-        return self.paused or not self.objects
 
     def begun(self, name: str, each: DesiredObject) -> DesiredState:
         """The state after an object has begun, in the place of another one of its name."""
@@ -100,7 +97,7 @@ class Start:
     states: dict[str, DetectorState]
 
 
-def resume_at(position: Position, after: int, desired: DesiredState, context: float, *, live: bool) -> Start:
+def resume_at(position: Position, after: int | None, desired: DesiredState, context: float, *, live: bool) -> Start:
     """Where a detector continues: after the last frame that both the compressor and the owner have.
 
     Frames of a live source cannot be read again: the stream continues after the last one that was learned from.
@@ -113,11 +110,11 @@ def resume_at(position: Position, after: int, desired: DesiredState, context: fl
     Parameters
     ----------
     position : answer of the compressor, with the states after message `after`
-    after : number of the last frame that the owner of the run has
+    after : number of the last message that the owner of the run has, None without an owner
     context : size of a window, in boxes of its object
     """
-    seq = position.processed if live else min(after, position.processed)
-    repeats = position.processed if live or after == NO_OWNER else max(after, position.processed)
+    after = position.processed if live or after is None else after
+    seq, repeats = min(after, position.processed), max(after, position.processed)
     begun = {name: each for name, each in desired.objects.items() if each.begins <= seq}
     if begun and not live and not position.versions:
         return Start(min(each.begins for each in begun.values()) - 1, repeats, desired, {})
@@ -128,10 +125,6 @@ def resume_at(position: Position, after: int, desired: DesiredState, context: fl
             box = each.box if state is None else state.window.box(context)
             desired = desired.begun(name, replace(each, box=box, begins=seq + 1))
     return Start(seq, repeats, desired, states)
-
-
-#: In the place of the owner's last frame if a run has no owner.
-NO_OWNER = 1 << 62
 
 
 def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str, int]) -> bool:
@@ -161,6 +154,39 @@ def awaited(
     if processed < due:
         return "features"
     return "models" if any(newest[name] < version for name, version in samples.items() if name in newest) else ""
+
+
+class TrainingLag:
+    """The samples that features have led to: a detector in lockstep, or with `lag_frames`, waits for their models.
+
+    processed  seq of the newest features that the compressor has processed
+    """
+
+    def __init__(self, processed: int = 0) -> None:
+        self.processed = processed
+        self._changes: deque[tuple[int, dict[str, int]]] = deque(maxlen=_MOST_SAMPLES)  # seq that led to these versions
+        self._newest: dict[str, int] = {}  # the versions of the last reply
+        self._due: dict[str, int] = {}  # those that `samples` returned last
+
+    def reply(self, processed: int, versions: dict[str, int]) -> None:
+        """Note a reply of the compressor: the seq that it has processed, and the versions of its newest samples.
+
+        If it did not reply to each message, a sample counts from the first message that it may be of.
+        """
+        if versions != self._newest:
+            self._changes.append((self.processed + 1, versions))
+            self._newest = versions
+        self.processed = processed
+
+    def samples(self, seq: int) -> dict[str, int]:
+        """The newest version of each object's samples that the features up to `seq` led to; `seq` never falls."""
+        while self._changes and self._changes[0][0] <= seq:
+            self._due = self._changes.popleft()[1]
+        return self._due
+
+    def awaited(self, due: int, newest: Mapping[str, int]) -> Literal["", "features", "models"]:
+        """The channel on which a detector waits before its next frame, as `awaited` says."""
+        return awaited(due, self.processed, self.samples(due), newest)
 
 
 def checkpoint_is_due(since: float, took: float, interval: float) -> bool:

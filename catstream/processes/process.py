@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
-import mmap
-import os
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -15,13 +11,14 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from secrets import token_hex
-from typing import Self
 
 from catstream.base.addresses import without_password
 from catstream.base.workers import die_with, name_process
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import Health, run_state
+from catstream.processes.ending import Ending
+from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import reset_process
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint, private_folder
@@ -40,97 +37,33 @@ STOPPED_EARLY = 4
 TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
 MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
 HEALTH_SECONDS = 1.0  #: between two health reports of a process
-RUNNING_SECONDS = 10.0  #: without a turn of its loop, after which a process counts as stuck
-LONG_SECONDS = 120.0  #: the same for a start, and for a step that takes long and was announced
 
 _log = logging.getLogger(__name__)
-
-
-class Watchdog(ctypes.Structure):
-    """Four numbers in memory that a process shares with its supervisor; the descriptor `handle` is inherited.
-
-    No message can be late or lost: a supervisor that was suspended reads the newest count at once, and the count stops
-    with the loop of the process, even if other threads continue. A turn may take `limit` seconds.
-
-    turns     number of turns of the loop so far
-    patience  seconds that the present turn may take
-    after     number of the last frame that the owner of the run had when the process was started
-    read      number of the last frame that the owner of the run has read, infinite once it has received the end: a
-              detector is not too far ahead of it
-    """
-
-    _fields_ = (
-        ("turns", ctypes.c_double),
-        ("patience", ctypes.c_double),
-        ("after", ctypes.c_int64),
-        ("read", ctypes.c_double),
-    )
-    turns: float
-    patience: float
-    after: int
-    read: float
-    handle: int
-    limit: float
-
-    @classmethod
-    def opened(cls, handle: int | None = None) -> Self:
-        """The numbers in the memory of a descriptor, or in new memory."""
-        handle, size = os.memfd_create("watchdog") if handle is None else handle, ctypes.sizeof(cls)
-        os.truncate(handle, size)
-        watchdog = cls.from_buffer(mmap.mmap(handle, size))
-        watchdog.handle, watchdog.limit = handle, RUNNING_SECONDS
-        watchdog.allow()
-        return watchdog
-
-    def beat(self) -> None:
-        """Count a turn of the loop."""
-        self.allow(self.limit)
-
-    def allow(self, seconds: float = LONG_SECONDS) -> None:
-        """Announce that the present turn takes long."""
-        self.patience = seconds
-        self.turns += 1
-
-    def close(self) -> None:
-        """Close the file descriptor; the memory stays as long as the object."""
-        os.close(self.handle)
 
 
 class Process:
     """The state that every process of the pipeline has.
 
-    state            folder of what is kept; a private one, removed at the end, of a process started without one
+    state            folder of the checkpoints and of the desired state; a private one, removed at the end, by default
     trouble, source  description of a current problem, and the source; both are published with the health
-    source_failed    whether the stream ended because the source failed
-    has_ended        whether the process has sent or received the end of the stream
+    ending           why and how far the process has ended
     watchdog         counts the turns of the loop
+    owner            the frames that the owner of the run has; None if the process was started by hand
     """
 
-    def __init__(self, name: str, job: Job, watchdog: int | None = None) -> None:
+    def __init__(self, name: str, job: Job, handle: int | None = None) -> None:
         self.name, self.job, self.settings = name, job, job.settings
-        place = Endpoint.parse(job.endpoint or job.settings.run.endpoint, job.settings.run.keys)
+        endpoint = Endpoint.parse(job.endpoint or job.settings.run.endpoint, job.settings.run.keys)
         # Of processes that were started by hand, only the detector knows that a run begins.
-        self.endpoint = replace(place, run=job.run or (token_hex(8) if name == "detector" else ""))
+        self.endpoint = replace(endpoint, run=job.run or (token_hex(8) if name == "detector" else ""))
         self.trouble = self.source = ""
-        self.source_failed = self.has_ended = False
-        self.watchdog = Watchdog.opened(watchdog)
-        self._stop_moment = float("inf")  # at which a signal asked the process to end
+        self.ending = Ending()
+        memory = SharedMemory(handle)
+        self.watchdog, self.owner = memory.watchdog, memory.owner if job.run else None
         self._stack = ExitStack()
         self._health = self._stack.enter_context(Publisher(HEALTH, self.endpoint, sender=name))
         self.state = job.state or self._stack.enter_context(private_folder())
         self._reported = 0.0
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._end)
-
-    @property
-    def stop_requested(self) -> bool:
-        """Whether a signal has asked the process to end."""
-        return self.seconds_since_stop >= 0
-
-    @property
-    def seconds_since_stop(self) -> float:
-        """Seconds since a signal asked the process to end; negative if none has."""
-        return time.monotonic() - self._stop_moment
 
     def beat(
         self,
@@ -152,12 +85,9 @@ class Process:
         """Close the channel `health`, after its last message was sent."""
         self._stack.close()
 
-    def _end(self, *_: object) -> None:
-        self._stop_moment = min(self._stop_moment, time.monotonic())
-
 
 def run(
-    name: str, job: Job | Path, parent: int | None = None, watchdog: int | None = None, *, restarted: bool = False
+    name: str, job: Job | Path, parent: int | None = None, memory: int | None = None, *, restarted: bool = False
 ) -> int:
     """Run the detector, the compressor or the trainer; return its exit code.
 
@@ -174,7 +104,7 @@ def run(
         job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
         source = without_password(job.source)
         name_process(f"{name}:{Path(source).name}" if source else name, f"catstream {name} {source}")
-        process = Process(name, job, watchdog)
+        process = Process(name, job, memory)
         try:
             service.main(process)
         finally:
@@ -185,6 +115,6 @@ def run(
     except CatstreamError as error:
         print(error, file=sys.stderr)  # without the name: a supervisor raises it, and does not log it too
         return PERMANENT_FAILURE
-    if process.source_failed:
+    if process.ending.failed:
         return SOURCE_FAILED
-    return 0 if process.has_ended or parent is None else STOPPED_EARLY
+    return 0 if process.ending.ended or parent is None else STOPPED_EARLY

@@ -8,8 +8,8 @@ server; all pipelines of the program share it, and it ends with the program, how
        │ <── process id ─────────── │                                 │
        │ <── exit code ──────────── │ <─────────────────────── exit ─ │
 
-A request is a packet of JSON on a Unix socket, with the descriptors of the log, of the watchdog, and of a socket for
-the two answers: the process id; then the exit code, or minus the number of the signal. The server has one thread: a
+A request is a packet of JSON on a Unix socket, with the descriptors of the log, of the shared memory, and of a socket
+for the two answers: the process id; then the exit code, or minus the number of the signal. The server has one thread: a
 fork copies only the thread that calls it. The kernel kills its processes if the server ends; they are then restarted
 like any that died, by a new server.
 """
@@ -156,8 +156,8 @@ class StartServer:
             )
         return code is None
 
-    def start(self, name: str, job: Path, log: int, watchdog: int, *, restarted: bool) -> StartedProcess:
-        """Request one of the processes `NAMES`, with descriptors of its log and its watchdog; do not wait for it."""
+    def start(self, name: str, job: Path, log: int, memory: int, *, restarted: bool) -> StartedProcess:
+        """Request one of the processes `NAMES`, with descriptors of its log and its memory; do not wait for it."""
         try:
             folder = str(Path.cwd())
         except FileNotFoundError:  # it was removed
@@ -165,7 +165,7 @@ class StartServer:
         request = {"name": name, "job": str(job), "restarted": restarted, "folder": folder}
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs, suppress(ConnectionError):  # the server has just ended: so has the process
-            socket.send_fds(self._requests, [json.dumps(request).encode()], [log, watchdog, theirs.fileno()])
+            socket.send_fds(self._requests, [json.dumps(request).encode()], [log, memory, theirs.fileno()])
         return StartedProcess(self._process, ours)
 
     def close(self) -> None:
@@ -257,16 +257,16 @@ def main(descriptor: int, program: int) -> None:
             data, descriptors, _, _ = socket.recv_fds(requests, _LONGEST, 3)
             if not data:
                 return
-            log, watchdog, answer_to = descriptors
+            log, memory, answer_to = descriptors
             request = json.loads(data)
             with suppress(Exception):  # the process reports it
                 import_module(f"catstream.processes.{request['name']}")
             gc.freeze()  # a later collection leaves the memory alone that all processes share
             parent = os.getpid()
             if not (pid := os.fork()):
-                _run(request, parent, log, watchdog)
+                _run(request, parent, log, memory)
             os.close(log)
-            os.close(watchdog)
+            os.close(memory)
             running[pid] = socket.socket(fileno=answer_to)
             with suppress(OSError):
                 running[pid].send(b"%d" % pid)
@@ -274,7 +274,7 @@ def main(descriptor: int, program: int) -> None:
             return
 
 
-def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
+def _run(request: dict[str, str], parent: int, log: int, memory: int) -> None:
     """Run a process that was just forked, and exit with its code."""
     from catstream.processes.process import run
 
@@ -287,13 +287,13 @@ def _run(request: dict[str, str], parent: int, log: int, watchdog: int) -> None:
             descriptors = {int(each.name) for each in Path("/proc/self/fd").iterdir()}
         except FileNotFoundError:  # there is no /proc
             descriptors = {*range(1024)}
-        for descriptor in descriptors - {0, 1, 2, watchdog}:
+        for descriptor in descriptors - {0, 1, 2, memory}:
             with suppress(OSError):  # the one of the listing
                 os.close(descriptor)
         with suppress(OSError):  # it was removed
             os.chdir(request["folder"])
         gc.enable()
-        code = run(request["name"], Path(request["job"]), parent, watchdog, restarted=bool(request["restarted"]))
+        code = run(request["name"], Path(request["job"]), parent, memory, restarted=bool(request["restarted"]))
         atexit._run_exitfuncs()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0

@@ -25,7 +25,8 @@ from catstream.base.clock import RunningClock
 from catstream.errors import ServiceError, VideoError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import End, Health, Track, Tracks
-from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS, Watchdog
+from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS
+from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import NAMES, StartedProcess, start_server, starting
 from catstream.video.source import is_live
 from catstream.wire.channels import HEALTH
@@ -97,7 +98,7 @@ class Child:
         self.process: StartedProcess | None = None
         self.hung = False
         self._oom_kills = oom_kills()  # before its start
-        self.watchdog = Watchdog.opened()
+        self.memory = SharedMemory()
         self.log = ProcessLog(name, (folder / f"{name}.log").open("w+b"))
 
     @property
@@ -108,13 +109,12 @@ class Child:
     def start(self, after: int) -> None:
         """Start the process; the owner of the run has the frames up to message `after`."""
         self.end()
-        self.watchdog.close()
-        self.watchdog, self._turns, self.silent = Watchdog.opened(), 0.0, 0.0
-        self.watchdog.after = self.watchdog.read = after
+        self.memory.close()
+        self.memory, self._turns, self.silent = SharedMemory(after=after), 0.0, 0.0
         self.hung, self._oom_kills = False, oom_kills()
         self.log.begin()
-        log, watchdog = self.log.fileno(), self.watchdog.handle
-        self.process = start_server().start(self.name, self._job, log, watchdog, restarted=bool(self.restarts))
+        log, memory = self.log.fileno(), self.memory.handle
+        self.process = start_server().start(self.name, self._job, log, memory, restarted=bool(self.restarts))
 
     def ending(self, code: int) -> str:
         """How the process has ended: the signal or the exit code; and its last line, if that can be about the end.
@@ -143,9 +143,9 @@ class Child:
 
     def check(self, seconds: float) -> bool:
         """Count the seconds without a turn of the loop; returns whether they are too many."""
-        turns, self._turns = self._turns, self.watchdog.turns
+        turns, self._turns = self._turns, self.memory.watchdog.turns
         self.silent = self.silent + seconds if turns == self._turns and self.code is None else 0.0
-        return self.silent > self.watchdog.patience
+        return self.silent > self.memory.watchdog.patience
 
     def terminate(self, seconds: float, turn: Callable[[], object]) -> None:
         """Ask the process to end, and wait at most `seconds` for it; `turn` is called again and again meanwhile."""
@@ -161,10 +161,10 @@ class Child:
             self.process = None
 
     def close(self) -> None:
-        """Kill the process if it runs, and close the log and the watchdog."""
+        """Kill the process if it runs, and close the log and the shared memory."""
         self.end()
         self.log.close()
-        self.watchdog.close()
+        self.memory.close()
 
 
 class Supervisor:
@@ -192,8 +192,7 @@ class Supervisor:
         file = replace(job, state=job.state or folder, run=token_hex(8)).save(folder)
         endpoint = Endpoint.parse(job.endpoint, job.settings.run.keys)
         with starting(), ExitStack() as stack:
-            window = job.settings.run.unstored_frames
-            self._results = stack.enter_context(ResultsReceiver(endpoint, window + 1, after))
+            self._results = stack.enter_context(ResultsReceiver(endpoint, job.settings.run.unstored_frames + 1, after))
             self._reports = stack.enter_context(Subscriber(HEALTH, endpoint))
             self._children: dict[str, Child] = {}
             for name in NAMES:
@@ -226,7 +225,7 @@ class Supervisor:
             if self._frames and not self._ending.is_set():
                 tracks = self._frames.popleft()
                 if self.end is None:
-                    self._children["detector"].watchdog.read = tracks.seq
+                    self._children["detector"].memory.owner.read = tracks.seq
                 return tracks.tracks
             if not self._over:
                 return {}
@@ -285,7 +284,7 @@ class Supervisor:
         message = self._results.receive(TURN_SECONDS)
         if isinstance(message, End):
             self.end = message
-            self._children["detector"].watchdog.read = math.inf
+            self._children["detector"].memory.owner.read = math.inf
         elif message is not None:
             with self._changed:
                 self._frames.append(message)

@@ -16,10 +16,10 @@ def main(process: Process) -> None:
     trainer = Trainer(process.settings)
     trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:
-        while not (process.stop_requested or process.has_ended):
+        while not process.ending.reason:
             message = samples.receive(MESSAGE_SECONDS)  # of the object that has waited longest
             if isinstance(message, End):
-                process.source_failed, process.has_ended = message.failed, True
+                process.ending.receive(message)
             # An older version comes from a restarted compressor that lost the newer one; a detector may need its model.
             elif message is not None and message.version != trained.get(message.object, _NONE)["version"]:
                 process.watchdog.allow()
@@ -29,7 +29,7 @@ def main(process: Process) -> None:
                 if len(trained) > process.settings.run.objects_most:  # the longest ago: it was forgotten
                     del trained[next(iter(trained))]
             models.serve_late_joiners()
-            process.beat(lambda: _totals(trained), lambda: trained, now=process.has_ended)
+            process.beat(lambda: _totals(trained), lambda: trained, now=process.ending.ended)
         process.watchdog.allow()
 
 

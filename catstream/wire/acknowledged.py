@@ -2,7 +2,8 @@
 
 The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N;
 `catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to sockets and to the
-clock. A frame without content asks for the position; one of digits also for the states after that message.
+clock. A frame without content asks for the position; one of digits also for the states after that message, and the word
+`newest` for the newest states.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from catstream.wire.endpoint import Endpoint
 from catstream.wire.go_back_n import PATIENCE_SECONDS, ReceiveWindow, SendWindow
 from catstream.wire.socket import LINGER_SECONDS, ChannelSocket, Event
 
-_LONGEST_QUESTION = 20  # digits
-_MOST_ASKING = 64  # senders that may wait for an answer at a time; any other asks again
+_LONGEST_QUESTION = 20  # bytes
+_NEWEST = b"newest"
+_MOST_RESTARTS = 64  # senders that may wait for an answer at a time; any other asks again
 
 
 class _Numbered(Protocol):
@@ -38,19 +40,29 @@ Message = TypeVar("Message", bound=_Numbered)
 class Sender(ChannelSocket[Message]):
     """The sending side of an acknowledged channel; at most `size` messages, fewer large ones, wait for their reply.
 
-    window  the messages that were sent, acknowledged and stored
+    window   the messages that were sent, acknowledged and stored
+    replied  called after each reply, with the seq that the receiver has processed and its versions
     """
 
-    def __init__(self, channel: Channel[Message], endpoint: Endpoint, size: int) -> None:
+    def __init__(
+        self,
+        channel: Channel[Message],
+        endpoint: Endpoint,
+        size: int,
+        replied: Callable[[int, dict[str, int]], object] = lambda *_: None,
+    ) -> None:
         super().__init__(zmq.DEALER, channel, endpoint, high_water_mark=size + 1)
-        self.window = SendWindow(channel.name, size, monotonic())
+        self.window, self._replied = SendWindow(channel.name, size, monotonic()), replied
         self._send_frame = partial(self._socket.send, flags=zmq.NOBLOCK, copy=False)
         self._socket.set(zmq.IMMEDIATE, 1)  # nothing is queued before the receiver is connected
         self._connect()
 
-    def ask_position(self, after: int) -> Position | None:
-        """Ask once for the position, and the states after message `after`; None if no answer arrived in time."""
-        self._ask(b"%d" % after)
+    def ask_position(self, after: int | None) -> Position | None:
+        """Ask once for the position, and the states after message `after`, or the newest ones.
+
+        None if no answer arrived in time.
+        """
+        self._ask(_NEWEST if after is None else b"%d" % after)
         if self._wait(PATIENCE_SECONDS):
             return self._decode(self._socket.recv(), Position)
         return None
@@ -77,7 +89,9 @@ class Sender(ChannelSocket[Message]):
         """
         while self._wait(seconds):
             position = self._decode(self._socket.recv(), Position)
-            if position is not None and not self.window.receive(position, monotonic()):
+            if position is not None and self.window.receive(position, monotonic()):
+                self._replied(self.window.processed, dict(position.versions))
+            elif position is not None:
                 self._reject("acknowledgement", "an acknowledgement was dropped: it is older than the last one")
             seconds = 0.0
         if self.window.must_ask(monotonic()):
@@ -107,9 +121,9 @@ class Receiver(ChannelSocket[Message]):
     position  where the stream continues; the next message received is the one after `position.processed`
     size      as the sender's
     check     raises ProtocolError if a message does not belong to this stream; it then does not count as received
-    states    returns the states of the detectors after a message, for a sender that was restarted
+    states    returns the states of the detectors after a message, or the newest ones, for a sender that was restarted
     window    the messages that were received and stored
-    asking    the senders that were restarted and wait for `answer`, and the message whose states they ask for
+    pending_restarts  the senders that were restarted and wait for `answer`, and the message whose states they ask for
     """
 
     def __init__(
@@ -119,11 +133,11 @@ class Receiver(ChannelSocket[Message]):
         position: Position,
         size: int,
         check: Callable[[Message], None] | None = None,
-        states: Callable[[int], dict[str, DetectorState]] = lambda _: {},
+        states: Callable[[int | None], dict[str, DetectorState]] = lambda _: {},
     ) -> None:
         super().__init__(zmq.ROUTER, channel, endpoint, high_water_mark=size + 1)
         self.window, self._check, self._states = ReceiveWindow(position, size), check, states
-        self.asking: dict[bytes, int] = {}
+        self.pending_restarts: dict[bytes, int | None] = {}
         self._size = size
         self._bind()
 
@@ -134,11 +148,12 @@ class Receiver(ChannelSocket[Message]):
         peer, data = self._receive_from_peer()
         if data is None:
             return None
-        if len(data) <= _LONGEST_QUESTION and (not data or bytes(data).isdigit()):
-            if not data:
-                self._reply(peer, self.window.asked(peer))
-            elif len(self.asking) < _MOST_ASKING:
-                self.asking[peer] = int(bytes(data))
+        if not data:
+            self._reply(peer, self.window.asked(peer))
+            return None
+        if len(data) <= _LONGEST_QUESTION and ((question := bytes(data)).isdigit() or question == _NEWEST):
+            if len(self.pending_restarts) < _MOST_RESTARTS:
+                self.pending_restarts[peer] = None if question == _NEWEST else int(question)
             return None
         message = self._decode(data, *self.channel.messages, check=self._check)
         if message is None:
@@ -161,9 +176,9 @@ class Receiver(ChannelSocket[Message]):
 
     def answer(self) -> None:
         """Answer the senders that were restarted."""
-        for peer, after in self.asking.items():
+        for peer, after in self.pending_restarts.items():
             self._reply(peer, replace(self.window.asked(peer), states=self._states(after)))
-        self.asking.clear()
+        self.pending_restarts.clear()
 
     def close(self) -> None:
         """Close, after the sender if it has sent its end: a connection that breaks may cost it the last reply."""

@@ -34,7 +34,6 @@ PATIENCE_SECONDS = 0.2  #: without a reply, after which a sender asks for the po
 AGAIN_SECONDS = 2.0  #: within which a sender goes back once only on the same connection
 
 _MOST_BYTES = 256 << 20  # total size of the copies at which no further one is added
-_MOST_SAMPLES = 65536  # changes of the newest samples that a sender remembers until it is asked for them
 
 
 class SendWindow:
@@ -55,9 +54,6 @@ class SendWindow:
         self._sent_before = 0  # newest seq that a sender before this one may have sent
         self._last_reply = now
         self._went_back = -math.inf  # when it last did, on the present connection
-        self._samples: deque[tuple[int, dict[str, int]]] = deque(maxlen=_MOST_SAMPLES)  # seq that led to these versions
-        self._newest: dict[str, int] = {}  # the versions of the last reply
-        self._counted: dict[str, int] = {}  # those that `count_samples` returned last
 
     def resume(self, seq: int, position: Position) -> None:
         """Continue after message `seq` of an earlier sender, of which the receiver is at `position`."""
@@ -113,9 +109,6 @@ class SendWindow:
         elif position.seq < self.acknowledged or position.processed < self.processed:
             return False
         self._last_reply = now
-        if position.versions != self._newest:
-            self._samples.append((self.processed + 1, position.versions))
-            self._newest = position.versions
         while self._unacknowledged and self._unacknowledged[0][0] <= position.seq:
             self._bytes -= len(self._unacknowledged.popleft()[1])
             self._in_flight = max(self._in_flight - 1, 0)
@@ -126,15 +119,6 @@ class SendWindow:
             self._went_back = now
             self._in_flight = min(sum(seq <= position.processed for seq, _ in self._unacknowledged), self._in_flight)
         return True
-
-    def count_samples(self, seq: int) -> dict[str, int]:
-        """The newest version of each object's samples that the messages up to `seq` led to; `seq` never falls.
-
-        If the receiver did not reply to each message, a sample counts from the first message that it may be of.
-        """
-        while self._samples and self._samples[0][0] <= seq:
-            self._counted = self._samples.popleft()[1]
-        return self._counted
 
     def disconnected(self) -> None:
         """The connection ended, and what was in flight may be lost."""

@@ -1,12 +1,11 @@
 """The channel `results`: the tracks of each frame, for the program that owns the run.
 
 A PUSH socket connects to the PULL socket of the owner. Nothing is acknowledged: the owner has started the detector, and
-a detector that it starts again goes on after the last frame that the owner has. It drops what it has by `seq`.
+a detector that it starts again goes on after the last frame that the owner has. It drops what it has by `seq`. The
+sender's queue has no limit of its own: a detector is at most `run.unstored_frames` ahead of what its owner has read.
 """
 
 from __future__ import annotations
-
-import contextlib
 
 import zmq
 
@@ -17,24 +16,22 @@ from catstream.wire.socket import ChannelSocket
 
 
 class ResultsSender(ChannelSocket[Tracks | End]):
-    """The detector's side; `size` messages are queued at most on either side."""
+    """The detector's side."""
 
-    def __init__(self, endpoint: Endpoint, size: int) -> None:
-        super().__init__(zmq.PUSH, RESULTS, endpoint, high_water_mark=size)
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(zmq.PUSH, RESULTS, endpoint, high_water_mark=0)
         self._connect()
 
-    def send(self, message: Tracks | End, seconds: float) -> bool:
-        """Send a message; returns False if there was no room for it within so many seconds."""
-        data = self._encode(message)
-        if self._socket.poll(round(seconds * 1000), zmq.POLLOUT):
-            with contextlib.suppress(zmq.Again):
-                self._socket.send(data, zmq.NOBLOCK)
-                return True
-        return False
+    def send(self, message: Tracks | End) -> None:
+        """Queue a message."""
+        self._socket.send(self._encode(message), zmq.NOBLOCK)
 
 
 class ResultsReceiver(ChannelSocket[Tracks | End]):
-    """The owner's side: each frame once, in order; `last` is the number of the last message that the owner has."""
+    """The owner's side: each frame once, in order; `last` is the number of the last message that the owner has.
+
+    At most `size` messages are queued.
+    """
 
     def __init__(self, endpoint: Endpoint, size: int, last: int) -> None:
         super().__init__(zmq.PULL, RESULTS, endpoint, high_water_mark=size)

@@ -95,8 +95,8 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert table[-3].split() == ["object", "state", "score", "model", "leaves"]
     assert {line.split()[0] for line in table[-2:]} == {"anna", "ben"}
     code, answer = steer("forget")
-    assert (code, answer.endswith("which object? This run has anna, ben: give a name")) == (1, True)
-    assert steer("forget", "carl")[1].endswith("there is no object 'carl': the objects are anna, ben")
+    assert (code, answer.endswith("ambiguous object: this run tracks anna, ben; pass a name")) == (1, True)
+    assert steer("forget", "carl")[1].endswith("there is no object 'carl': this run tracks anna, ben")
     assert steer("set-box", "an na=1,2,30,40")[0] == 1
     assert steer("forget", "anna")[1].startswith("anna is no longer tracked after frame")
     assert steer("forget")[1].endswith("no object is left, so the run waits for a box")

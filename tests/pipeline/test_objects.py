@@ -89,7 +89,7 @@ def test_objects_are_saved_forgotten_and_begun_by_name_while_paused(video, objec
         assert saved.object == SavedModel.load(tmp_path / "ben").object == "ben"
         begin = steering.set_box(objects["anna"], np.str_("dora"))
         assert begin.reason.startswith("the object dora begins at")
-        with pytest.raises(CommandRejectedError, match="which object"):
+        with pytest.raises(CommandRejectedError, match="ambiguous object"):
             steering.forget()
         for name in ("anna", "ben", "carl"):
             steering.forget(name)

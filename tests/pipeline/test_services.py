@@ -21,7 +21,7 @@ from catstream.jobs.job import Job
 from catstream.jobs.state import TREES
 from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
-from catstream.processes.process import RUNNING_SECONDS
+from catstream.processes.shared import RUNNING_SECONDS
 from catstream.processes.start_server import NAMES
 from catstream.processes.supervisor import Child, Supervisor
 from catstream.video.source import open_source
@@ -202,7 +202,8 @@ def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_t
         stopped = pipeline.pids
         for name, pid in stopped.items():
             os.kill(pid, signal.SIGSTOP)
-            while pipeline._supervisor._children[name].watchdog.patience > RUNNING_SECONDS:  # a step that may take long
+            watchdog = pipeline._supervisor._children[name].memory.watchdog
+            while watchdog.patience > RUNNING_SECONDS:  # a step that may take long
                 os.kill(pid, signal.SIGCONT)
                 time.sleep(0.01)
                 os.kill(pid, signal.SIGSTOP)

@@ -11,13 +11,15 @@ from catstream.jobs.job import Job
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features, ObjectFeatures, TrainingRows
 from catstream.processes.compressor import CompressorLoop
-from catstream.processes.process import LONG_SECONDS, RUNNING_SECONDS, Process, Watchdog
+from catstream.processes.process import Process
+from catstream.processes.shared import LONG_SECONDS, RUNNING_SECONDS, SharedMemory
 
 
 def test_a_watchdog_counts_turns_and_only_an_announced_long_step_may_take_long():
-    with closing(Watchdog.opened()) as watchdog:
+    with closing(SharedMemory()) as memory:
+        watchdog = memory.watchdog
         assert watchdog.patience == LONG_SECONDS, "a start takes long"
-        loop = Watchdog.opened(watchdog.handle)
+        loop = SharedMemory(memory.handle).watchdog
         before = watchdog.turns
         loop.beat()
         assert (watchdog.turns, watchdog.patience) == (before + 1, RUNNING_SECONDS)

@@ -9,9 +9,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from catstream.base.box import Box, Window
 from catstream.messages.kinds import DetectorState, Position
 from catstream.processes.decisions import (
-    NO_OWNER,
     DesiredObject,
     DesiredState,
+    TrainingLag,
     awaited,
     checkpoint_is_due,
     have_arrived,
@@ -49,7 +49,7 @@ def test_an_object_that_begins_is_the_last_one_and_one_that_is_forgotten_leaves_
     assert [*begun.without(name).objects] == others
 
 
-@given(DESIRED, SEQ, SEQ | st.just(NO_OWNER), VERSIONS, st.sets(NAMES), st.booleans())
+@given(DESIRED, SEQ, SEQ | st.none(), VERSIONS, st.sets(NAMES), st.booleans())
 def test_a_detector_continues_where_nothing_is_lost_and_no_frame_is_learned_from_twice(
     desired, processed, after, versions, known, live
 ):
@@ -61,10 +61,10 @@ def test_a_detector_continues_where_nothing_is_lost_and_no_frame_is_learned_from
     if live:
         assert start.seq == processed, "frames of a live source are not read again"
     else:
-        assert start.seq <= after, "the owner has all frames before"
-        assert start.repeats >= (after if after < NO_OWNER else 0)
+        assert after is None or start.seq <= after, "the owner has all frames before"
+        assert start.repeats >= (after or 0)
         if versions:
-            assert start.seq == min(after, processed)
+            assert start.seq == (processed if after is None else min(after, processed))
     for name, each in start.desired.objects.items():
         continues, begins = name in start.states, each.begins > start.seq
         assert continues != begins, "each object either continues with its state, or begins again"
@@ -100,6 +100,19 @@ def test_a_detector_waits_until_its_models_include_the_features_that_are_due(due
     behind = any(newest[name] < version for name, version in samples.items() if name in newest)
     assert (waits == "features") == (processed < due)
     assert (waits == "models") == (processed >= due and behind)
+
+
+@given(st.lists(st.tuples(st.integers(1, 3), VERSIONS), max_size=20), SEQ)
+def test_a_sample_counts_from_the_first_message_that_may_have_led_to_it(replies, seq):
+    """Each reply is some messages after the one before."""
+    lag, processed, led_to = TrainingLag(), 0, {}
+    for messages, versions in replies:
+        led_to |= dict.fromkeys(range(processed + 1, processed + messages + 1), versions)
+        processed += messages
+        lag.reply(processed, versions)
+    assert lag.processed == processed
+    assert lag.samples(min(seq, processed)) == led_to.get(min(seq, processed), {})
+    assert lag.awaited(processed + 1, {}) == "features"
 
 
 class Storing(RuleBasedStateMachine):

@@ -12,7 +12,7 @@ from catstream.jobs.job import Job
 from catstream.messages.kinds import Command
 from catstream.multi import MultiTracker
 from catstream.processes.detector import DetectorLoop
-from catstream.processes.outputs import ModelFiles
+from catstream.processes.model_files import ModelFiles
 from catstream.processes.process import Process
 from catstream.video.rendered import render
 
@@ -57,7 +57,8 @@ def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp
     job = Job("walk.mp4", {"ben": Box(1, 2, 30, 40)}, settings=settings, endpoint=str(folder), state=state)
     with closing(Process("detector", job)) as process, ExitStack() as stack:
         loop = DetectorLoop(process, stack)
-        loop._conclude(answer := loop._carried_out(Command("1", "search", object="anna", model=learned.to_bytes())))
+        command = Command("1", "search", object="anna", model=learned.to_bytes())
+        loop.commands.store_and_answer(answer := loop.commands._execute(command))
         assert not answer.done
-        assert list(loop.desired.objects) == ["ben"]
-        assert not loop._model_files._models
+        assert list(loop.commands.desired.objects) == ["ben"]
+        assert not loop.commands.models._models

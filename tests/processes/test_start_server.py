@@ -16,7 +16,8 @@ from catstream.errors import ServiceError
 from catstream.jobs.job import Job
 from catstream.processes import start_server as module
 from catstream.processes import supervisor
-from catstream.processes.process import STOPPED_EARLY, Watchdog
+from catstream.processes.process import STOPPED_EARLY
+from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Child, ProcessLog
 
@@ -31,23 +32,23 @@ def own_server(monkeypatch):
 
 @pytest.fixture
 def start(folder, tmp_path, until):
-    """Starts a trainer, which takes turns until it is ended; its process, its watchdog and its log."""
+    """Starts a trainer, which takes turns until it is ended; its process, its memory and its log."""
     started = []
 
     def trainer(job=None):
         place = folder / str(len(started))
         place.mkdir()
         file = job or Job(endpoint=str(place)).save(place)
-        log, watchdog = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), Watchdog.opened()
-        process = start_server().start("trainer", file, log.fileno(), watchdog.handle, restarted=False)
-        started.append((process, watchdog, log))
-        until(lambda: job or watchdog.turns > 2)
+        log, memory = ProcessLog("trainer", (tmp_path / f"{len(started)}.log").open("w+b")), SharedMemory()
+        process = start_server().start("trainer", file, log.fileno(), memory.handle, restarted=False)
+        started.append((process, memory, log))
+        until(lambda: job or memory.watchdog.turns > 2)
         return started[-1]
 
     yield trainer
-    for process, watchdog, log in started:
+    for process, memory, log in started:
         process.close()
-        watchdog.close()
+        memory.close()
         log.close()
 
 
@@ -130,11 +131,11 @@ import os, time
 from pathlib import Path
 {closed}
 from catstream.processes.start_server import start_server
-from catstream.processes.process import Watchdog
+from catstream.processes.shared import SharedMemory
 with open({str(log)!r}, "w+b") as log:
-    watchdog = Watchdog.opened()
-    process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), watchdog.handle, restarted=False)
-    while watchdog.turns < 3 and process.poll() is None:
+    memory = SharedMemory()
+    process = start_server().start("trainer", Path({str(job)!r}), log.fileno(), memory.handle, restarted=False)
+    while memory.watchdog.turns < 3 and process.poll() is None:
         time.sleep(0.01)
     code = process.poll()
     process.close()
@@ -150,11 +151,11 @@ def test_a_process_begins_with_no_blocked_signal_and_as_many_files_as_it_may_hav
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGCHLD})
     try:
-        process, watchdog, _ = start()
+        process, memory, _ = start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    until(lambda: watchdog.turns > 2)
+    until(lambda: memory.watchdog.turns > 2)
     assert psutil.Process(process.pid).rlimit(psutil.RLIMIT_NOFILE) == (hard, hard)
     process.send_signal(signal.SIGTERM)
     assert until(process.poll) == 4

@@ -53,7 +53,6 @@ class Histories(RuleBasedStateMachine):
         self.senders += 1
         self.connect()
         self.sender, self.resumed = SendWindow("features", self.size, self.now), self.senders == 1
-        self.known = self.asked = 0  # newest seq of an earlier sender; newest seq whose samples were asked for
 
     def connect(self):
         """Each connection counts as another peer."""
@@ -110,7 +109,7 @@ class Histories(RuleBasedStateMachine):
         if not self.resumed:
             if message.again:
                 self.sender.resume(message.processed, message)
-                self.resumed, self.known = True, message.processed
+                self.resumed = True
             return
         try:
             assert self.sender.receive(message, self.now) or not message.again
@@ -190,20 +189,6 @@ class Histories(RuleBasedStateMachine):
         self.to_sender.clear()
         self.start_sender()
 
-    @rule()
-    def sender_asks_for_the_count_samples_what_was_taken(self):
-        """A sample counts from the message that led to it, or an earlier one; none counts that was not made."""
-        seq = self.sender.processed
-        if seq <= max(self.known, self.asked):
-            return
-        self.asked = seq
-        samples, led_to = self.sender.count_samples(seq), made_by(seq)
-        for name in samples.keys() & led_to.keys():
-            assert samples[name] >= led_to[name]
-        for version in samples.values():
-            assert version % 3
-            assert version <= self.sender.sent
-
     @rule(seq=st.integers(0, 50))
     def stranger_repeats_a_frame(self, seq):
         if seq <= self.receiver.processed:  # one that is not of the stream is rejected before it is counted
@@ -245,8 +230,6 @@ class Histories(RuleBasedStateMachine):
         assert self.resumed
         assert self.receiver.processed >= self.sender.sent
         assert self.sender.acknowledged == self.sender.processed == self.sender.sent
-        if self.sender.sent > self.known:
-            assert self.sender.count_samples(self.sender.sent) == made_by(self.sender.sent)
         assert not self.sender._unacknowledged
 
 

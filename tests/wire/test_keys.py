@@ -223,7 +223,7 @@ def test_a_client_that_may_only_watch_gets_an_error_if_it_sends(name, place, lis
     turn, watcher = listener(name), place("watcher")
     clients = {
         "features": lambda: Sender(FEATURES, watcher, WINDOW),
-        "results": lambda: ResultsSender(watcher, WINDOW),
+        "results": lambda: ResultsSender(watcher),
         "control": lambda: Requester(CONTROL, watcher),
     }
     with (

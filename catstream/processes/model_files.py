@@ -1,0 +1,60 @@
+"""The files of the saved models that objects begin with."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+from hashlib import blake2b
+from pathlib import Path
+
+from catstream.base.files import write_atomically
+from catstream.errors import CatstreamError
+from catstream.jobs.saved_model import SavedModel
+from catstream.processes.decisions import DesiredObject
+
+_log = logging.getLogger(__name__)
+
+
+class ModelFiles:
+    """The saved models that objects begin with: a restarted detector begins the objects again.
+
+    Each has a name, which is a digest of its content. They are in memory, and in a folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._models: dict[str, SavedModel] = {}
+
+    def add(self, saved: SavedModel) -> DesiredObject:
+        """Keep a saved model in memory; returns the object that it begins in the first message, with its name."""
+        data = saved.to_bytes()
+        name = blake2b(data, digest_size=16).hexdigest()
+        self._models[name] = saved
+        return DesiredObject(saved.box, 1, name, len(data), saved.model.version)
+
+    def get(self, name: str) -> SavedModel | None:
+        """The saved model of a name, None if its file cannot be read."""
+        if name not in self._models:
+            try:
+                self._models[name] = SavedModel.load(self._file(name))
+            except CatstreamError as error:
+                _log.warning("the object of a saved model is not searched for any more: %s", error)
+        return self._models.get(name)
+
+    def store(self) -> None:
+        """Write the saved models in memory that have no file yet; OSError if that fails."""
+        for name, saved in self._models.items():
+            if not self._file(name).exists():
+                self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+                write_atomically(self._file(name), saved.to_bytes(), mode=0o600)
+
+    def keep_only(self, names: set[str]) -> None:
+        """Remove all saved models but those of these names; a file that cannot be removed is left to a later call."""
+        self._models = {name: saved for name, saved in self._models.items() if name in names}
+        with suppress(OSError):
+            for file in self._folder.glob("*.safetensors"):
+                if file.stem not in names:
+                    file.unlink()
+
+    def _file(self, name: str) -> Path:
+        return self._folder / f"{name}.safetensors"

@@ -1,0 +1,67 @@
+"""Memory that a process shares with its supervisor: the descriptor `handle` is inherited.
+
+No value in it can be late or lost: a supervisor that was suspended reads the newest ones at once.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+
+RUNNING_SECONDS = 10.0  #: without a turn of its loop, after which a process counts as stuck
+LONG_SECONDS = 120.0  #: the same for a start, and for a step that takes long and was announced
+
+
+class Watchdog(ctypes.Structure):
+    """Counts the turns of the loop of a process. The count stops with the loop, even if other threads continue.
+
+    turns     number of turns of the loop so far
+    patience  seconds that the present turn may take
+    limit     seconds that a turn may take that was not announced
+    """
+
+    _fields_ = (("turns", ctypes.c_double), ("patience", ctypes.c_double))
+    turns: float
+    patience: float
+    limit = RUNNING_SECONDS
+
+    def beat(self) -> None:
+        """Count a turn of the loop."""
+        self.allow(self.limit)
+
+    def allow(self, seconds: float = LONG_SECONDS) -> None:
+        """Announce that the present turn takes long."""
+        self.patience = seconds
+        self.turns += 1
+
+
+class OwnerPosition(ctypes.Structure):
+    """The frames that the owner of the run has: backpressure, as a detector is not too far ahead of it.
+
+    after  number of the last message that it had when the process was started
+    read   number of the last message that it has read, infinite once it has received the end
+    """
+
+    _fields_ = (("after", ctypes.c_int64), ("read", ctypes.c_double))
+    after: int
+    read: float
+
+
+class SharedMemory:
+    """The two records, in the memory of a descriptor or in new memory."""
+
+    def __init__(self, handle: int | None = None, after: int = 0) -> None:
+        self.handle = os.memfd_create("catstream") if handle is None else handle
+        size = ctypes.sizeof(Watchdog) + ctypes.sizeof(OwnerPosition)
+        os.truncate(self.handle, size)
+        memory = mmap.mmap(self.handle, size)
+        self.watchdog = Watchdog.from_buffer(memory)
+        self.owner = OwnerPosition.from_buffer(memory, ctypes.sizeof(Watchdog))
+        if handle is None:
+            self.owner.after = self.owner.read = after
+        self.watchdog.allow()
+
+    def close(self) -> None:
+        """Close the file descriptor; the memory stays as long as the records."""
+        os.close(self.handle)
