@@ -1,6 +1,6 @@
 """Shows a running pipeline in the Rerun viewer: pictures, box, score, state and model version of each object.
 
-    pip install "catstream[rerun]"
+    pip install ".[rerun]"
     catstream track walk.mp4 --box 120,80,64,48 --set run.endpoint=run
     python examples/rerun_subscriber.py run
     python examples/rerun_subscriber.py run --save walk.rrd

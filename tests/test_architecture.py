@@ -62,12 +62,7 @@ IMPORTERS = {
     "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/loadtest/camera.py", "catstream/loadtest/rtsp.py"],
     "zmq": [
-        "catstream/wire/socket.py",
-        "catstream/wire/acknowledged.py",
-        "catstream/wire/results.py",
-        "catstream/wire/newest.py",
-        "catstream/wire/commands.py",
-        "catstream/wire/keys.py",
+        "catstream/wire",
         "catstream/client/subscription.py",
     ],
     "paho": ["catstream/sinks/mqtt_sink.py"],

@@ -24,8 +24,11 @@ ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any mo
 
 
 def state_home() -> Path:
-    """The folder of what is kept for this user; RuntimeError if the user has none."""
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream"
+    """The folder for files of this user that outlive a process; ServiceError if the user has no home directory."""
+    try:
+        return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "catstream"
+    except RuntimeError:
+        raise ServiceError("this user has no home directory: set HOME or XDG_STATE_HOME to a folder") from None
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o666) -> None:

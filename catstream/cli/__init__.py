@@ -12,7 +12,7 @@ from typing import cast
 import click
 
 from catstream.base.addresses import without_passwords
-from catstream.cli.common import INTERRUPTS, complain, stopped
+from catstream.cli.common import INTERRUPTS, CommandGroup, complain, stopped
 from catstream.errors import CatstreamError
 
 #: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
@@ -50,7 +50,7 @@ def load_command(name: str) -> click.Command:
     return command
 
 
-class _Commands(click.Group):
+class _Commands(CommandGroup):
     def list_commands(self, _: click.Context) -> list[str]:
         return list(COMMANDS)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from catstream.base.settings import describe
-from catstream.cli.common import screen, table
+from catstream.cli.common import CommandGroup, screen, table
 from catstream.errors import SettingsError
 from catstream.processes.options import PATH, with_json
 from catstream.wire.channels import CHANNELS, Role
@@ -19,7 +19,7 @@ _folder = click.argument("folder", metavar="DIR", type=PATH)
 _name = click.argument("name")
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def keys() -> None:
     """Manage the keys of a pipeline and its clients.
 

@@ -21,7 +21,7 @@ from rich.text import Text
 from catstream.base.files import check_file, write_atomically, writing
 from catstream.base.names import UNNAMED, split_name
 from catstream.cli.attach import with_fleet_address
-from catstream.cli.common import screen, table
+from catstream.cli.common import CommandGroup, screen, table
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
 from catstream.errors import FleetError
@@ -36,13 +36,13 @@ _SHOW_SECONDS = 0.5  # between two pictures of the status
 _STARTED = ("running", "lost", "waiting", "paused", "ended", "failed")
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def fleet() -> None:
     """Run many streams on one machine or on many, and change them while they run.
 
     A fleet keeps each stream running on some node, and continues it elsewhere
     from its last state if the node dies. Clients find a stream by its name. Ray
-    places and watches the processes: pip install "catstream[fleet]".
+    places and watches the processes: pip install ".[fleet]".
 
     \b
     EXAMPLES

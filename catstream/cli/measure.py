@@ -79,7 +79,7 @@ def evaluate(
     TRACKERS
       catstream        this one, in one process
       mil              OpenCV's, always available
-      csrt, kcf, tld   OpenCV's, with pip install "catstream[peers]"
+      csrt, kcf, tld   OpenCV's, with pip install ".[peers]"
       nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER
 
     \b

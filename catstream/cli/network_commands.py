@@ -7,14 +7,14 @@ from pathlib import Path
 import click
 
 from catstream.base.files import check_file
-from catstream.cli.common import INTERRUPTS
+from catstream.cli.common import INTERRUPTS, CommandGroup
 from catstream.errors import require_extra
 from catstream.processes.options import PATH, with_overwrite
 
 _Levels = tuple[float, float, float]
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def network() -> None:
     """Use the features of a small network beside HOG and colours.
 

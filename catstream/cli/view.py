@@ -10,6 +10,7 @@ import click
 
 from catstream.base.files import state_home, write_atomically
 from catstream.cli.attach import with_endpoint, with_fleet_address
+from catstream.errors import ServiceError
 from catstream.processes.options import Decorator, combined, with_keys
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def _token_of_user() -> str:
             return file.read_text(encoding="ascii").strip()
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_atomically(file, f"{token}\n".encode(), mode=0o600)
-    except (OSError, RuntimeError, ValueError):  # no home, or one that cannot be written to; not what is written here
+    except (OSError, ServiceError, ValueError):  # no home, or one that cannot be written to; not what is written here
         pass
     return token
 

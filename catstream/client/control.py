@@ -2,14 +2,15 @@
 
     import catstream
 
-    with catstream.control("run") as pipeline:
-        pipeline.set_box((120, 80, 64, 48), "anna")
+    with catstream.control("run") as control:
+        control.set_box((120, 80, 64, 48), "anna")
 
 A command is resent until it is answered, and is executed once.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
@@ -20,7 +21,7 @@ from uuid import uuid4
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED, check_name
 from catstream.client.registry import follow
-from catstream.errors import CommandRejectedError, SilenceError
+from catstream.errors import CommandRejectedError, ServiceError, SilenceError
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Answer, Command, ModelFile, Verb
 from catstream.wire.channels import CONTROL, SAVED_MODELS
@@ -150,6 +151,11 @@ class Control(AbstractContextManager["Control"]):
         time: float | None = None,
     ) -> Answer:
         """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol."""
+        if box is not None:
+            box.checked()
+        for name, number in (("seconds", seconds), ("time", time)):
+            if number is not None and not (math.isfinite(number) and number >= 0):
+                raise ServiceError(f"{name} must be a finite number and not negative (got {number})")
         command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds, time)
         self._follow()
         if (answer := self._commands.ask(command, self.timeout)) is None:

@@ -1,7 +1,7 @@
 """Adapters for OpenCV's trackers, so that they can be evaluated on the same frames.
 
 MIL comes with every OpenCV; CSRT, KCF and TLD with the contrib modules of
-OpenCV 4: `pip install "catstream[peers]"`. NanoTrack and VitTrack are trained
+OpenCV 4: `pip install ".[peers]"`. NanoTrack and VitTrack are trained
 networks: they need model files, which the user has to give.
 """
 

@@ -198,7 +198,8 @@ class Store:
 def _credentials() -> Any:
     """What reads ~/.aws: profiles, roles, sessions; None if there is nothing, or the environment has a key."""
     variables = {"AWS_SHARED_CREDENTIALS_FILE": "~/.aws/credentials", "AWS_CONFIG_FILE": "~/.aws/config"}
-    files = [Path(os.environ.get(name, usual)).expanduser() for name, usual in variables.items()]
+    # `Path.expanduser` would raise for a user without a home directory.
+    files = [Path(os.path.expanduser(os.environ.get(name, usual))) for name, usual in variables.items()]  # noqa: PTH111
     if "AWS_ACCESS_KEY_ID" in os.environ or not ("AWS_PROFILE" in os.environ or any(file.exists() for file in files)):
         return None
     from obstore.auth.boto3 import Boto3CredentialProvider  # half a second of imports

@@ -23,7 +23,7 @@ from catstream.processes.start_server import reset_process
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint, private_folder
 from catstream.wire.newest import Publisher
-from catstream.wire.socket import rejects
+from catstream.wire.rejects import rejects
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2

@@ -31,7 +31,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.base.box import Box
-from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
+from catstream.errors import BoxError, CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
 from catstream.video.drawing import draw_preview
 from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
@@ -45,7 +45,14 @@ RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
 _MAX_BODY = 4096  # bytes
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.
-_CODES = {CommandRejectedError: 409, ProtocolError: 400, ObjectError: 400, SilenceError: 504, CatstreamError: 503}
+_CODES = {
+    CommandRejectedError: 409,
+    ProtocolError: 400,
+    BoxError: 400,
+    ObjectError: 400,
+    SilenceError: 504,
+    CatstreamError: 503,
+}
 
 
 def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
@@ -108,7 +115,7 @@ class Site:
         return PlainTextResponse("ok\n")
 
     async def _readyz(self, request: Request) -> Response:
-        problem = self._feed_of(request).problem
+        problem = self._feed.problem_of(request.path_params.get("stream", ""))
         return PlainTextResponse(f"{problem or 'running'}\n", 503 if problem else 200)
 
     async def _picture(self, request: Request) -> Response:
@@ -131,8 +138,9 @@ class Site:
             if len(body := body + part) > _MAX_BODY:
                 raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
         command = decode_json(body, Command)
+        box = Box(*command.box) if command.box is not None else None
         try:
-            answer = await run_in_threadpool(feed.execute, **asdict(command))
+            answer = await run_in_threadpool(feed.execute, **asdict(command) | {"box": box})
         except asyncio.CancelledError:  # by the server, which waits for its shutdown no longer
             raise HTTPException(503, "the server of this page has ended\n") from None
         result = {"reason": answer.reason, "frame": answer.frame, "version": answer.version, "object": answer.object}
@@ -192,7 +200,7 @@ class Command:
 
     verb: Literal["set-box", "forget", "pause", "resume", "stop"]
     object: str = ""
-    box: Box | None = None
+    box: tuple[float, float, float, float] | None = None
     keep: bool = False
     seconds: float | None = None
     time: float | None = None

@@ -22,7 +22,7 @@ from catstream.client.control import Control
 from catstream.client.registry import Registry, address_of, locate
 from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
-from catstream.messages.kinds import Answer, End
+from catstream.messages.kinds import Answer, End, StreamStatus
 from catstream.web.dashboard import Dashboard, FleetDashboard, Parts
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
@@ -52,10 +52,12 @@ class Feed(ABC):
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
-    @property
     @abstractmethod
-    def problem(self) -> str:
-        """Why no frames are tracked, or the fleet is not seen; empty otherwise. It names no address, and no stream."""
+    def problem_of(self, stream: str = "") -> str:
+        """Why no frames are tracked, of a stream of a fleet if one is named, or why the fleet is not seen; else empty.
+
+        Without the name of a stream, it names no address: anybody may ask for it.
+        """
 
     @abstractmethod
     def pipeline(self, stream: str) -> PipelineFeed:
@@ -122,8 +124,7 @@ class PipelineFeed(Feed):
         self._place: Endpoint | None = None  # of the current connection, with its keys
         self.dashboard = Dashboard()
 
-    @property
-    def problem(self) -> str:
+    def problem_of(self, stream: str = "") -> str:  # noqa: ARG002  # there is one
         since, last = monotonic() - SILENCE_SECONDS, self.dashboard.last_reports
         silent = [name for name in CHANNELS["health"].senders if name not in last or last[name] < since]
         state, words = self.dashboard.state
@@ -155,6 +156,7 @@ class PipelineFeed(Feed):
     def _receive(self, place: Endpoint, subscriptions: dict[str, Subscription[Any]]) -> None:
         """Receive all channels until the pipeline ends or is silent, those that have ended are removed."""
         last_report, last_read, deadline = monotonic(), 0.0, inf
+        has_reported = False
         while subscriptions and monotonic() < deadline and not self._stopped.is_set():
             if self.viewers and deadline == inf and "previews" not in subscriptions:
                 subscriptions["previews"] = Subscription(place, "previews", timeout=0.0)
@@ -169,13 +171,18 @@ class PipelineFeed(Feed):
                 if deadline == inf or not isinstance(message, End):  # the next pipeline may have begun at this place
                     self._call(self.dashboard.take, message, now, messages.run)
                 if channel == "health":
-                    last_report = now
+                    last_report, has_reported = now, True
                 if isinstance(message, End):
                     # The last health report, with the final size of the trees, and the last picture may follow.
                     deadline = min(deadline, now + DRAIN_SECONDS)
                     subscriptions.pop(channel).close()
             if deadline == inf and monotonic() - last_report > SILENCE_SECONDS:
-                raise SilenceError(f"no health report arrived from {place} within {SILENCE_SECONDS:g} s")
+                if has_reported:
+                    raise SilenceError(f"no health report arrived from {place} within {SILENCE_SECONDS:g} s")
+                raise SilenceError(
+                    f"Waiting for the first health report from {place}. The first start after an installation compiles "
+                    "kernels, which takes about 10 s."
+                )
             if "tracks" not in subscriptions:  # nothing else waits
                 self._stopped.wait(READ_SECONDS)
 
@@ -205,14 +212,17 @@ class FleetFeed(Feed):
         self._streams: dict[str, PipelineFeed] = {}
         self.dashboard = FleetDashboard()
 
-    @property
-    def problem(self) -> str:
-        return "" if self.dashboard.phase == "running" else "the fleet does not answer"
+    def problem_of(self, stream: str = "") -> str:
+        if self.dashboard.phase != "running":
+            return "the fleet does not answer"
+        if not stream:
+            return ""
+        status = self._status_of(stream)
+        return "" if status.state == "running" else ": ".join(filter(None, (status.state, status.trouble)))
 
     def pipeline(self, stream: str) -> PipelineFeed:
         """Return the feed of a stream, opened by the first request to its page."""
-        if stream not in self.dashboard.status.streams:
-            raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
+        self._status_of(stream)
         if stream not in self._streams:
             if len(self._streams) >= _MAX_FEEDS:
                 self.close_unused(0.0)
@@ -222,6 +232,11 @@ class FleetFeed(Feed):
             self._streams[stream].start()
         self._streams[stream].used = monotonic()
         return self._streams[stream]
+
+    def _status_of(self, stream: str) -> StreamStatus:
+        if stream not in self.dashboard.status.streams:
+            raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
+        return self.dashboard.status.streams[stream]
 
     def close_unused(self, seconds: float = IDLE_SECONDS) -> None:
         """End the feeds that nobody looks at, and to which the last request was so many seconds ago."""

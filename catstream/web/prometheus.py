@@ -67,5 +67,5 @@ def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
 def _of_status(kind: str, status: StreamStatus | NodeStatus, labels: dict[str, str]) -> Iterator[_Sample]:
     yield f"{kind}_state", 1, labels | {"state": status.state}
     for field in fields(status):
-        if isinstance(value := getattr(status, field.name), int | float):
+        if field.name != "token" and isinstance(value := getattr(status, field.name), int | float):  # of the store
             yield f"{kind}_{field.name}", value, labels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import hmac
@@ -28,7 +29,7 @@ _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether th
 _MIN_TOKEN_LENGTH = 16
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
-SHUTDOWN_SECONDS = 2  #: limit for the responses to end when the server does
+SHUTDOWN_SECONDS = 2  #: after which a response that has not ended with the server is cut off; twice that for commands
 KEEP_ALIVE_SECONDS = 5  #: after which a connection without a request is closed
 _MAX_CONNECTIONS = 256
 _MAX_HEAD = 16384  # bytes
@@ -79,7 +80,7 @@ class Server:
             proxy_headers=False,
             limit_concurrency=_MAX_CONNECTIONS,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
-            timeout_graceful_shutdown=SHUTDOWN_SECONDS,
+            timeout_graceful_shutdown=2 * SHUTDOWN_SECONDS,
             h11_max_incomplete_event_size=_MAX_HEAD,
         )
         self._server = _Uvicorn(config, site.close)
@@ -117,7 +118,14 @@ class _Uvicorn(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._close()
+        asyncio.get_running_loop().call_later(SHUTDOWN_SECONDS, self._abort_stalled)
         await super().shutdown(sockets)
+
+    def _abort_stalled(self) -> None:
+        """Cut off viewers that do not read: uvicorn would cancel their responses, and log a traceback for each."""
+        for connection in list(self.server_state.connections):
+            if connection.transport.get_write_buffer_size():
+                connection.transport.abort()
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -127,7 +135,8 @@ def _listen(host: str, port: int) -> socket.socket:
             return socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=True)
         return socket.create_server((host, port))
     except OSError as error:
-        raise ServiceError(f"cannot listen on {host}:{port} ({error.strerror}): give another port or host") from None
+        why = (error.strerror or str(error)).partition(" (while")[0]  # Python adds the address
+        raise ServiceError(f"cannot listen on {host}:{port} ({why}): choose another port or host") from None
 
 
 class Guard:

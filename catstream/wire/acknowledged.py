@@ -22,7 +22,8 @@ from catstream.messages.kinds import DetectorState, End, Position
 from catstream.wire.channels import Channel
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.go_back_n import PATIENCE_SECONDS, ReceiveWindow, SendWindow
-from catstream.wire.socket import LINGER_SECONDS, ChannelSocket, Event
+from catstream.wire.monitor import Event
+from catstream.wire.socket import LINGER_SECONDS, ChannelSocket
 
 _LONGEST_QUESTION = 20  # bytes
 _NEWEST = b"newest"

@@ -28,6 +28,8 @@ from catstream.wire.keys import Keys
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _PREFIX = "catstream-"  # of private folders
 _TCP = re.compile(r"tcp://(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,252}|\[[^\[\]]+\]):([0-9]{1,5})")
+#: HOST:PORT, perhaps with a part of the prefix, which is no folder unless there is one.
+_NO_FOLDER = re.compile(r"(?:tcp:/*|//)?(?P<host>[A-Za-z0-9_.*-]*|\[[^\[\]/]+\]):(?P<port>[0-9]{1,5})/?")
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
 _FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
@@ -71,9 +73,14 @@ class Endpoint:
         known = keys if isinstance(keys, Keys) else Keys.load(keys) if keys else None
         if text.startswith("tcp://"):
             return cls._tcp(text, known)
-        if "://" in text:
-            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
         folder = Path(text)
+        if (meant := _NO_FOLDER.fullmatch(text)) is not None and not folder.exists():
+            address = f"tcp://{meant['host'] or '127.0.0.1'}:{meant['port']}"
+            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT (got {text!r}): did you mean {address}?")
+        if "://" in text:
+            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT (got {text!r})")
+        if folder.exists() and not folder.is_dir():
+            raise ServiceError(f"an endpoint is a folder, and {text!r} is a file: pass a folder")
         if _is_too_long(folder):
             raise ServiceError(
                 f"the name of the folder {text!r} is too long for a Unix socket: give a shorter one "

@@ -24,7 +24,8 @@ from catstream.messages.kinds import End, Health
 from catstream.wire.channels import Channel
 from catstream.wire.codec import Topic, opening, topic_of
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.socket import ChannelSocket, arrives
+from catstream.wire.monitor import arrives
+from catstream.wire.socket import ChannelSocket
 
 REPEAT_SECONDS = 1.0  #: after which the last messages are sent again
 _MOST_KEPT = 256  # newest messages that are kept, one of each object

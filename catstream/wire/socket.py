@@ -1,35 +1,34 @@
-"""The sockets of all channels: context, limits, connection events, keys, and the check of messages.
+"""The sockets of all channels: context, limits, keys, and the check of messages.
 
 Every queue, message and handshake has a limit. A frame that is not a message of the channel is counted, logged once and
 dropped. If the endpoint has keys, everything is encrypted (CURVE), and a peer that connects needs a key with the role
-of the channel: `_ZapHandler` decides.
+of the channel: `catstream.wire.zap` decides.
 """
 
 from __future__ import annotations
 
 import atexit
-import itertools
-import logging
+import errno
 import os
-import struct
-import threading
 import warnings
-from collections import Counter
-from collections.abc import Callable, Iterator
-from enum import Enum
+from collections.abc import Callable
 from functools import cache
+from time import monotonic
 from typing import Any, Generic, Self, TypeVar
 from weakref import WeakSet
 
 import zmq
 import zmq.utils.garbage  # with the first message that is not copied, zmq would import it
-from zmq.utils import z85
 
+from catstream.base.forks import after_fork, check_not_forked, forked, generation
 from catstream.errors import ProtocolError, ServiceError
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import ROLES, Keys
+from catstream.wire.keys import public_key
+from catstream.wire.monitor import Event, Monitor, arrives, has_keys
+from catstream.wire.rejects import disconnected, reject
+from catstream.wire.zap import ZapHandler
 
 LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last messages
 RECONNECT_MOST_SECONDS = 0.5  #: between two attempts to connect again
@@ -51,18 +50,14 @@ _OPTIONS = {
     zmq.RECONNECT_IVL_MAX: round(RECONNECT_MOST_SECONDS * 1000),
 }
 
-_POLLIN = int(zmq.POLLIN)  # an operation with a member of an enumeration would take half as long as to look
-_MOST_CAUSES = 1024  # causes of rejects that are remembered; each is logged once
-
-_log = logging.getLogger(__name__)
+_FAILURES = 3  # failed handshakes in a row, after which a client asks whether its keys are those of another pipeline
+_PROBE_SECONDS = 1.0  # between two such questions
 
 Message = TypeVar("Message")
 Kind = TypeVar("Kind")
 
 _OPEN: WeakSet[ChannelSocket[Any]] = WeakSet()  # sockets that were not closed yet
-_lock = threading.Lock()  # the ZAP handler has a thread of its own
-_counts: Counter[str] = Counter()
-_logged: set[tuple[str, str]] = set()
+_ZAP = ZapHandler()  # libzmq asks one for each context
 
 
 @cache
@@ -82,169 +77,15 @@ def check_owner(owner: int) -> None:
         )
 
 
-def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
-    """Whether a socket has a message, or gets one within so many seconds."""
-    # To look costs half as much as `poll`, and most sockets that are looked at have no message.
-    has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
-    return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))
-
-
-def reject(channel: str, cause: str, text: str) -> None:
-    """Count a message or a connection that was rejected on a channel, and log it unless its cause was logged before."""
-    with _lock:
-        _counts["rejected"] += 1
-        known = (channel, cause) in _logged
-        if len(_logged) >= _MOST_CAUSES:
-            _logged.clear()
-        _logged.add((channel, cause))
-    if not known:
-        _log.warning("%s: %s", channel, text)
-
-
-def rejects() -> dict[str, float]:
-    """How many messages and connections this process has rejected, and how many connections ended, for its health."""
-    return {name: float(_counts[name]) for name in ("rejected", "disconnected")}
-
-
-class Event(Enum):
-    """What ZeroMQ reports of a connection."""
-
-    STOPPED = "the socket is closed: nothing is reported after it"
-    CONNECTED = "the handshake succeeded"
-    DISCONNECTED = "a connection ended"
-    DENIED = "the handshake failed: the key was denied (ZAP status 400)"
-    OTHER_MECHANISM = "the handshake failed: one side has keys, the other has none"
-    FAILED = "the handshake failed for another reason"
-
-
-_EVENTS = {
-    zmq.EVENT_MONITOR_STOPPED: Event.STOPPED,
-    zmq.EVENT_HANDSHAKE_SUCCEEDED: Event.CONNECTED,
-    zmq.EVENT_DISCONNECTED: Event.DISCONNECTED,
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH: Event.DENIED,
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Event.FAILED,
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: Event.FAILED,
-}
-_MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
-
-
-class Monitor:
-    """Receives the connection events of one socket.
-
-    libzmq's I/O thread blocks if a monitor is not read, or has no reader any more: so the queue has no limit, and a
-    socket that listens is drained until the event `STOPPED` before its monitor is closed.
-    """
-
-    _numbers = itertools.count(1)  # a closed monitor keeps its address a little longer: each gets a new one
-
-    def __init__(self, socket: zmq.Socket[bytes]) -> None:
-        address = f"inproc://events-{next(self._numbers)}"
-        self._events: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)  # first: nothing is reported without it
-        self._events.set(zmq.RCVHWM, 0)
-        try:
-            socket.monitor(address, sum(_EVENTS))
-        except zmq.ZMQError:
-            self._events.close()
-            raise
-        self._events.connect(address)
-
-    def events(self, seconds: float) -> Iterator[Event]:
-        """The events that are here, and those that come within so many seconds of the one before."""
-        while not self._events.closed and arrives(self._events, seconds):
-            report, _ = self._events.recv_multipart()  # and the address of the other end
-            kind, value = struct.unpack("=Hi", report)
-            event = _EVENTS[kind]
-            yield Event.OTHER_MECHANISM if event is Event.FAILED and value == _MECHANISM_MISMATCH else event
-
-    def close(self) -> None:
-        self._events.close()
-
-
-class _ZapHandler:
-    """Decides which peers may connect to the sockets of this process that listen, if the pipeline has keys.
-
-    libzmq asks once for each connection, before it reads a message of it, by its protocol ZAP (RFC 27). A question
-    names the socket, as a "domain", and the peer's public key; the peer has proved by then that it holds the secret
-    one. The list of clients is read for each question, so no process has to be restarted if a client is allowed or
-    revoked. A connection that is open stays open. A thread answers while a socket is registered.
-
-    pyzmq's own handler, `zmq.auth`, is not used: see docs/decisions/0023-roles.md.
-    """
-
-    _address = "inproc://zeromq.zap.01"
-
-    def __init__(self) -> None:
-        self._sockets: dict[bytes, tuple[Channel[object], Keys]] = {}  # by domain
-        self._numbers = itertools.count(1)
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-
-    def register(self, channel: Channel[object], keys: Keys) -> bytes:
-        """Register a socket that listens; returns its domain."""
-        with self._lock:
-            domain = f"{channel.name} {next(self._numbers)}".encode()
-            self._sockets[domain] = channel, keys
-            if self._thread is None:
-                socket = context().socket(zmq.REP)
-                socket.bind(self._address)
-                self._thread = threading.Thread(target=self._serve, args=(socket,), name="zap", daemon=True)
-                self._thread.start()
-        return domain
-
-    def unregister(self, domain: bytes) -> None:
-        with self._lock:
-            self._sockets.pop(domain, None)
-            if self._thread is not None and not self._sockets:
-                with context().socket(zmq.REQ) as last:
-                    last.connect(self._address)
-                    last.send(b"")
-                    self._thread.join()
-                self._thread = None
-
-    def _serve(self, socket: zmq.Socket[bytes]) -> None:
-        with socket:
-            while len(question := socket.recv_multipart()) > 1:
-                _, request, domain, address, _, mechanism, *credentials = question
-                status = self._status(domain, address.decode(errors="replace"), mechanism, credentials)
-                socket.send_multipart([b"1.0", request, status, b"", b"", b""])
-            socket.unbind(self._address)  # at once, for the next thread: libzmq closes some time later
-
-    def _status(self, domain: bytes, address: str, mechanism: bytes, credentials: list[bytes]) -> bytes:
-        """The status that lets a peer connect (200), try again later (300), or not (400)."""
-        if domain not in self._sockets or mechanism != b"CURVE":
-            return b"400"
-        channel, keys = self._sockets[domain]
-        public = z85.encode(credentials[0]).decode()
-        try:
-            client = keys.client(public)
-        except ServiceError as error:
-            reject(channel.name, str(error), f"nobody can connect: {error}")
-            return b"300"
-        if client is None:
-            reject(channel.name, public, f"{address} was rejected, its key {public} is not allowed")
-            return b"400"
-        name, role = client
-        if ROLES.index(role) < ROLES.index(channel.role):
-            text = f"{name} at {address} was rejected, its role is {role} and not {channel.role}"
-            reject(channel.name, public, text)
-            return b"400"
-        return b"200"
-
-
-#: The handler of this process: libzmq asks one for each context.
-_ZAP = _ZapHandler()
-
-
 def _begin_copy() -> None:
     """Begin without the context and the threads of the process of which this one is a copy."""
-    global _ZAP, _lock
+    global _ZAP
     context.cache_clear()
-    _lock = threading.Lock()
     _OPEN.clear()
-    _ZAP = _ZapHandler()
+    _ZAP = ZapHandler()
 
 
-os.register_at_fork(after_in_child=_begin_copy)
+after_fork(_begin_copy)
 
 
 def _too_many(error: zmq.ZMQError) -> ServiceError:
@@ -253,6 +94,20 @@ def _too_many(error: zmq.ZMQError) -> ServiceError:
         f"cannot open a socket ({error.strerror}): close the subscriptions and pipelines that are not needed, "
         "or raise the limit of open files (ulimit -n)"
     )
+
+
+def _remedy(error: zmq.ZMQError) -> str:
+    """What to do if a socket cannot listen."""
+    match error.errno:
+        case errno.EADDRINUSE:
+            what = "another pipeline may be running there: wait for it, or choose"
+        case errno.ENOENT | errno.ENOTDIR:
+            what = "the folder does not exist: create it, or choose"
+        case errno.EACCES | errno.EPERM | errno.EROFS:
+            what = "this user may not write there: change the permissions, or choose"
+        case _:
+            what = "choose"
+    return f"{what} another endpoint (--set run.endpoint=...)"
 
 
 @atexit.register
@@ -275,7 +130,8 @@ class ChannelSocket(Generic[Message]):
         self._listens = False
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
-        self._pid = os.getpid()
+        self._generation = generation()
+        self._failures, self._probe_at = 0, 0.0  # failed handshakes since the last connection
         try:
             self._socket: zmq.Socket[bytes] = context().socket(kind)
         except zmq.ZMQError as error:
@@ -294,7 +150,7 @@ class ChannelSocket(Generic[Message]):
 
     def close(self) -> None:
         """Transmit what is queued, then close; the address is free for the next socket."""
-        if self._pid != os.getpid():  # a copy in a process that was forked, which lacks ZeroMQ's threads
+        if forked(self._generation):  # this process lacks ZeroMQ's threads
             return
         if self._listens:
             self._socket.close()
@@ -316,7 +172,7 @@ class ChannelSocket(Generic[Message]):
         # The monitor of a socket that was dropped has no reader any more, and would block ZeroMQ's thread: nothing more
         # would arrive at any socket of this program.
         socket = getattr(self, "_socket", None)
-        if socket is not None and not socket.closed and self._pid == os.getpid():
+        if socket is not None and not socket.closed and not forked(self._generation):
             socket.disable_monitor()
             socket.close()
             if self._monitor is not None:
@@ -336,7 +192,7 @@ class ChannelSocket(Generic[Message]):
             if keys is not None:
                 self._socket.set(zmq.CURVE_SECRETKEY, keys.listening())
                 self._socket.set(zmq.CURVE_SERVER, 1)
-                self._domain = _ZAP.register(self.channel, keys)
+                self._domain = _ZAP.register(context(), self.channel, keys)
                 self._socket.set(zmq.ZAP_DOMAIN, self._domain)
                 self._socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without a ZAP handler nobody may connect
             if self._endpoint.taken(self.channel, sender):
@@ -346,10 +202,7 @@ class ChannelSocket(Generic[Message]):
             self._listens = True
         except zmq.ZMQError as error:
             self.close()
-            raise ServiceError(
-                f"cannot listen on {address} ({error.strerror}): another pipeline may be running there, "
-                "wait for it or give another endpoint (--set run.endpoint=...)"
-            ) from None
+            raise ServiceError(f"cannot listen on {address} ({error.strerror}): {_remedy(error)}") from None
         except ServiceError:
             self.close()
             raise
@@ -415,9 +268,10 @@ class ChannelSocket(Generic[Message]):
 
         ServiceError if this side connects and is denied, or in a copy of the process.
         """
-        check_owner(self._pid)
+        check_not_forked(self._generation)
         for event in self._monitor.events(seconds) if self._monitor is not None else ():
             if event is Event.CONNECTED:
+                self._failures = 0
                 self._connected()
             elif event is Event.DISCONNECTED:
                 self._disconnected()
@@ -432,22 +286,43 @@ class ChannelSocket(Generic[Message]):
     def _disconnected(self) -> None:
         """A connection ended."""
         if self._listens:
-            _counts["disconnected"] += 1
+            disconnected()
 
     def _handshake_failed(self, event: Event) -> None:
         """Count a peer that failed; a key that was denied is counted by the ZAP handler already. Or raise the cause."""
-        keys = self._endpoint.keys
-        if self._listens and event is not Event.DENIED:
-            other = "does not speak ZeroMQ" if keys is None else "lacks the pipeline's keys"
+        if not self._listens:
+            self._failures += 1
+            if (problem := self._denial(event)) is not None:
+                raise ServiceError(problem)
+        elif event is not Event.DENIED:
+            other = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
             reject(self.channel.name, "handshake", f"a peer has failed the handshake: it has ended, or it {other}")
-        elif event is Event.DENIED and not self._listens:
-            raise ServiceError(
-                f"{self._endpoint} rejects this key: it was revoked, was never allowed, or lacks the role "
+
+    def _denial(self, event: Event) -> str | None:
+        """Why this client cannot connect, whenever it tries again; None if it may be able to later."""
+        endpoint, keys = self._endpoint, self._endpoint.keys
+        if event is Event.DENIED:
+            return (
+                f"{endpoint} rejects this key: it was revoked, was never allowed, or lacks the role "
                 f"{self.channel.role}, which {self.channel.name} requires; the pipeline's log says which: "
                 "ask its administrator (catstream keys allow)"
             )
-        elif event is Event.OTHER_MECHANISM and not self._listens and keys is None:
-            raise ServiceError(
-                f"the pipeline at {self._endpoint} requires authentication: pass a folder of keys that it allows "
+        if event is Event.OTHER_MECHANISM and keys is None:
+            return (
+                f"the pipeline at {endpoint} requires authentication: pass a folder of keys that it allows "
                 "(--keys DIR, see catstream keys)"
             )
+        if keys is None:
+            return None
+        if event is Event.OTHER_MECHANISM:
+            return f"the pipeline at {endpoint} has no keys: connect without keys (omit --keys)"
+        now = monotonic()
+        if self._failures < _FAILURES or now < self._probe_at or keys.server != public_key(keys.folder).encode():
+            return None  # a stream of a fleet has another key wherever it runs next
+        self._probe_at = now + _PROBE_SECONDS
+        if not any(has_keys(endpoint.address(self.channel, sender)) for sender in self.channel.senders):
+            return None
+        return (
+            f"the keys in {keys.folder} belong to another pipeline (the one at {endpoint} does not have the key in "
+            "server.pub): ask its administrator for current keys (catstream keys allow)"
+        )

@@ -1,5 +1,6 @@
 """Commands of a fleet, with a stand-in for it."""
 
+import os
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -23,3 +24,14 @@ def test_a_merged_model_replaces_a_file_only_if_asked_to(fail, monkeypatch, tmp_
     monkeypatch.setattr(fleet, "Fleet", lambda *_, **__: nullcontext(None))
     (tmp_path / "anna").touch()
     assert "anna exists already: replace it with --overwrite" in fail("fleet", "merge", "-o", tmp_path / "anna")
+
+
+@pytest.mark.parametrize("command", ["up", "down", "drain", "merge"])
+def test_without_a_home_directory_a_fleet_is_an_error_of_one_line(command, fail, tmp_path, monkeypatch):
+    file = tmp_path / "fleet.toml"
+    file.write_text('[streams.one]\nsource = "demo:1"\n')
+    for name in ("HOME", "XDG_STATE_HOME", "RAY_ADDRESS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 54321)  # no line in /etc/passwd
+    words = {"up": [file], "drain": ["node"]}
+    assert "set HOME or XDG_STATE_HOME" in fail("fleet", command, *words.get(command, []))

@@ -41,7 +41,7 @@ def test_every_command_has_a_help_text_with_examples(help_of, command):
 
 
 def test_an_unknown_command_is_an_error(fail):
-    assert "No such command 'trakc'" in fail("trakc")
+    assert fail("trakc").endswith("No such command 'trakc'. Did you mean 'track'?")
 
 
 NUMBERS = [
@@ -103,3 +103,18 @@ def test_as_json_a_program_reads_names_and_defaults(said, words):
     read = {each["name"]: each["default"] for each in json.loads(output)}
     assert read.items() <= Settings().values().items()
     assert bool(words) == (len(read) < len(Settings().values()))
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["trak"], "track"),
+        (["set_box"], "set-box"),
+        (["fleet", "staus"], "status"),
+        (["keys", "alow"], "allow"),
+        (["network", "prepair"], "prepare"),
+    ],
+)
+def test_the_nearest_command_is_suggested_for_a_mistyped_one(fail, words, meant):
+    assert fail(*words).endswith(f"Did you mean {meant!r}?")
+    assert "Did you mean" not in fail(*words[:-1], "xyzzy")

@@ -12,7 +12,7 @@ from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import find, fleets, reserve_endpoint, running
 from catstream.wire.keys import Client, Keys, allow, allowed, clients, create, revoke, synchronise
-from catstream.wire.socket import rejects
+from catstream.wire.rejects import rejects
 
 CAM = StreamStatus("cam-7", "running", "north", "walk.mp4", "run", token=3)
 SITE = FleetStatus("site", 1.7e9, {"cam-7": CAM}, {"north": NodeStatus("north", "alive")})

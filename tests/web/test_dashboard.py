@@ -96,7 +96,7 @@ def test_while_no_frames_are_tracked_the_page_says_why_and_nothing_of_where_the_
 
 def test_ready_is_what_tracks_and_a_process_is_silent_some_seconds_after_its_last_report():
     feed, everyone = PipelineFeed("run"), "no health report from: detector, compressor, trainer"
-    assert feed.problem == everyone
+    assert feed.problem_of() == everyone
     for ago, names, more, problem in (
         (SILENCE_SECONDS + 1.0, ("detector", "compressor", "trainer"), {}, everyone),
         (0.0, ("compressor", "trainer"), {}, "no health report from: detector"),
@@ -105,9 +105,9 @@ def test_ready_is_what_tracks_and_a_process_is_silent_some_seconds_after_its_las
     ):
         for name in names:
             feed.dashboard.take(Health(name, 1.0, {"sent": 1.0, **more}), monotonic() - ago)
-        assert feed.problem == problem
+        assert feed.problem_of() == problem
     feed.dashboard.take(End(2, "cannot read /home/me/secret.mp4", failed=True), monotonic())
-    assert feed.problem == "ended", "who has no token is told no name of a file"
+    assert feed.problem_of() == "ended", "who has no token is told no name of a file"
 
 
 def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, facts):

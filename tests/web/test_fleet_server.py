@@ -135,3 +135,25 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatc
         streams.close_unused(0.0)
 
     asyncio.run(use())
+
+
+@pytest.mark.parametrize(
+    ("state", "trouble", "answer"),
+    [
+        ("running", "", (200, "running\n")),
+        (
+            "failed",
+            "cannot open rtsp://10.0.0.7 (connection refused)",
+            (503, "failed: cannot open rtsp://10"),
+        ),
+        ("lost", "its source has been lost for 12 s", (503, "lost: its source has been lost for 12 s\n")),
+        ("paused", "", (503, "paused\n")),
+        ("starting", "", (503, "starting\n")),
+    ],
+)
+def test_the_first_question_whether_a_stream_is_ready_is_answered(fleet, page, until, state, trouble, answer):
+    fleet.stream("cam-7", state=state, trouble=trouble)
+    until(lambda: page.get("/readyz").status_code == 200)
+    ready = page.get("/streams/cam-7/readyz")
+    assert (ready.status_code, ready.text[: len(answer[1])]) == answer
+    assert page.get("/streams/cam-8/readyz").status_code == 404

@@ -7,7 +7,7 @@ import numpy as np
 from catstream.base.box import Box, Window
 from catstream.messages.kinds import Command, Model, Preview, Track
 from catstream.messages.schema import Field, Named, fields
-from catstream.wire.socket import rejects
+from catstream.wire.rejects import rejects
 
 
 def track(seq: int, name: str = "") -> Track:

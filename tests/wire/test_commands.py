@@ -9,7 +9,7 @@ import zmq
 
 from catstream.base.box import Box
 from catstream.client.control import Control
-from catstream.errors import CommandRejectedError, ProtocolError, SilenceError
+from catstream.errors import BoxError, CommandRejectedError, ServiceError, SilenceError
 from catstream.messages.kinds import Answer, Command
 from catstream.wire import commands
 from catstream.wire.channels import CHANNELS, CONTROL
@@ -205,6 +205,25 @@ def test_a_command_without_an_answer_raises_an_error(endpoint):
         control.stop()
 
 
-def test_a_box_that_cannot_be_encoded_is_rejected_before_it_is_sent(endpoint):
-    with Control(str(endpoint)) as control, pytest.raises(ProtocolError, match="> 0"):
-        control.set_box((1, 2, 0, 4))
+@pytest.mark.parametrize(
+    ("box", "problem"),
+    [
+        ("10,10,0,20", "at least 2 pixels, got 0 x 20"),
+        ("10,10,20,-5", "at least 2 pixels, got 20 x -5"),
+        ("nan,10,20,20", "four finite numbers, got nan,10,20,20"),
+        ("10,10,inf,20", "four finite numbers, got 10,10,inf,20"),
+        ((10, 10, 1e400, 20), "four finite numbers"),
+    ],
+)
+def test_an_invalid_box_is_rejected_before_it_is_sent(endpoint, box, problem):
+    with Control(endpoint) as control, pytest.raises(BoxError, match=problem):
+        control.set_box(box)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_an_invalid_number_of_seconds_is_rejected_before_it_is_sent(endpoint, seconds):
+    with Control(endpoint) as control:
+        with pytest.raises(ServiceError, match="seconds must be a finite number"):
+            control.pause(seconds)
+        with pytest.raises(ServiceError, match="time must be a finite number"):
+            control.set_box((1, 2, 30, 40), time=seconds)

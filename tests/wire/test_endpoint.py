@@ -13,9 +13,10 @@ from unittest.mock import Mock
 import pytest
 
 from catstream.errors import ServiceError
-from catstream.wire.channels import CHANNELS
+from catstream.wire.channels import CHANNELS, TRACKS
 from catstream.wire.endpoint import Endpoint, find, note, private_folder, reserve_endpoint, running, source_at
 from catstream.wire.keys import Keys, create
+from catstream.wire.newest import Publisher
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
 
@@ -111,7 +112,7 @@ def test_a_folder_that_is_made_is_for_this_user_alone_and_another_one_has_to_be(
     (folder / "file").touch()
     (folder / "open").mkdir()
     (folder / "open").chmod(0o777)
-    bad = {"file": "give another place", "open": "other users may write"}
+    bad = {"file": "is a file", "open": "other users may write"}
     if os.geteuid() == 0:  # only root can give a folder away
         (folder / "theirs").mkdir(mode=0o755)
         os.chown(folder / "theirs", 12345, 12345)
@@ -195,3 +196,41 @@ def test_a_pipeline_whose_keys_cannot_be_read_does_not_hide_the_others(tmp_path)
         assert str(good) in {str(endpoint) for endpoint in running()}
         assert str(other) not in {str(endpoint) for endpoint in running()}
         assert find(source="good.mp4").source == source_at(find(str(good))) == "good.mp4"
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("127.0.0.1:5700", "tcp://127.0.0.1:5700"),
+        ("localhost:5700", "tcp://localhost:5700"),
+        (":5700", "tcp://127.0.0.1:5700"),
+        ("tcp:/camera.example.org:5700", "tcp://camera.example.org:5700"),
+        ("//[::1]:5700/", r"tcp://\[::1\]:5700"),
+    ],
+)
+def test_an_address_without_its_prefix_is_not_taken_for_a_folder(text, meant, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    with pytest.raises(ServiceError, match=rf"did you mean {meant}\?"):
+        Endpoint.parse(text)
+    if "/" not in text:
+        (folder / text).mkdir()
+        assert Endpoint.parse(text).folder == Path(text)
+
+
+def test_a_file_is_no_endpoint(folder):
+    (folder / "file").touch()
+    with pytest.raises(ServiceError, match="is a file: pass a folder"):
+        Endpoint.parse(str(folder / "file"))
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "remedy"),
+    [
+        ("missing", "No such file or directory.*the folder does not exist"),
+        ("tcp://no-such-host.invalid:5700", "choose another endpoint"),
+    ],
+)
+def test_what_cannot_be_listened_on_is_an_error_with_its_remedy(endpoint, remedy, folder, keys):
+    place = Endpoint.parse(endpoint if "://" in endpoint else str(folder / endpoint), str(keys))
+    with pytest.raises(ServiceError, match=f"cannot listen on .*{remedy}"), Publisher(TRACKS, place):
+        pass

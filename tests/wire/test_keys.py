@@ -1,6 +1,7 @@
 """Who comes in, where a pipeline has keys: with real sockets, on every channel."""
 
 import os
+import socket
 import stat
 from contextlib import ExitStack, suppress
 
@@ -298,7 +299,8 @@ def test_two_pipelines_of_one_program_have_each_their_own_clients(place, keys, f
         Subscriber(MODELS, Endpoint.parse(second[0], str(keys))) as stranger,
     ):
         until(lambda: heard, lambda: (one.send(model), two.send(model), heard.extend(reader.receive_all())))
-        assert stranger.receive(0.1) is None
+        with pytest.raises(ServiceError, match="belong to another pipeline"):
+            until(lambda: False, lambda: (two.send(model), stranger.receive(0.02)))
 
 
 def test_sockets_with_keys_come_and_go_as_they_like(place, until):
@@ -327,3 +329,37 @@ def test_a_client_without_keys_gets_an_error_if_the_pipeline_requires_them(place
 
     with pytest.raises(ServiceError, match=r"requires authentication.*--keys DIR"):
         until(attached)
+
+
+@pytest.mark.parametrize(
+    ("server", "client", "cause"),
+    [
+        ("keys", "wrong", "belong to another pipeline"),
+        ("none", "keys", "has no keys: connect without keys"),
+        ("keys", "none", "requires authentication"),
+    ],
+)
+@pytest.mark.parametrize("name", ["tracks", "control"])
+def test_a_client_that_can_never_connect_is_told_the_cause(place, until, server, client, cause, name):
+    endpoint = place(client)
+    listening = Publisher(TRACKS, place(server)) if name == "tracks" else Responder(CONTROL, place(server))
+    connecting = Subscriber(TRACKS, endpoint) if name == "tracks" else Requester(CONTROL, endpoint)
+    with listening, connecting, pytest.raises(ServiceError, match=cause):
+        until(lambda: False, lambda: (listening._wait(0.01), connecting._wait(0.02)))
+
+
+def test_a_client_waits_behind_a_tunnel_whose_pipeline_has_not_started(place, tcp, until):
+    port = int(tcp.rpartition(":")[2]) + TRACKS.port
+    accepted, heard = [], []
+    with socket.create_server(("127.0.0.1", port)) as tunnel, Subscriber(TRACKS, place("watcher")) as reader:
+        tunnel.setblocking(False)
+
+        def turn():
+            reader.receive(0.01)
+            with suppress(BlockingIOError):
+                accepted.append(tunnel.accept()[0].close())
+
+        until(lambda: len(accepted) > 10, turn)
+        tunnel.close()
+        with Publisher(TRACKS, place()) as tracks:
+            until(lambda: heard, lambda: (tracks.send(track(1)), heard.extend(reader.receive_all())))

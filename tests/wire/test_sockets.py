@@ -21,8 +21,9 @@ from catstream.messages.kinds import End, Position, Sample, Summary, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
-from catstream.wire.socket import Event, Monitor, context
+from catstream.wire.socket import context
 from tests.wire.examples import model, track
 
 WINDOW = 4

@@ -12,7 +12,7 @@ from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import CHANNELS, FEATURES, RESULTS
 from catstream.wire.codec import VERSION, encode
 from catstream.wire.newest import Publisher, Subscriber
-from catstream.wire.socket import rejects
+from catstream.wire.rejects import rejects
 from tests.wire.examples import rejected
 
 WINDOW = 4

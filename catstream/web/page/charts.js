@@ -8,12 +8,13 @@ const [LEFT, TOP, BOTTOM] = [34, 8, 18];
 const CHARTS = [
   { title: "score", column: 1, least: 1, show: (value) => value.toFixed(2), unit: "" },
   { title: "frames a second", column: 2, least: 10, show: (value) => value.toFixed(0), unit: "" },
-  { title: "frame to model", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
+  { title: "learning delay", column: 3, least: 0.5, show: (value) => value.toFixed(2), unit: "s" },
   { title: "model version", column: 4, least: 4, show: (value) => value.toFixed(0), unit: "" },
 ];
 
 export class Charts {
   constructor(element) {
+    this.section = element.closest("section");
     this.rows = [];
     this.name = null;
     this.charts = CHARTS.map((chart) => ({ ...chart, ...figure(element, "chart", chart.title) }));
@@ -39,6 +40,7 @@ export class Charts {
   }
 
   draw() {
+    this.section.hidden = !this.rows.length;
     const points = this.rows.filter((row) => Object.hasOwn(row[2], this.name)).map(([second, rate, { [this.name]: [score, ...more] }]) => [second, score, rate, ...more]);
     for (const chart of this.charts) this.plot(chart, points);
   }

@@ -36,8 +36,6 @@ export class StreamPage {
     $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
       "Stop it", "Continue", () => this.send("stop"));
     addEventListener("pagehide", () => this.stage.cancel()); // else the pipeline resumes only once its pause is over
-    const trees = $("#trees details");
-    trees.open = matchMedia("(min-width: 40rem)").matches; // on a phone, they are much longer than the rest
     const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
     for (const drawn of [$("#stage"), $(".charts"), $(".trees")]) sizes.observe(drawn);
   }

@@ -1,0 +1,86 @@
+"""Authentication of the peers that connect to the sockets of this process (ZAP, RFC 27)."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import zmq
+from zmq.utils import z85
+
+from catstream.errors import ServiceError
+from catstream.wire.channels import Channel
+from catstream.wire.keys import ROLES, Keys
+from catstream.wire.rejects import reject
+
+
+class ZapHandler:
+    """Decides which peers may connect to the sockets of this process that listen, if the pipeline has keys.
+
+    libzmq asks once for each connection, before it reads a message of it, by its protocol ZAP (RFC 27). A question
+    names the socket, as a "domain", and the peer's public key; the peer has proved by then that it holds the secret
+    one. The list of clients is read for each question, so no process has to be restarted if a client is allowed or
+    revoked. A connection that is open stays open. A thread answers while a socket is registered.
+
+    pyzmq's own handler, `zmq.auth`, is not used: see docs/decisions/0023-roles.md.
+    """
+
+    _address = "inproc://zeromq.zap.01"
+
+    def __init__(self) -> None:
+        self._sockets: dict[bytes, tuple[Channel[object], Keys]] = {}  # by domain
+        self._numbers = itertools.count(1)
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def register(self, context: zmq.Context[zmq.Socket[bytes]], channel: Channel[object], keys: Keys) -> bytes:
+        """Register a socket that listens; returns its domain."""
+        with self._lock:
+            domain = f"{channel.name} {next(self._numbers)}".encode()
+            self._sockets[domain] = channel, keys
+            if self._thread is None:
+                self._context = context
+                socket = context.socket(zmq.REP)
+                socket.bind(self._address)
+                self._thread = threading.Thread(target=self._serve, args=(socket,), name="zap", daemon=True)
+                self._thread.start()
+        return domain
+
+    def unregister(self, domain: bytes) -> None:
+        with self._lock:
+            self._sockets.pop(domain, None)
+            if self._thread is not None and not self._sockets:
+                with self._context.socket(zmq.REQ) as last:
+                    last.connect(self._address)
+                    last.send(b"")
+                    self._thread.join()
+                self._thread = None
+
+    def _serve(self, socket: zmq.Socket[bytes]) -> None:
+        with socket:
+            while len(question := socket.recv_multipart()) > 1:
+                _, request, domain, address, _, mechanism, *credentials = question
+                status = self._status(domain, address.decode(errors="replace"), mechanism, credentials)
+                socket.send_multipart([b"1.0", request, status, b"", b"", b""])
+            socket.unbind(self._address)  # at once, for the next thread: libzmq closes some time later
+
+    def _status(self, domain: bytes, address: str, mechanism: bytes, credentials: list[bytes]) -> bytes:
+        """The status that lets a peer connect (200), try again later (300), or not (400)."""
+        if domain not in self._sockets or mechanism != b"CURVE":
+            return b"400"
+        channel, keys = self._sockets[domain]
+        public = z85.encode(credentials[0]).decode()
+        try:
+            client = keys.client(public)
+        except ServiceError as error:
+            reject(channel.name, str(error), f"nobody can connect: {error}")
+            return b"300"
+        if client is None:
+            reject(channel.name, public, f"{address} was rejected, its key {public} is not allowed")
+            return b"400"
+        name, role = client
+        if ROLES.index(role) < ROLES.index(channel.role):
+            text = f"{name} at {address} was rejected, its role is {role} and not {channel.role}"
+            reject(channel.name, public, text)
+            return b"400"
+        return b"200"
