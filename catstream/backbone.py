@@ -18,6 +18,7 @@ import numpy as np
 
 from catstream.base.box import Window
 from catstream.base.files import write_atomically, writing
+from catstream.base.text import cause_of
 from catstream.errors import SettingsError, VideoError, require_extra
 from catstream.features.layout import CELL, EDGE, STRIDE, WINDOW
 from catstream.features.network import ENERGY, MOST_CHANNELS, Network, by_onnxruntime
@@ -58,7 +59,9 @@ def prepare(
     try:
         model = onnx.shape_inference.infer_shapes(onnx.load(os.fspath(backbone)))
     except Exception as error:  # of the file, of protobuf, or of ONNX
-        raise SettingsError(f"cannot read the backbone {str(backbone)!r} ({error}): give an ONNX file") from None
+        raise SettingsError(
+            f"cannot read the backbone {str(backbone)!r} ({cause_of(error)}): pass an ONNX file"
+        ) from None
     crops = list(_crops(Path(images)))
     model = _cut(model, layer, str(backbone))
     _put_in_front(model, rgb, np.array(mean), np.array(std))

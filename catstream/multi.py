@@ -15,7 +15,7 @@ from types import MappingProxyType
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.names import UNNAMED, Boxes, boxes_by_name, check_count, check_name
+from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_count, check_name
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.threads import one_thread
@@ -155,7 +155,7 @@ class MultiTracker:
         image, boxes, time = as_bgr(frame), boxes_by_name({} if begin is None else begin), _seconds(time)
         models = {
             name: each if isinstance(each, SavedModel) else SavedModel.load(each)
-            for name, each in (search or {}).items()
+            for name, each in by_name(search or {}).items()
         }
         compressors = self._continued(models, boxes)
         if image.shape[:2] != self._size:
@@ -177,8 +177,7 @@ class MultiTracker:
         """The compressors of the objects of saved models; an error if one of the objects cannot begin."""
         if both := models.keys() & boxes.keys():
             raise ObjectError(f"{listed(sorted(both))}: a box and a saved model for one object: give one of them")
-        names = {check_name(name) for name in (*self.detectors.detectors, *boxes, *models)}
-        check_count(len(names), self.settings.run.objects_most)
+        check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.objects_most)
         network = self.detectors.network
         return {name: learned.compressor(self.settings, network, name) for name, learned in models.items()}
 
@@ -193,7 +192,7 @@ class MultiTracker:
             If there is no object of this name.
         """
         _ = self.tracks
-        self.detectors.forget(name)
+        self.detectors.forget(check_name(name))
 
     def saved_model(self, name: str = UNNAMED) -> SavedModel:
         """Everything that was learned of an object: save it as a model, and use it in another video.
@@ -208,6 +207,7 @@ class MultiTracker:
             If too few frames were learned from.
         """
         _ = self.tracks
+        name = check_name(name)
         if name not in self.forest.compressors:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
         return SavedModel.of(self.forest.compressors[name], self.settings)
@@ -222,6 +222,10 @@ class MultiTracker:
 
 def _seconds(time: float) -> float:
     """The time of a frame as a number of Python."""
-    if not math.isfinite(time):
-        raise FrameError(f"the time of a frame is a finite number of seconds, got {time}: give another, or none")
-    return float(time)
+    try:
+        seconds = float(time)
+    except (TypeError, ValueError):
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise FrameError(f"the time of a frame is a finite number of seconds, got {time!r:.80}: omit it if unknown")
+    return seconds

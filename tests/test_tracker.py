@@ -144,7 +144,7 @@ def test_a_copy_of_a_tracker_continues_as_the_tracker(video):
     assert {other.update(video[0][2]) for other in others} == {tracker.update(video[0][2])}
 
 
-@pytest.mark.parametrize("time", [math.nan, math.inf])
-def test_a_time_that_is_not_finite_is_rejected(video, time):
+@pytest.mark.parametrize("time", [math.nan, math.inf, None, "noon"])
+def test_a_time_that_is_no_finite_number_is_rejected(video, time):
     with pytest.raises(FrameError, match="finite number of seconds"):
         started(video).update(video[0][1], time)

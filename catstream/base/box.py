@@ -109,6 +109,17 @@ class Box(_Rectangle):
             ) from None
         return cls(x, y, w, h)
 
+    def rounded(self) -> tuple[int, int, int, int]:
+        """Return x, y, w, h in whole pixels, at least one wide and high, as `cv2.rectangle` takes them.
+
+        Examples
+        --------
+        >>> Box(10.6, 20.4, 30.2, 0.3).rounded()
+        (11, 20, 30, 1)
+        """
+        left, top, right, bottom = (round(value) for value in (self.x, self.y, self.x + self.w, self.y + self.h))
+        return left, top, max(right - left, 1), max(bottom - top, 1)
+
     def checked(self) -> Box:
         """Return the box unchanged if tracking can start with it in some frame.
 

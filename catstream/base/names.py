@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain
+from typing import TypeVar
+from unicodedata import category, normalize
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, ObjectError
@@ -15,28 +19,43 @@ UNNAMED = ""
 #: The boxes of objects: of one object without a name, or by name.
 Boxes = str | Iterable[float] | Mapping[str, str | Iterable[float]]
 
+_Value = TypeVar("_Value")
+
 _LONGEST = 64
+#: Blocks of Unicode with the combining marks of living scripts; a search through all of it would take half a second.
+_SCRIPTS = chain(range(0x300, 0x2100), range(0xA600, 0xAC00), range(0x11000, 0x11800), range(0x1E000, 0x1F000))
+#: Vowel signs and accents, which `\w` lacks, and the two joiners that Persian and the scripts of India write with.
+_MARKS = "".join(mark for mark in map(chr, _SCRIPTS) if category(mark).startswith("M")) + "\u200c\u200d"
 #: Regular expression of the name of an object.
-PATTERN = rf"(\w[\w.-]{{0,{_LONGEST - 1}}})?"
-
-
-def is_name(text: str) -> bool:
-    """Whether a text may be the name of an object."""
-    return re.fullmatch(PATTERN, text) is not None
+PATTERN = rf"(\w[\w{_MARKS}.-]{{0,{_LONGEST - 1}}})?"
 
 
 def check_name(name: str) -> str:
-    """Return the name of an object; raise ObjectError if it is not valid.
+    """Return the name of an object in the composed form of Unicode (NFC); raise ObjectError if it is not valid.
 
-    >>> check_name("anna-2")
-    'anna-2'
+    >>> check_name("anna-2"), check_name("Zoe\u0308")
+    ('anna-2', 'Zoë')
     """
-    if not isinstance(name, str) or not is_name(name):
+    composed = normalize("NFC", name) if isinstance(name, str) else None
+    if composed is None or re.fullmatch(PATTERN, composed) is None:
         raise ObjectError(
             f"{name!r:.80} is not a name: expected text of 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
             "the first of them a letter, a digit or '_'"
         )
-    return str(name)  # of a text of numpy, too
+    return str(composed)  # of a text of numpy, too
+
+
+def by_name(values: Mapping[str, _Value]) -> dict[str, _Value]:
+    """The values of objects by their checked names; ObjectError if one is not valid, or two are the same in Unicode.
+
+    >>> by_name({"Zoe\u0308": 1})
+    {'Zoë': 1}
+    """
+    names = Counter(map(check_name, values))
+    if len(names) < len(values):
+        (name, _), *_ = names.most_common(1)
+        raise ObjectError(f"two objects are named {name!r}, once with combining marks: rename one of them")
+    return dict(zip(map(check_name, values), values.values(), strict=True))
 
 
 def split_name(text: str) -> tuple[str, str]:
@@ -62,8 +81,8 @@ def boxes_by_name(boxes: Boxes) -> dict[str, Box]:
     if not isinstance(boxes, Mapping):
         return {UNNAMED: Box.parse(boxes)}
     parsed = {}
-    for name, box in boxes.items():
-        with errors_about(check_name(name)):
+    for name, box in by_name(boxes).items():
+        with errors_about(name):
             parsed[name] = Box.parse(box)
     return parsed
 

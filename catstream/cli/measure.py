@@ -73,7 +73,8 @@ def evaluate(
     PATH is a sequence or a folder of sequences. A sequence is a folder with
     images or one video, and a text file with the box of the object in each
     frame: groundtruth_rect.txt (x,y,w,h; nan if the object is absent). The
-    layouts of OTB, TLD, VOT and Princeton can be read.
+    layouts of OTB, LaSOT, GOT-10k, TLD, VOT and Princeton are supported, with
+    their flags of absence.
 
     \b
     TRACKERS
@@ -89,8 +90,8 @@ def evaluate(
       precision  share of frames whose centre is at most 20 pixels off
       norm.      normalised precision: the same, relative to the size of the object
       F          F-score of VOT-LT, if the object is absent in some frames
-      noticed    frames without the object in which no box is reported
-      false      frames with the object in which no box is reported
+      absence noticed   frames without the object in which no box is reported
+      falsely absent    frames with the object in which no box is reported
 
     --starts, --shifts and --jitter make several runs of each sequence; mean and
     standard deviation are printed. With --output, results are stored in the
@@ -114,7 +115,7 @@ def evaluate(
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     errors: list[CatstreamError] = []
-    sequences = [sequence for path in paths for sequence in datasets.find_sequences(path, errors.append)]
+    sequences = datasets.find_sequences(*paths, failed=errors.append)
     seen = {} if attributes is None else datasets.read_attributes(attributes)
 
     try:

@@ -19,7 +19,8 @@ from catstream.jobs.saved_model import merge as merged
 from catstream.processes.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 
 if TYPE_CHECKING:
-    from catstream.finding.find import File, Search
+    from catstream.finding.files import File
+    from catstream.finding.find import Search
     from catstream.finding.found import FileResult, SearchLog
 
 _SHOWN = 12  # intervals that are printed
@@ -94,7 +95,8 @@ def find(
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
-        from catstream.finding.find import Search, find_files, load_models
+        from catstream.finding.files import find_files
+        from catstream.finding.find import Search, load_models
         from catstream.finding.found import SearchLog, write_report, write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)

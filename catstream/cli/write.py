@@ -13,7 +13,7 @@ import click
 import numpy as np
 from rich.console import Console
 
-from catstream.base.names import is_name
+from catstream.base.names import split_name
 from catstream.base.text import counted, listed
 from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
@@ -45,13 +45,13 @@ def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dic
     """The corners of the zones by name."""
     zones: dict[str, Any] = {}
     for text in texts:
-        name, _equals, corners = text.partition("=")
+        name, corners = split_name(text)
         pairs = [corner.split(",") for corner in corners.split()]
         try:
             points = tuple((float(x), float(y)) for x, y in pairs)
         except ValueError:
             points = ()
-        if not (name and is_name(name) and name not in zones and len(points) > 2 and np.isfinite(points).all()):
+        if not (name and name not in zones and len(points) > 2 and np.isfinite(points).all()):
             raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three corners or more, got {text!r}')
         zones[name] = points
     return zones

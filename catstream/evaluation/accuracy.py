@@ -24,7 +24,7 @@ MEASURES = {
     "auc": "AUC",
     "success": "success",
     "precision": "precision",
-    "normalised_precision": "norm.",
+    "normalised_precision": "norm. precision",
     "f_score": "F",
     "fps": "frames/s",
 }
@@ -33,7 +33,7 @@ MEASURES = {
 COUNTS = ("absent", "noticed", "present", "false")
 
 #: The headings of `cells`.
-HEADINGS = (*list(MEASURES.values())[:-1], "noticed", "false", MEASURES["fps"])
+HEADINGS = (*list(MEASURES.values())[:-1], "absence noticed", "falsely absent", MEASURES["fps"])
 
 #: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
 FLIP = 0.25
@@ -207,11 +207,11 @@ def write_report(
     body = [
         "<h1>Accuracy</h1>",
         f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
-        "the object count only for F and noticed. Noticed and false are the frames without and with the object that "
-        "have no reported box. ± is the standard deviation over the runs of a sequence.</p>",
+        "the object count only for F and absence noticed. Absence noticed and falsely absent: frames without and with "
+        "the object for which no box is reported. ± is the standard deviation over the runs of a sequence.</p>",
         *(f'<p class="about">Not included: {escape(str(error))}</p>' for error in errors),
         *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
-        _plots(runs),
+        _plots(runs, {tracker: mean["auc"] or 0.0 for tracker, mean in mean_of(rows).items()}),
         "<h2>Sequences</h2>",
         _table(rows),
         *(["<h2>Attributes</h2>", _attribute_table(rows, attributes)] if attributes else []),
@@ -221,8 +221,9 @@ def write_report(
     return write_page(path, "evaluation", body)
 
 
-def _plots(runs: list[EvaluationRun]) -> str:
-    """Plot success and precision of each tracker, averaged over the sequences."""
+def _plots(runs: list[EvaluationRun], aucs: Mapping[str, float]) -> str:
+    """Plot success and precision of each tracker, averaged over the sequences; each has one colour in both."""
+    trackers = sorted(dict.fromkeys(run.tracker for run in runs), key=lambda tracker: -aucs[tracker])
 
     def curves(
         places: np.ndarray, measure: Callable[..., Float64], at: Callable[[Float64], float]
@@ -236,8 +237,7 @@ def _plots(runs: list[EvaluationRun]) -> str:
             tracker: np.mean([np.mean(plots, axis=0) for plots in sequences.values()], axis=0)
             for tracker, sequences in by_tracker.items()
         }
-        ranked = sorted(means.items(), key=lambda item: -at(item[1]))
-        return {f"{tracker}  {at(curve):.3f}": (places, curve) for tracker, curve in ranked}
+        return {f"{tracker}  {at(means[tracker]):.3f}": (places, means[tracker]) for tracker in trackers}
 
     overlap, distance = (
         dataclasses.replace(SHARES, label="overlap threshold"),

@@ -1,4 +1,4 @@
-"""Annotated sequences in the layouts of OTB, TLD, VOT and Princeton, and the frames and boxes that runs start with.
+"""Annotated sequences in the layouts of public data sets, and the frames and boxes that runs start with.
 
 A sequence is a folder with frames, in any form that `catstream.video.source`
 opens, and one of these files:
@@ -6,13 +6,15 @@ opens, and one of these files:
     groundtruth_rect.txt   OTB: x,y,w,h (comma, semicolon, blank or tab); two objects, groundtruth_rect.1.txt and
                            .2.txt, are two sequences
     gt.txt                 TLD: x1,y1,x2,y2
-    groundtruth.txt        VOT: polygons x1,y1,x2,y2 ... (their bounding box is taken), or x,y,w,h
+    groundtruth.txt        VOT: polygons x1,y1,x2,y2 ... (replaced by their bounding boxes), or x,y,w,h, as in
+                           LaSOT and GOT-10k
     FOLDER.txt             Princeton: x,y,w,h,occluded, and the frames in rgb/
 
 Each file has one line for each frame; NaN, or a box without area, means that
-the object is absent. Numbers may have a decimal comma, if commas do not also
-separate them. Boxes are used as published; OTB's pixel coordinates, which start
-at 1, are not shifted.
+the object is absent. So do the flags of a data set beside the file, since boxes
+of frames without the object repeat the last one: see `_ABSENCE`. Numbers may
+have a decimal comma, if commas do not also separate them. Boxes are used as
+published; OTB's pixel coordinates, which start at 1, are not shifted.
 
 A run starts from one of these:
 
@@ -34,9 +36,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from catstream.base.arrays import Float64, UInt8
+from catstream.base.arrays import Bool, Float64, UInt8
 from catstream.base.box import Box
-from catstream.base.text import counted
+from catstream.base.text import cause_of, counted
 from catstream.errors import BoxError, SettingsError, VideoError
 from catstream.video.images import natural_order
 from catstream.video.source import open_source
@@ -45,6 +47,15 @@ from catstream.video.source import open_source
 #: boxes.
 _FIRST_FRAMES = {("david", 471): 299}
 _RECT = re.compile(r"groundtruth_rect(\.\d+)?")  # others beside it, such as groundtruth_rect_old, are of no sequence
+
+
+#: Files with a number for each frame that say in which frames the object is absent, and the test of a number.
+_ABSENCE: dict[str, Callable[[Float64], Bool]] = {
+    **dict.fromkeys(("full_occlusion.txt", "out_of_view.txt"), lambda flags: flags != 0),  # LaSOT
+    "absence.label": lambda flags: flags != 0,  # GOT-10k
+    "cover.label": lambda levels: levels == 0,  # GOT-10k: eighths of the object that are visible
+    **dict.fromkeys(("full-occlusion.tag", "out-of-frame.tag"), lambda flags: flags != 0),  # VOT, CDTB
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,31 +97,55 @@ class Sequence:
         return width, height
 
 
-def find_sequences(path: str | Path, failed: Callable[[VideoError], None] | None = None) -> list[Sequence]:
-    """Return the sequence in a folder, or the sequences in its subfolders, in natural order.
+def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | None = None) -> list[Sequence]:
+    """Return the sequence in each folder, or the sequences in its subfolders, in natural order; each once.
 
-    failed : function that is called with the error of each sequence whose ground truth is malformed, while the others
-        are read; if None, the error is raised
+    failed : function that is called with the error of each sequence that cannot be read, while the others are; if None,
+        the error is raised
     """
-    path = Path(path)
-    folders = [path]
-    if not _truths(path) and path.is_dir():
-        folders = sorted((inner for inner in path.iterdir() if inner.is_dir()), key=natural_order)
-    truths = [truth for folder in folders for truth in _truths(folder)]
-    if not truths:
-        raise VideoError(
-            f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with groundtruth_rect.txt "
-            "(x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT) or FOLDER.txt (Princeton), or a folder of such folders"
-        )
-    sequences = []
-    for truth in truths:
-        try:
-            sequences.append(_sequence(*truth))
-        except VideoError as error:
+    sequences: dict[Path, Sequence | None] = {}  # by the file of the ground truth
+    for path in map(Path, paths):
+        folders = _folders(path)
+        truths = [truth for folder in folders for truth in _truths(folder)]
+        for link in filter(_is_dead_link, folders):
+            error = VideoError(f"{str(link)!r} is a dead link: {str(link.readlink())!r} does not exist")
             if failed is None:
-                raise
+                raise error
             failed(error)
-    return sequences
+        if not truths:
+            raise VideoError(
+                f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with "
+                "groundtruth_rect.txt (x,y,w,h), gt.txt (TLD), groundtruth.txt (VOT, LaSOT, GOT-10k) or FOLDER.txt "
+                "(Princeton), or a folder of such folders"
+            )
+        for truth in truths:
+            if (file := truth[2].resolve()) in sequences:
+                continue
+            sequences[file] = None
+            try:
+                sequences[file] = _sequence(*truth)
+            except VideoError as error:
+                if failed is None:
+                    raise
+                failed(error)
+    return [sequence for sequence in sequences.values() if sequence is not None]
+
+
+def _folders(path: Path) -> list[Path]:
+    """Return the folder of a sequence itself, or the folders and dead links in a folder."""
+    if _truths(path) or not path.is_dir():
+        return [path]
+    inner = (inner for inner in path.iterdir() if not inner.name.startswith("."))
+    return sorted((each for each in inner if each.is_dir() or _is_dead_link(each)), key=natural_order)
+
+
+def _is_there(file: Path) -> bool:
+    """Whether there is such a file, or a dead link, which is an error when it is read."""
+    return file.is_file() or _is_dead_link(file)
+
+
+def _is_dead_link(path: Path) -> bool:
+    return path.is_symlink() and not path.exists()
 
 
 class _Layout(NamedTuple):
@@ -126,7 +161,11 @@ def _rectangles(table: Float64) -> Float64:
 
 
 def _corners(table: Float64) -> Float64:
-    return np.hstack([table[:, :2], table[:, 2:] - table[:, :2]])
+    boxes = np.hstack([table[:, :2], table[:, 2:] - table[:, :2]])
+    if (boxes[:, 2:] < 0).any():
+        line = int((boxes[:, 2:] < 0).any(axis=1).argmax()) + 1
+        raise ValueError(f"line {line} has x2 < x1 or y2 < y1: if it is x,y,w,h, name the file groundtruth_rect.txt")
+    return boxes
 
 
 def _polygons(table: Float64) -> Float64:
@@ -153,12 +192,16 @@ def _truths(folder: Path) -> list[tuple[str, Path, Path, _Layout]]:
         ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
         return [(name + end, folder, file, _OTB) for file, end in zip(rects, ends, strict=True)]
     others = {"gt.txt": _TLD, "groundtruth.txt": _VOT, f"{target.name}.txt": _PRINCETON}
-    found = [(name, folder, folder / file, layout) for file, layout in others.items() if (folder / file).is_file()]
-    return found[:1]
+    files = [(name, folder, folder / file, layout) for file, layout in others.items() if _is_there(folder / file)]
+    return files[:1]
 
 
 def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
-    boxes = layout.boxes(_numbers(file, layout))
+    try:
+        boxes = layout.boxes(_numbers(file, layout))
+    except ValueError as error:
+        raise VideoError(f"{str(file)!r}: {error}") from None
+    boxes[_absent(folder, len(boxes))] = np.nan
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
     present = np.isfinite(boxes).all(axis=1).sum()
     if present < 2:  # a run starts with the first box
@@ -166,19 +209,64 @@ def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
             f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
             "frame, and the object in at least two frames"
         )
-    return Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
+    sequence = Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
+    if layout is not _TLD and _look_like_corners(sequence):
+        raise VideoError(
+            f"{str(file)!r} looks like corners x1,y1,x2,y2, expected {layout.line}: for corners, name the file gt.txt"
+        )
+    return sequence
+
+
+def _look_like_corners(sequence: Sequence) -> bool:
+    """Whether x,y,w,h are rather x1,y1,x2,y2.
+
+    Then w > x and h > y in each frame, and w and h change with x and y, or reach out of the frame.
+    """
+    x, y, w, h = sequence.boxes[np.isfinite(sequence.boxes).all(axis=1)].T
+    if (w <= x).any() or (h <= y).any():
+        return False
+    if 2 * (np.var(w - x) + np.var(h - y)) < np.var(w) + np.var(h):
+        return True
+    try:
+        width, height = sequence.size()
+    except VideoError:  # said by the run
+        return False
+    fits = ((w <= width + 1) & (h <= height + 1)).mean() > 0.5
+    return bool(fits and ((x + w > width + 2) | (y + h > height + 2)).mean() > 1 / 3)
+
+
+def _absent(folder: Path, frames: int) -> Bool:
+    """Read the flags of absence in the folder of a sequence, bool (frames,)."""
+    absent = np.zeros(frames, bool)
+    for name, is_absent in _ABSENCE.items():
+        file = folder / name
+        if not file.is_file():
+            continue
+        try:
+            flags = np.array(re.split(r"[\s,]+", _text(file).strip()), float)
+        except ValueError:
+            raise VideoError(f"{str(file)!r} is not a list of numbers: expected one for each frame") from None
+        if len(flags) != frames:
+            raise VideoError(
+                f"{str(file)!r} has {counted(len(flags), 'number')} for {frames} boxes: expected one for each box"
+            )
+        absent |= is_absent(flags)
+    return absent
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8-sig").rstrip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise VideoError(
+            f"{str(file)!r} cannot be read ({cause_of(error)}): expected a text file with one line for each frame"
+        ) from None
 
 
 def _numbers(file: Path, layout: _Layout) -> Float64:
     """Read the table in a text file, float64 (lines, columns)."""
     rows: list[list[float]] = []
-    try:
-        lines = file.read_text(encoding="utf-8-sig").rstrip().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise VideoError(
-            f"{str(file)!r} cannot be read ({error}): expected a text file with one line for each frame"
-        ) from None
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(_text(file).splitlines(), start=1):
         if not line.strip():  # skipping the line would shift all later boxes by one frame
             raise VideoError(f"{str(file)!r}, line {number} is blank: if the object is absent, write nan,nan,nan,nan")
         columns = [len(rows[0])] if rows else layout.columns
@@ -369,5 +457,6 @@ def read_attributes(file: Path) -> dict[str, list[str]]:
         return msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
     except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
         raise SettingsError(
-            f'cannot read the attributes in {str(file)!r} ({error}): give a JSON file {{"sequence": ["occlusion"]}}'
+            f"cannot read the attributes in {str(file)!r} ({cause_of(error)}): "
+            'expected a JSON file {"sequence": ["occlusion"]}'
         ) from None

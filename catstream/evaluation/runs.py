@@ -26,6 +26,7 @@ import numpy as np
 from catstream.base.arrays import Float64
 from catstream.base.files import write_atomically, writing
 from catstream.base.settings import Settings
+from catstream.base.text import cause_of
 from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence, Start
 from catstream.evaluation.peers import OPENCV
@@ -123,7 +124,9 @@ def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> Evalua
             np.loadtxt(seconds, ndmin=1),
         )
     except (OSError, ValueError) as error:
-        raise CatstreamError(f"{str(boxes.parent)!r} cannot be read ({error}): remove it to repeat the run") from None
+        raise CatstreamError(
+            f"{str(boxes.parent)!r} cannot be read ({cause_of(error)}): remove it to repeat the run"
+        ) from None
     if not len(sequence) - start.frame == len(run.boxes) == len(run.confidence) == len(run.seconds):
         return None
     return run if _has_first_box(run) else None

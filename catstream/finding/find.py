@@ -10,20 +10,18 @@ import hashlib
 import logging
 import math
 import os
-from collections import Counter, defaultdict, deque
+from collections import defaultdict, deque
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from catstream.base.addresses import without_password
 from catstream.base.box import Box, Window
 from catstream.base.settings import RunSettings, Settings
-from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.detection.search import SAME_OVERLAP, Detection, fitted
 from catstream.detection.similarity import Similarity
@@ -33,15 +31,12 @@ from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
+from catstream.finding.files import File, NamedFrame, Reading, find_files
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Model
-from catstream.video.frames import Frame, read_ahead
-from catstream.video.images import IMAGES, ImageReader, first_pages, image_files, natural_order, pages_of
-from catstream.video.source import VIDEOS, is_live, open_source
+from catstream.video.frames import Frame
 
 _One = TypeVar("_One", bound=str | os.PathLike[str] | SavedModel)
-#: A frame that is searched, and the name of its file in a folder of images.
-_Searched = tuple[Frame, str]
 
 #: Seconds of a video between two frames that are searched.
 EVERY = 0.2
@@ -56,7 +51,6 @@ _MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for 
 _WIDEST = 1.25  # of a window, as a multiple of the frame: its object fills the frame
 _SMALLEST = 24  # side of a window in pixels: a smaller one shows too little of its object
 _MOST_MAXIMA = 8  # windows of one size that are examined, and sightings of one object in a frame
-_TIME_STEP = 0.001  # of most containers, in seconds: time stamps are rounded to it
 _FITTED = 0.7  # share of the threshold from which a window is fitted: its score rises by less
 
 _log = logging.getLogger(__name__)
@@ -91,129 +85,6 @@ class Sighting:
     box: Box
     score: float
     image: str = ""
-
-
-@dataclass(slots=True, kw_only=True)
-class Reading:
-    """The length and the problems of a file, which become known while it is read.
-
-    frames    number of its frames, None if unknown
-    problems  reasons for what could not be read: each image, or at the end of a video the frames that were skipped
-    """
-
-    frames: int | None = None
-    problems: list[str] = field(default_factory=list)
-
-
-@dataclass(frozen=True, slots=True)
-class File:
-    """A video, a folder of images, or a single image.
-
-    path  of the file, or of the folder
-    kind  "video", "images" or "image"
-    """
-
-    path: Path
-    kind: Literal["video", "images", "image"]
-
-    @property
-    def signature(self) -> list[int]:
-        """Number of files, their total size, and the newest time of modification: it differs if the file changed."""
-        states = [path.stat() for path in self.paths() if path.exists()]  # a dead link is a damaged image
-        newest = max((state.st_mtime_ns for state in states), default=0)
-        return [len(states), sum(state.st_size for state in states), newest]
-
-    def paths(self) -> list[Path]:
-        """The video, or the images in order."""
-        return image_files(self.path) if self.kind == "images" else [self.path]
-
-    def frames(self, every: float, settings: RunSettings, reading: Reading) -> Generator[_Searched]:
-        """Yield the frames to search: all images; of a video the first one in each `every` seconds, and the last one.
-
-        A video that is damaged raises VideoError after the frames before the damage.
-        """
-        if self.kind == "video":
-            # Not in equal numbers of frames: the rate of a file may be nominal, and its frames need not be regular.
-            with open_source(self.path, settings=settings, resize=True) as source:
-                reading.frames = source.frames
-                before, last = -1.0, None
-                with closing(read_ahead(source)) as frames:
-                    for frame in frames:
-                        interval = (frame.time + _TIME_STEP) // every if every else frame.number
-                        last = frame if interval == before else None
-                        if last is None:
-                            yield frame, ""
-                        before = interval
-                if last is not None:
-                    yield last, ""
-                if scaled := source.counters.get("scaled"):
-                    _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
-                if skipped := source.counters.get("damaged"):
-                    reading.problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
-            return
-        pages = first_pages(self.paths()) if self.kind == "images" else pages_of(self.path)
-        reading.frames = len(pages)
-        read_image = ImageReader(pages)
-        for number, (path, _) in enumerate(pages):
-            image = read_image(number)
-            if image is None:
-                reading.problems.append(f"cannot read the image {str(path)!r}: it is left out")
-            else:
-                yield Frame(number, number / settings.image_rate, image), path.name if self.kind == "images" else ""
-
-
-def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
-    """Return the files to search, in order and each once; folders are searched with all their subfolders.
-
-    The images of one folder are one file, in natural order (2.png before 10.png).
-    """
-    found: dict[File, None] = {}
-    for path in paths:
-        if is_live(str(path)):
-            raise VideoError(
-                f"{without_password(str(path))} is a live source: record it to a video first, and give the video"
-            )
-        found |= dict.fromkeys(_files(Path(path)))
-    return list(found)
-
-
-def _files(path: Path) -> list[File]:
-    if path.is_file():
-        return [File(path, "image" if pages_of(path) else "video")]
-    if not path.is_dir():
-        raise VideoError(f"there is no file or folder {str(path)!r}: give videos, images, or folders of them")
-    others: Counter[str] = Counter()
-    found = list(_files_below(path, set(), others))
-    left_out = ", ".join(f"{number} {suffix}" for suffix, number in others.most_common())
-    if not found:
-        raise VideoError(
-            f"the folder {str(path)!r} and its subfolders hold neither images nor videos"
-            f"{left_out and f' ({left_out})'}: give another folder, or name the files"
-        )
-    if left_out:
-        _log.warning("left out of %s: %s; a file that is named is searched", path, left_out)
-    return found
-
-
-def _files_below(folder: Path, searched: set[Path], others: Counter[str]) -> Iterator[File]:
-    """Yield the files in a folder and its subfolders, also in linked ones; count the suffixes of all others."""
-    if folder.resolve() in searched:  # a link leads back to it
-        return
-    searched.add(folder.resolve())
-    entries = sorted((entry for entry in folder.iterdir() if not entry.name.startswith(".")), key=natural_order)
-    if any(entry.suffix.lower() in IMAGES and entry.is_file() for entry in entries):
-        yield File(folder, "images")
-    for entry in entries:
-        suffix = entry.suffix.lower()
-        if entry.is_dir():
-            try:
-                yield from _files_below(entry, searched, others)
-            except PermissionError as error:
-                _log.warning("%s is left out (%s)", error.filename, error.strerror)
-        elif suffix in VIDEOS and entry.is_file():
-            yield File(entry, "video")
-        elif suffix not in IMAGES:
-            others[suffix or "without a suffix"] += 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -506,10 +377,10 @@ def _several(given: _One | Iterable[_One]) -> Iterable[_One]:
     return [given] if isinstance(given, str | os.PathLike | SavedModel) else given
 
 
-def _scanned(scan: Scan, frames: Iterator[_Searched]) -> Generator[tuple[_Searched, list[list[Seen]]]]:
+def _scanned(scan: Scan, frames: Iterator[NamedFrame]) -> Generator[tuple[NamedFrame, list[list[Seen]]]]:
     """Scan frames in several threads, and yield the results in order; an error of the source comes after them."""
     workers = len(os.sched_getaffinity(0))
-    pending: deque[tuple[_Searched, Future[list[list[Seen]]]]] = deque()
+    pending: deque[tuple[NamedFrame, Future[list[list[Seen]]]]] = deque()
     problem: VideoError | None = None
     with ThreadPoolExecutor(workers, "scan") as pool:
         try:

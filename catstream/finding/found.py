@@ -20,9 +20,10 @@ from catstream.base.box import Box
 from catstream.base.files import write_atomically, writing
 from catstream.base.text import counted
 from catstream.errors import ServiceError
-from catstream.finding.find import File, Reading, Sighting, Step
-from catstream.reports.page import Bar, clock, figure, legend, table, timeline, write_page
-from catstream.video.drawing import Colours
+from catstream.finding.files import File, Reading
+from catstream.finding.find import Sighting, Step
+from catstream.reports.page import COLOURS, Bar, clock, figure, legend, table, timeline, write_page
+from catstream.video.drawing import Colours, outline
 from catstream.video.frames import jpeg
 
 _KIND = "catstream find 3"  # and the version of the lines
@@ -95,12 +96,14 @@ class FileResult(Reading):
 
 
 def _picture(image: np.ndarray, box: Box) -> bytes:
-    """A small square JPEG of an object with some of its surroundings."""
+    """A small square JPEG of an object with its box and some of its surroundings."""
     height, width = image.shape[:2]
     side = round(np.clip(max(box.w, box.h) * _SURROUNDINGS, 16, min(width, height)))
     left, top = (round(centre - side / 2) for centre in box.centre)
     left, top = int(np.clip(left, 0, width - side)), int(np.clip(top, 0, height - side))
-    return jpeg(image[top : top + side, left : left + side], _PICTURE)
+    picture = image[top : top + side, left : left + side].copy()
+    outline(picture, Box(box.x - left, box.y - top, box.w, box.h), COLOURS[0], unit=side / _PICTURE)
+    return jpeg(picture, _PICTURE)
 
 
 class SearchLog(AbstractContextManager["SearchLog"]):

@@ -22,7 +22,7 @@ import msgspec
 from msgspec import Meta
 
 from catstream.base.box import Box
-from catstream.base.names import UNNAMED, boxes_by_name, check_name
+from catstream.base.names import UNNAMED, boxes_by_name, by_name, check_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
 from catstream.errors import CatstreamError, FleetError
@@ -119,7 +119,7 @@ class StreamSpec:
             if source.strip() and not is_live(source) and "://" not in source:
                 values["source"] = str(folder / source)  # its node has another working folder
             values["boxes"] = boxes_by_name(values["boxes"])
-            values["models"] = {check_name(each): folder / file for each, file in values["models"].items()}
+            values["models"] = {each: folder / file for each, file in by_name(values["models"]).items()}
             values["settings"] = flat(values.get("settings", {}))
             names = [follow] if isinstance(follow, str) else follow
             values["follow"] = tuple(dict.fromkeys(map(check_name, names)))

@@ -18,7 +18,7 @@ import msgspec
 
 from catstream.base.box import Box
 from catstream.base.files import writing
-from catstream.base.names import UNNAMED, check_count, check_name
+from catstream.base.names import UNNAMED, by_name, check_count
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, ServiceError, SettingsError
@@ -208,7 +208,7 @@ def changed_setting(before: Settings, after: Settings) -> str:
 def files_by_name(files: Models | None) -> dict[str, Path]:
     """Files by the names of their objects; a file without a name is for the only object."""
     named = files if isinstance(files, Mapping) else {} if files is None else {UNNAMED: files}
-    return {check_name(name): Path(file) for name, file in named.items()}
+    return {name: Path(file) for name, file in by_name(named).items()}
 
 
 def _plain(value: object) -> object:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from statistics import fmean
 from threading import Event, Thread
 from time import monotonic
 
@@ -261,37 +260,31 @@ def _models(observations: Observations, schedule: Schedule) -> list[tuple[float,
 
 
 class Usage:
-    """Processor and memory use of named groups of processes; after a restart, the process ids of a group may change.
+    """Processor use of named groups of processes; after a restart, the process ids of a group may change.
 
-    readings  by name, and of `REST`, oldest first: mean number of busy cores since the reading before, resident bytes
+    readings  mean number of busy cores since the reading before, by name, and of `REST`, oldest first
     """
 
     def __init__(self) -> None:
-        self.readings: dict[str, list[tuple[float, int]]] = {}
+        self.readings: dict[str, list[float]] = {}
         self._processes: dict[int, psutil.Process] = {}  # psutil keeps the processor time of the previous reading in it
 
     def read(self, groups: Mapping[str, Iterable[int]]) -> None:
         """Add a reading of groups of process ids; the first call only starts the measurement."""
         is_first = not self._processes
-        rest, rest_memory = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1), psutil.virtual_memory().used
-        read: dict[str, tuple[float, int]] = {}
-        for name, pids in groups.items():
-            used = [self._of(pid) for pid in pids]
-            cores, memory = sum(busy for busy, _ in used), sum(resident for _, resident in used)
-            read[name] = cores, memory
-            rest, rest_memory = rest - cores, rest_memory - memory
+        all_cores = psutil.cpu_percent() / 100 * (psutil.cpu_count() or 1)
+        cores = {name: sum(map(self._cores, pids)) for name, pids in groups.items()}
         if not is_first:
-            for name, reading in (read | {REST: (max(0.0, rest), max(0, rest_memory))}).items():
+            for name, reading in (cores | {REST: max(0.0, all_cores - sum(cores.values()))}).items():
                 self.readings.setdefault(name, []).append(reading)
 
-    def _of(self, pid: int) -> tuple[float, int]:
-        """Return busy cores and memory of a process; nothing if it has just ended."""
+    def _cores(self, pid: int) -> float:
+        """Return the busy cores of a process; 0 if it has just ended."""
         try:
-            process = self._processes.get(pid) or psutil.Process(pid)
-            self._processes[pid] = process
-            return process.cpu_percent() / 100, process.memory_info().rss
+            self._processes[pid] = self._processes.get(pid) or psutil.Process(pid)
+            return float(self._processes[pid].cpu_percent() / 100)
         except psutil.Error:
-            return 0.0, 0
+            return 0.0
 
 
 def proportional_memory(pids: Iterable[int]) -> int:
@@ -301,9 +294,3 @@ def proportional_memory(pids: Iterable[int]) -> int:
         with suppress(psutil.Error):  # it has just ended
             total += psutil.Process(pid).memory_full_info().pss
     return total
-
-
-def summary(readings: Sequence[tuple[float, int]]) -> dict[str, float]:
-    """Return mean and maximum of busy cores and of memory in bytes."""
-    cores, memory = zip(*readings, strict=True)
-    return {"cores": fmean(cores), "cores_most": max(cores), "memory": fmean(memory), "memory_most": max(memory)}

@@ -7,13 +7,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from html import escape
 from pathlib import Path
+from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
 
 from catstream.base.arrays import Float64
 from catstream.base.text import counted
-from catstream.loadtest.latency import PERCENTILES, percentiles, summary
+from catstream.loadtest.latency import PERCENTILES, percentiles
 from catstream.loadtest.load_test import KINDS, MOST_STREAMS, LoadTest, Result, violations
 from catstream.reports.page import Axis, plot, table, write_page
 from catstream.reports.provenance import provenance
@@ -40,7 +41,7 @@ def tables(result: Result) -> Iterator[Table]:
             "frames/s": f"{each.rate(result.plan.rate):.1f}",
             "skipped": f"{100 * each.skipped_share:.1f} %",
             "cores": f"{result.cores(number):.2f}",
-            "MB": _shown(result.memory[number] / 1e6 if result.memory else None, ".0f"),
+            "MB": f"{result.stream_memory(number) / 1e6:.0f}",
             **_latencies(each.track, each.model),
             "lag": str(each.max_lag),
             "not stored": _shown(each.not_stored, "d"),
@@ -58,9 +59,17 @@ def tables(result: Result) -> Iterator[Table]:
         "the end. Success: share of frames with an overlap with the ground truth above 0.5; a skipped frame has the "
         "last known box. Of tracked: the same over the frames that were not skipped.",
     )
-    processes = [{"process": name, **_use(summary(readings))} for name, readings in result.usage.items()]
+    processes = [
+        {
+            "process": name,
+            "cores": f"{fmean(readings):.2f}",
+            "cores, most": f"{max(readings):.2f}",
+            "MB": f"{result.memory[name] / 1e6:.0f}" if name in result.memory else "-",
+        }
+        for name, readings in result.usage.items()
+    ]
     if processes:
-        yield Table("Processes", processes)
+        yield Table("Processes", processes, "MB: as above (PSS), at the end of the run.")
     if (plan := result.plan).subscribers:
         subscribers = {
             "of each stream": plan.subscribers,
@@ -88,11 +97,6 @@ def _latencies(track: Float64, model: Float64) -> dict[str, str]:
     return {name: milliseconds(seconds) for name, seconds in (percentiles(track) | of_model).items()}
 
 
-def _use(use: dict[str, float]) -> dict[str, str]:
-    cores = {"cores": f"{use['cores']:.2f}", "cores, most": f"{use['cores_most']:.2f}"}
-    return cores | {"MB": f"{use['memory'] / 1e6:.0f}", "MB, most": f"{use['memory_most'] / 1e6:.0f}"}
-
-
 def _shown(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
@@ -111,7 +115,10 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
         "interrupted": load_test.interrupted,
         "latency": {"track": percentiles(result.track), "model": percentiles(result.model)},
         "streams": [_stream(result, number) for number in range(len(result.streams))],
-        "processes": {name: summary(readings) for name, readings in result.usage.items()},
+        "processes": {
+            name: {"cores": fmean(readings), "cores_most": max(readings), "memory": result.memory.get(name)}
+            for name, readings in result.usage.items()
+        },
         "subscribers": {
             "quick": len(result.received),
             "received": sum(result.received),
@@ -143,7 +150,7 @@ def _stream(result: Result, number: int) -> dict[str, object]:
     measures = result.streams[number]
     return {
         "cores": result.cores(number),
-        "memory": result.memory[number] if result.memory else None,
+        "memory": result.stream_memory(number),
         "frames": measures.frames,
         "frames_per_second": measures.rate(result.plan.rate),
         "skipped": measures.skipped,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from os import getpid
+from statistics import fmean
 from time import monotonic
 from typing import Literal
 
@@ -28,7 +29,6 @@ from catstream.loadtest.latency import (
     observed,
     percentiles,
     proportional_memory,
-    summary,
 )
 from catstream.loadtest.load import Stream, Subscribers, Video, render
 from catstream.loadtest.rtsp import encode
@@ -200,11 +200,11 @@ class Result:
     plan         parameters of the run
     seconds      duration of the measured frames: less than planned if the run was interrupted
     streams      measures of each stream
-    usage        readings of each process, and of the load by processes outside the load test
+    usage        readings of the busy cores of each process, and of the processes outside the load test
     received     number of frames whose tracks each fast subscriber received; `missed` is the number that it missed
     frozen       seconds for which the frozen subscribers were stopped
     camera_late  largest delay in seconds of a frame that the camera itself caused
-    memory       bytes of the processes of each stream, in which a shared page counts in proportion (PSS)
+    memory       bytes of each process, in which a shared page counts in proportion (PSS)
     errors       errors of failed streams
     interrupted  whether the run was interrupted
     """
@@ -212,12 +212,12 @@ class Result:
     plan: Plan
     seconds: float
     streams: list[Measures]
-    usage: dict[str, list[tuple[float, int]]]
+    usage: dict[str, list[float]]
     received: list[int]
     missed: list[int]
     frozen: float
     camera_late: float
-    memory: list[int] = field(default_factory=list)
+    memory: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     interrupted: bool = False
 
@@ -236,18 +236,22 @@ class Result:
 
     def cores(self, number: int) -> float:
         """Return the processor seconds per second of the processes of a stream."""
-        return sum(summary(each)["cores"] for name, each in self.usage.items() if name.endswith(f" {number}"))
+        return sum(fmean(readings) for name, readings in self.usage.items() if name.endswith(f" {number}"))
+
+    def stream_memory(self, number: int) -> int:
+        """Return the bytes of the processes of a stream."""
+        return sum(size for name, size in self.memory.items() if name.endswith(f" {number}"))
 
     @property
     def cost(self) -> tuple[float, float]:
         """Mean of the streams: processor seconds per second, and bytes of memory."""
         count = len(self.streams)
-        return sum(map(self.cores, range(count))) / count, sum(self.memory) / count
+        return sum(map(self.cores, range(count))) / count, sum(map(self.stream_memory, range(count))) / count
 
     @property
     def other_load(self) -> float:
         """Mean number of cores that were busy with processes outside the load test."""
-        return summary(self.usage[REST])["cores"] if REST in self.usage else 0.0
+        return fmean(self.usage[REST]) if REST in self.usage else 0.0
 
     @property
     def missed_share(self) -> float:
@@ -262,17 +266,21 @@ def run(plan: Plan, video: Video, camera: Camera, report: Report) -> Result:
     usage, interrupted, next_reading = Usage(), False, 0.0
     with ExitStack() as stack:
         seen, groups = _started(plan, streams, next(iter(video.boxes)), stack, report)
+
+        def processes() -> dict[str, list[int]]:
+            return _pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]}
+
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate, plan.frames))
         try:
             for now in _until_the_last_track(plan, streams, seen, schedules):
                 if now >= next_reading:
                     next_reading = now + _READING_SECONDS
-                    usage.read(_pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]})
+                    usage.read(processes())
                 report(*_progress(plan, seen, now - schedules[0].start))
         except KeyboardInterrupt:
             interrupted = True
         end, late = monotonic(), camera.late
-        memory = [proportional_memory(stream.pids.values()) for stream in streams]
+        memory = {name: proportional_memory(pids) for name, pids in processes().items()}
         frozen = max((group.frozen_seconds for group in groups), default=0.0)
         report("ending", 1.0, "")
         _stop(streams)

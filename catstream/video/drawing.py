@@ -114,6 +114,11 @@ def preview_image(preview: Preview, tracks: Sequence[Track], colours: Colours) -
     return draw(image, [_scaled(track, scale) for track in tracks], colours)
 
 
+def outline(image: np.ndarray, box: Box, colour: str, unit: float = 1.0) -> None:
+    """Draw a box into an image, in a colour #rrggbb; `unit` is the width of its lines, about one pixel."""
+    _draw_box(image, (box.x, box.y), (box.x + box.w, box.y + box.h), _bgr(colour), unit)
+
+
 def _scaled(track: Track, scale: float) -> Track:
     return replace(track, box=None if track.box is None else Box(*(side * scale for side in track.box)))
 

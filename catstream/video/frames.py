@@ -173,6 +173,15 @@ def ffmpeg_reason(error: FFmpegError) -> str:
     return (error.strerror or str(error)).lower()
 
 
+#: How to make an array of what OpenCV returns or uses in its place.
+_CONVERSIONS = {
+    "UMat": "pass frame.get()",
+    "GpuMat": "pass frame.download()",
+    "tuple": "pass the image alone, as in `ok, frame = capture.read()`",
+    "str": "pass the image, as cv2.imread returns it",
+}
+
+
 def as_bgr(image: object) -> np.ndarray:
     """Return an image as a writable, contiguous uint8 array (h, w, 3), blue green red; no copy is made if it is one.
 
@@ -197,9 +206,8 @@ def _validated(image: object) -> np.ndarray:
             f"{_EXPECTED}, got None: a read has failed, as at the end of a video; check what it returns first"
         )
     if not isinstance(image, np.ndarray):
-        raise FrameError(
-            f"{_EXPECTED}, got {type(image).__name__}: turn it into such an array first, as np.asarray does"
-        )
+        kind = type(image).__name__
+        raise FrameError(f"{_EXPECTED}, got {kind}: {_CONVERSIONS.get(kind, 'convert it, as np.asarray does')}")
     shape = image.shape
     if not (image.ndim == 2 or (image.ndim == 3 and shape[2] in _CHANNELS)):
         hint = "give one of this shape"

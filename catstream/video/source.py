@@ -361,7 +361,7 @@ class _Video:
             for frame in frames:
                 is_spoilt = frame.is_corrupt or (is_spoilt and not frame.key_frame)
                 if is_spoilt and not skip:
-                    problem = "its picture is damaged"
+                    problem = "the picture cannot be decoded"
                     break
                 if is_spoilt:
                     self.damaged += 1

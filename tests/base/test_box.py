@@ -1,5 +1,6 @@
 """Boxes, as people write them."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -24,6 +25,13 @@ def test_anything_but_four_numbers_is_one_line_of_error_with_an_example(value):
     with pytest.raises(BoxError, match=said) as told:
         Box.parse(value)
     assert "\n" not in str(told.value)
+
+
+def test_cv2_draws_a_rounded_box():
+    frame = np.zeros((60, 80, 3), np.uint8)
+    cv2.rectangle(frame, Box(10.4, 19.6, 30.4, 10.2).rounded(), (255, 255, 255), cv2.FILLED)
+    rows, columns = np.nonzero(frame[:, :, 0])
+    assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (10, 20, 41, 30)
 
 
 def test_a_long_text_is_shortened_in_the_error():

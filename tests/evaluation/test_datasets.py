@@ -77,6 +77,61 @@ def test_the_layouts_of_the_benchmarks(tmp_path, name, images, rows, sign, file)
     check(place)
 
 
+@pytest.mark.parametrize(
+    ("file", "text", "absent"),
+    [
+        ("full_occlusion.txt", "0,0,1,1", [2, 3]),  # LaSOT: one line
+        ("out_of_view.txt", "0,1,0,0\n", [1]),
+        ("absence.label", "0\n0\n0\n1\n", [3]),  # GOT-10k: a line for each frame
+        ("cover.label", "8\n0\n1\n5\n", [1]),
+        ("full-occlusion.tag", "0\n1\n0\n0\n", [1]),  # CDTB
+        ("out-of-frame.tag", "0.0\n0.0\n1.0\n0.0\n", [2]),
+    ],
+)
+def test_the_object_is_absent_where_the_data_set_flags_it(tmp_path, file, text, absent):
+    place = folder(tmp_path / "walk", "groundtruth.txt", "img", 4 * "1,2,30,40\n")
+    (place / file).write_text(text)
+    assert np.flatnonzero(np.isnan(find_sequences(place)[0].boxes).any(axis=1)).tolist() == absent
+
+
+def test_all_flags_of_a_sequence_count(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth.txt", "img", 4 * "1,2,30,40\n")
+    (place / "full_occlusion.txt").write_text("0,1,0,0")
+    (place / "out_of_view.txt").write_text("0,0,1,0")
+    assert np.isnan(find_sequences(place)[0].boxes).any(axis=1).tolist() == [False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("0,1", "2 numbers for 4 boxes"), ("", "list of numbers"), ("a", "numbers")]
+)
+def test_flags_that_do_not_suit_the_boxes_are_an_error(tmp_path, text, message):
+    place = folder(tmp_path / "walk", "groundtruth.txt", "img", 4 * "1,2,30,40\n")
+    (place / "absence.label").write_text(text)
+    with pytest.raises(VideoError, match=f"absence.label.*{message}"):
+        find_sequences(place)
+
+
+@pytest.mark.parametrize("name", ["groundtruth_rect.txt", "groundtruth.txt", "walk.txt"])
+@pytest.mark.parametrize("step", [(1, 0), (0, 2), (0, 0)], ids=["right", "down", "still"])
+def test_corners_in_a_file_of_rectangles_are_noticed(tmp_path, name, step):
+    place = tmp_path / "walk"
+    (place / "img").mkdir(parents=True)
+    boxes = np.array([60, 50, 20, 16]) + np.outer(np.arange(9), (*step, 0, 0))
+    for number in range(9):
+        cv2.imwrite(str(place / "img" / f"{number}.png"), np.zeros((75, 100, 3), np.uint8))
+    (place / name).write_text(lines(boxes))
+    assert find_sequences(place)
+    (place / name).write_text(lines(corners(boxes)))
+    with pytest.raises(VideoError, match=r"looks like corners .* name the file gt\.txt"):
+        find_sequences(place)
+
+
+def test_rectangles_in_a_file_of_corners_are_noticed(tmp_path):
+    place = folder(tmp_path / "walk", "gt.txt", "img", "20,20,30,30\n60,20,30,30\n")
+    with pytest.raises(VideoError, match=r"line 2 has x2 < x1 .* name the file groundtruth_rect\.txt"):
+        find_sequences(place)
+
+
 def test_otb_with_two_objects_is_two_sequences_if_both_have_a_ground_truth(tmp_path):
     place = folder(tmp_path / "walk", "groundtruth_rect.2.txt", "img", lines(TRUTH))
     (place / "groundtruth_rect.1.txt").touch()
@@ -144,6 +199,27 @@ def test_folders_of_one_name_are_told_apart_by_the_names_of_their_links(tmp_path
         check(tmp_path / link, link)
     monkeypatch.chdir(tmp_path / "one" / "rgb")
     check(Path(".."))
+
+
+def test_a_sequence_is_read_once_whatever_links_lead_to_it(tmp_path):
+    place = folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH))
+    folder(tmp_path / ".thumbnails", "groundtruth_rect.txt", "img", lines(TRUTH))
+    (tmp_path / "z").symlink_to(place)
+    for paths in ([tmp_path], [tmp_path, tmp_path], [place, tmp_path, tmp_path / "z"]):
+        assert [sequence.name for sequence in find_sequences(*paths)] == ["walk"]
+
+
+@pytest.mark.parametrize("link", ["gone", "gone/groundtruth.txt"])
+def test_a_dead_link_is_an_error_and_the_others_are_read(tmp_path, link):
+    folder(tmp_path / "walk", "groundtruth_rect.txt", "img", lines(TRUTH))
+    (tmp_path / link).parent.mkdir(exist_ok=True)
+    (tmp_path / link).symlink_to(tmp_path / "nowhere")
+    errors: list[VideoError] = []
+    assert [sequence.name for sequence in find_sequences(tmp_path, failed=errors.append)] == ["walk"]
+    (error,) = errors
+    assert str(tmp_path / link) in str(error)
+    with pytest.raises(VideoError):
+        find_sequences(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
     attributes.write_text('{"walk": ["blur"]}')
     files = ["--output", out, "--json", file, "--attributes", attributes]
     output, errors = succeed("evaluate", walk, *files, "--set", "coreset.size=32")
-    assert re.search(r"walk +catstream +12 +0\.\d{3} .* \d/3 \d+(\.0)?%  0/9 0\.0%", output)
+    assert re.search(r"walk +catstream +12 +0\.\d{3} .* \d/3 \d+(\.0)?% +0/9 0\.0%", output)
     assert "report.html" in output + errors
     figures = json.loads(file.read_text())
     assert figures["mean"]["catstream"].keys() == {*MEASURES, *COUNTS}

@@ -19,7 +19,8 @@ from catstream.base.settings import RunSettings
 from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoError
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
-from catstream.finding.find import File, Reading, Scan, Search, Sighting, Step, find_files, load_models
+from catstream.finding.files import Reading, find_files
+from catstream.finding.find import Scan, Search, Sighting, Step, load_models
 from catstream.finding.found import FileResult, SearchLog
 from catstream.video.frames import Frame
 from catstream.video.writer import VideoWriter
@@ -56,7 +57,7 @@ def finished(log, file, search, steps=None):
 
 
 def test_one_frame_in_a_time_is_searched_and_the_last_one(search, appearing):
-    file = File(appearing, "video")
+    file = find_files([appearing])[0]
     steps = list(search.file(file))
     assert [step.frame.number for step in steps] == [*range(0, 40, 5), 39]
     seen = [each.frame for step in steps for each in step.sightings if each.object == "dahlia"]
@@ -66,7 +67,7 @@ def test_one_frame_in_a_time_is_searched_and_the_last_one(search, appearing):
 
 
 def test_a_search_that_was_interrupted_finds_the_same_as_one_that_was_not(search, appearing, video, tmp_path):
-    files = File(video, "video"), File(appearing, "video")
+    files = find_files([video, appearing])
     with SearchLog(tmp_path / "whole", search.description) as log:
         whole = [finished(log, file, search) for file in files]
     with SearchLog(tmp_path / "cut", search.description) as log:
@@ -86,10 +87,10 @@ def test_a_search_that_was_interrupted_finds_the_same_as_one_that_was_not(search
 def test_a_file_that_has_changed_is_searched_anew(search, appearing, video, tmp_path):
     path = shutil.copy(appearing, tmp_path / "one.mp4")
     with SearchLog(tmp_path / "log", search.description) as log:
-        finished(log, File(path, "video"), search)
-        assert log.begin(File(path, "video")).complete
+        finished(log, find_files([path])[0], search)
+        assert log.begin(find_files([path])[0]).complete
         shutil.copy(video, path)
-        assert not log.begin(File(path, "video")).complete
+        assert not log.begin(find_files([path])[0]).complete
 
 
 def test_the_log_of_another_search_is_not_continued(search, tmp_path):
@@ -113,12 +114,13 @@ def test_a_file_that_is_no_log_is_an_error_and_stays(search, tmp_path, content):
 
 
 def test_find_yields_the_sightings_of_all_paths_in_order(model_files, images, appearing, tmp_path):
-    for number in (20, 21):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), images[number])
-    found = list(catstream.find(model_files[0], [tmp_path, appearing, tmp_path / "20.png"]))
+    (folder := tmp_path / "folder").mkdir()
+    for number, place in ((20, folder), (21, folder), (22, tmp_path)):
+        cv2.imwrite(str(place / f"{number}.png"), images[number])
+    found = list(catstream.find(model_files[0], [folder, appearing, tmp_path / "22.png"]))
     files = [sighting.file for sighting in found]
-    assert list(dict.fromkeys(files)) == [str(tmp_path), str(appearing), str(tmp_path / "20.png")]
-    names = [sighting.image for sighting in found if sighting.file == str(tmp_path)]
+    assert list(dict.fromkeys(files)) == [str(folder), str(appearing), str(tmp_path / "22.png")]
+    names = [sighting.image for sighting in found if sighting.file == str(folder)]
     assert list(dict.fromkeys(names)) == ["20.png", "21.png"]
     assert {sighting.object for sighting in found} == {"dahlia"}
 
@@ -250,7 +252,7 @@ def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
     assert kinds == [("clips/a.mp4", "video"), ("clips/deep/b.MP4", "video"), ("photos", "images")]
 
 
-def test_a_subfolder_that_may_not_be_read_is_reported_and_the_others_are_searched(tree, monkeypatch, caplog):
+def test_a_folder_that_may_not_be_read_is_a_problem_and_the_others_are_searched(tree, monkeypatch):
     listed = type(tree).iterdir
 
     def iterdir(folder):
@@ -259,23 +261,72 @@ def test_a_subfolder_that_may_not_be_read_is_reported_and_the_others_are_searche
         return listed(folder)
 
     monkeypatch.setattr(type(tree), "iterdir", iterdir)
-    assert [file.path.name for file in find_files([tree])] == ["a.mp4", "photos"]
-    assert f"{tree / 'clips' / 'deep'} is left out (Permission denied)" in caplog.messages
+    video, denied, images = find_files([tree])
+    assert (video.path.name, images.path.name) == ("a.mp4", "photos")
+    with pytest.raises(VideoError, match="Permission denied"):
+        frames(denied)
 
 
-def test_linked_folders_are_searched_once_and_what_is_left_out_is_told(tree, tmp_path_factory, caplog):
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
+def names(tree, *paths):
+    return [str(file.path.relative_to(tree)) for file in find_files(paths or [tree])]
+
+
+def test_a_file_is_searched_once_whatever_links_lead_to_it(tree, caplog):
+    everything = ["clips/a.mp4", "clips/deep/b.MP4", "photos"]
+    (tree / "loop").symlink_to(tree)
+    (tree / "z.mp4").symlink_to(tree / "clips" / "a.mp4")
+    (tree / "z-hard.mp4").hardlink_to(tree / "clips" / "a.mp4")
+    (tree / "z-folder").symlink_to(tree / "photos")
+    (tree / "photos" / "z.png").symlink_to(tree / "photos" / "9.png")
+    assert names(tree) == names(tree, tree, tree, tree / "clips", tree / "z.mp4") == everything
+    assert names(tree, tree / "clips", tree) == everything
+    assert "5 duplicates, 1 hidden folder, 1 .txt file" in caplog.text
+    assert [name for _, name, _ in frames(find_files([tree / "photos"])[0])[0]] == ["1.png", "9.png", "10.png"]
+
+
+def test_an_image_of_another_folder_is_searched_once(tree):
+    (tree / "album").mkdir()
+    for name in ("1.png", "9.png"):
+        (tree / "album" / name).symlink_to(tree / "photos" / name)
+    files = find_files([tree / "photos" / "1.png", tree])
+    assert [[path.name for path in file.files] for file in files if file.kind != "video"] == [
+        ["1.png"],
+        ["9.png"],
+        ["10.png"],
+    ]
+
+
+@pytest.mark.parametrize("name", ["gone.mp4", "gone.png", "gone"])
+def test_a_dead_link_is_a_problem(tree, name):
+    (tree / "clips" / name).symlink_to(tree / "nowhere" / name)
+    (file,) = (file for file in find_files([tree]) if name in file.files[0].name)
+    try:
+        problems = frames(file)[1]
+    except VideoError as error:
+        problems = [str(error)]
+    assert name in problems[0]
+
+
+@pytest.mark.parametrize(
+    "name", ["@eaDir", ".thumbnails", "@__thumb", "Thumbnails", "#recycle", "__MACOSX", ".Trash-0"]
+)
+def test_thumbnails_and_hidden_folders_are_skipped_and_said(tree, name, caplog):
+    everything = names(tree)
+    shutil.copytree(tree / "clips", tree / "clips" / name / "inner")
+    assert names(tree) == everything
+    assert (f"{name} folder" if name[0] != "." else "2 hidden folders") in caplog.text
+    assert names(tree, tree / "clips" / name)  # unless it is named
+
+
+def test_files_of_other_kinds_are_counted_by_suffix(tree, caplog):
     for name in ("c.m2ts", "d.heic", "e.heic", "f"):
-        shutil.copy(tree / "clips" / "a.mp4", elsewhere / name)
-    for link, to in (("linked", elsewhere), ("loop", tree), ("again", elsewhere), ("dead", tree / "gone")):
-        (tree / link).symlink_to(to)
-    found = [str(file.path.relative_to(tree)) for file in find_files([tree])]
-    assert found == ["again/c.m2ts", "clips/a.mp4", "clips/deep/b.MP4", "photos"]
-    assert "2 .heic, 2 without a suffix, 1 .txt" in caplog.text
+        shutil.copy(tree / "clips" / "a.mp4", tree / "clips" / name)
+    assert names(tree) == ["clips/a.mp4", "clips/c.m2ts", "clips/deep/b.MP4", "photos"]
+    assert "2 .heic files, 1 hidden folder, 1 file without a suffix, 1 .txt file" in caplog.text
 
 
 def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
-    found, problems = frames(File(tree / "photos", "images"))
+    found, problems = frames(find_files([tree / "photos"])[0])
     assert found == [(0, "1.png", (21, 30, 3)), (1, "9.png", (29, 30, 3)), (2, "10.png", (30, 30, 3))]
     assert not problems
 
@@ -283,7 +334,7 @@ def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
 def test_images_that_are_unreadable_or_gone_are_reported_and_the_others_are_read(tree):
     (tree / "photos" / "9.png").write_bytes(b"no picture")
     (tree / "photos" / "8.png").symlink_to("gone.png")
-    file = File(tree / "photos", "images")
+    file = find_files([tree / "photos"])[0]
     assert file.signature[0] == 3
     found, (gone, unreadable) = frames(file)
     assert [name for _, name, _ in found] == ["1.png", "10.png"]
@@ -313,7 +364,7 @@ def test_a_video_is_searched_by_time_whatever_its_rate_and_its_size_may_change(t
     joined = tmp_path / "joined.ts"
     joined.write_bytes((tmp_path / "a.ts").read_bytes() + (tmp_path / "b.ts").read_bytes())
     reading = Reading()
-    steps = File(joined, "video").frames(0.2, RunSettings(), reading)
+    steps = find_files([joined])[0].frames(0.2, RunSettings(), reading)
     assert [frame.number for frame, _ in steps] == [0, 4, 6, 8, 13, 16, 18, 19]
     assert not reading.problems
     assert "10 frames of another size" in caplog.text
@@ -324,7 +375,7 @@ def test_a_video_is_searched_by_time_whatever_its_rate_and_its_size_may_change(t
     [
         ("none.mp4", "no file or folder"),
         ("empty", "neither images nor videos: "),
-        ("texts", r"neither images nor videos \(1 \.txt\)"),
+        ("texts", r"neither images nor videos \(1 \.txt file\)"),
         ("0", "live"),
         ("rtsp://a:b@c/d", "rtsp://c/d is a live"),
     ],

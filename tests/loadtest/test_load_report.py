@@ -44,8 +44,9 @@ def test_the_report_begins_with_whether_the_rate_was_sustained(result, tmp_path,
 
 
 def test_every_stream_and_process_has_its_row(result, tmp_path):
-    usage = {"detector 0": [(0.5, 10**8)], "detector 1": [(0.7, 10**8)]}
-    run = result([0.01] * 50, [0.02] * 50, usage=usage, errors=["stream 1: <it> died"])
+    usage, memory = {"detector 0": [0.5], "detector 1": [0.7]}, {"detector 0": 10**8, "detector 1": 2 * 10**8}
+    run = result([0.01] * 50, [0.02] * 50, usage=usage, memory=memory, errors=["stream 1: <it> died"])
+    assert [run.stream_memory(number) for number in (0, 1)] == [10**8, 2 * 10**8]
     page = write_report(tmp_path / "report.html", LoadTest([], results=[run])).read_text()
     for row in ("detector 0", "detector 1"):
         assert f'<td class="text">{row}</td>' in page

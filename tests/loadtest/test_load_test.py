@@ -41,9 +41,8 @@ def test_usage_shows_which_process_is_busy(sleeper):
     while time.process_time() < deadline:
         pass
     usage.read({"busy": [busy], "idle": [sleeper.pid]})
-    assert usage.readings["idle"][0][0] < usage.readings["busy"][0][0]
-    assert usage.readings[REST][0][0] >= 0
-    assert 0 < usage.readings["idle"][0][1] < usage.readings["busy"][0][1]
+    assert usage.readings["idle"][0] < usage.readings["busy"][0]
+    assert usage.readings[REST][0] >= 0
 
 
 def test_an_interrupted_run_returns_its_measurements_and_leaves_no_process():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from contextlib import closing
 
+import cv2
 import numpy as np
 import pytest
 
@@ -55,7 +56,13 @@ def test_grey_is_expanded(bgr, form):
     ("image", "told"),
     [
         (None, "got None: a read has failed"),
-        ([[1, 2], [3, 4]], "got list: turn it into"),
+        ([[1, 2], [3, 4]], "got list: convert it, as np.asarray does"),
+        (cv2.UMat(np.zeros((4, 5, 3), np.uint8)), r"got UMat: pass frame\.get\(\)"),
+        (
+            (True, np.zeros((4, 5, 3), np.uint8)),
+            r"got tuple: pass the image alone, as in `ok, frame = capture.read\(\)`",
+        ),
+        ("frame.png", "got str: pass the image, as cv2.imread returns it"),
         (np.zeros((4, 5, 3), bool), "got bool: a mask is not a picture"),
         (np.zeros((4, 5, 3), np.int64), "got int64: frame.astype"),
         (np.zeros((3, 4, 5), np.uint8), r"got the shape \(3, 4, 5\): the channels come last"),

@@ -112,7 +112,7 @@ export class BoxForm {
 
   /** Whether a new object has a name that no other has; if not, the browser says what is wrong. */
   check() {
-    this.name.value = this.name.value.trim();
+    this.name.value = this.name.value.trim().normalize("NFC");
     const taken = this.objects.get(this.name.value);
     this.name.setCustomValidity(taken?.name ? `There is an object ${taken.name} already: give another name.` : "");
     return this.form.reportValidity();
