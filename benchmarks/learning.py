@@ -67,7 +67,7 @@ def features(sequence: Sequence, start: int, count: int, settings: Settings) -> 
             if seq == 1:
                 _, part = detector.init(frame, seq, 0.0, Box(*map(float, sequence.boxes[start])))
             else:
-                _, part = detector.settle(detector.look(frame, seq), frame, seq, 0.0)
+                _, part = detector.update(detector.search(frame, seq), frame, seq, 0.0)
             learn(detector, compressor, trainer, seq, part)
             found.append(part)
     return found
@@ -97,7 +97,7 @@ def tracked(learned: SavedModel, sequence: Sequence, start: int, count: int) -> 
     with one_thread(opencv=True):
         for seq, image in enumerate(islice(sequence.frames(start), count), start=1):
             frame = Pyramid(image)
-            track, part = detector.settle(detector.look(frame, seq), frame, seq, 0.0)
+            track, part = detector.update(detector.search(frame, seq), frame, seq, 0.0)
             learn(detector, compressor, trainer, seq, part)
             tracks.append(track)
     return tracks

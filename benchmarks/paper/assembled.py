@@ -101,7 +101,7 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> Evalu
             given = {}
             if row == 0:
                 given[UNNAMED] = detectors.begin(UNNAMED, frame, start.box(sequence, image.shape[1::-1]))
-            tracks, features = detectors.step(frame, given=given)
+            tracks, features = detectors.step(frame, results=given)
             track = tracks.tracks[UNNAMED]
             part, version = features.objects[UNNAMED], compressor.version + 1
             sample = compressor.take(row, part, version) if row < recipe.learned * frames else None

@@ -1,4 +1,4 @@
-"""The last two checkpoints of a compressor, a file each: if the newest is damaged, the one before it is used."""
+"""The last two checkpoints of a compressor, one file each: if the newest is damaged, the previous one is used."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.errors import ProtocolError
 
-_KEPT = 2
-_DAMAGED = "damaged"  # name of the newest damaged checkpoint, which is kept for analysis
+_CHECKPOINTS = 2  # number of checkpoints in the folder
+_DAMAGED = "damaged"  # name of the newest damaged checkpoint, for analysis
 
 Read = TypeVar("Read")
 
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class CheckpointStore:
-    """A folder with the newest two checkpoints, and one that was found damaged; `trouble` says what is wrong now.
+    """A folder with the newest two checkpoints, and the last damaged one; `trouble` describes current problems.
 
     A checkpoint is written atomically, and is on disk before `save` returns. No file is overwritten: an older
     checkpoint is removed after a newer one is complete.
@@ -30,12 +30,12 @@ class CheckpointStore:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._folder = Path(folder)
         self._damaged: list[Path] = []
-        self._found_damaged = ""  # description of the damaged files
-        self._not_written = ""  # description of why the last checkpoint could not be written
+        self._read_problem = ""  # why checkpoints were not used
+        self._write_problem = ""  # why the last checkpoint could not be written
 
     @property
     def trouble(self) -> str:
-        return "; ".join(filter(None, (self._not_written, self._found_damaged)))
+        return "; ".join(filter(None, (self._write_problem, self._read_problem)))
 
     def load(self, settings: Settings) -> Forest:
         """A forest from the newest undamaged checkpoint, a new one if there is none.
@@ -45,9 +45,9 @@ class CheckpointStore:
         """
         forest = self._newest(lambda path: Forest.load(path, settings))
         if self._damaged:
-            instead = f"the one of frame {forest.frame} was used" if forest else "everything is learned again"
-            self._found_damaged = f"damaged checkpoints: {len(self._damaged)}, {instead}"
-            _log.warning("%s", self._found_damaged)
+            consequence = f"that of frame {forest.frame} was used" if forest else "training starts again"
+            self._read_problem = f"damaged checkpoints: {len(self._damaged)}; {consequence}"
+            _log.warning("%s", self._read_problem)
         return forest or Forest(settings)
 
     def position(self) -> tuple[int, float]:
@@ -75,18 +75,18 @@ class CheckpointStore:
         try:
             forest.save(self._folder / f"{number:012d}.safetensors")
         except OSError as error:
-            why = f"no checkpoint can be written to {self._folder} ({error.strerror})"
-            if why != self._not_written:
-                _log.warning("%s: what is learned is kept in memory only, and it is tried again", why)
-            self._not_written = why
+            problem = f"cannot write checkpoints to {self._folder} ({error.strerror})"
+            if problem != self._write_problem:
+                _log.warning("%s: training rows are in memory only; retrying", problem)
+            self._write_problem = problem
             return False
-        if self._not_written:
+        if self._write_problem:
             _log.warning("checkpoints are written again")
-        self._not_written = ""
+        self._write_problem = ""
         for path in self._damaged:
             path.replace(self._folder / _DAMAGED)
         self._damaged = []
-        for path in self._files()[:-_KEPT]:
+        for path in self._files()[:-_CHECKPOINTS]:
             path.unlink()
         return True
 

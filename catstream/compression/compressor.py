@@ -1,10 +1,11 @@
-"""The compressor of one object: takes its features of every frame, and returns a training sample now and then.
+"""The compressor of one object: inserts its features of every frame into coreset trees, and samples them periodically.
 
-It is the only owner of the object's coreset trees, those of `catstream.messages.heads.TREES`.
+It is the only owner of the object's coreset trees, one for each row of `catstream.messages.heads.TREES`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import blake2b
@@ -21,7 +22,7 @@ from catstream.messages.kinds import DetectorState, ObjectFeatures, Sample, Trai
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
 
 _RIGHT = 0.5  # label of a window that is neither too large nor too small, too wide or too high
-_GROWTH = 9 / 8  # factor of leaves from one sample to the next, however few frames lie between
+_GROWTH = 9 / 8  # factor of the number of leaves from which a sample is due before its interval is over
 
 
 class Compressor:
@@ -32,7 +33,7 @@ class Compressor:
 
     began        number of the object's first frame in this stream
     frame        number of the newest frame
-    box          box in which the object was last found
+    box          last box in which the object was detected
     detector     the detector state after the newest frame: a restarted detector continues from it
     last_sample  the newest sample, None before the first
     network      digest of the network that computes a part of the rows, empty if there is none
@@ -67,9 +68,9 @@ class Compressor:
         name: str = "",
         network: str = "",
     ) -> Compressor:
-        """A compressor that inserts another stream into copies of the trees of an earlier one; see `begin` too."""
+        """A compressor that inserts another stream into copies of the trees of an earlier one; call `begin` next."""
         self = cls(settings, name, network)
-        self.trees = {each: tree.copy() for each, tree in trees.items()}
+        self.trees = {kind: tree.copy() for kind, tree in trees.items()}
         self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name, network=network), centres
         self._sampled_leaves, self._earlier = self.leaves, origins
         return self
@@ -77,7 +78,7 @@ class Compressor:
     def begin(self, frame: int, version: int) -> Sample | None:
         """Begin the object's stream at a frame; returns the sample of the trees of an earlier stream, or None.
 
-        The version is the smallest that is free in this stream; a higher one of the sample is kept.
+        The sample gets the version, the next one of this stream, unless its own is higher.
         """
         self.began = frame
         if self.last_sample is not None:
@@ -96,7 +97,7 @@ class Compressor:
             self._origin = blake2b(features.training[APPEARANCE].rows.tobytes(), digest_size=8).hexdigest()
         for name, tree in TREES.items():
             if (training := features.training.get(tree.group)) is not None:
-                self.trees[name].insert(_rows_of(tree, training))
+                self.trees[name].extend(_rows_of(tree, training))
         self.frame, self.detector = frame, features.detector
         if features.box is not None:
             self.box = features.box
@@ -104,8 +105,9 @@ class Compressor:
         if not self._due():
             return None
         self._sampled_leaves = self.leaves
-        about = self.name, self.began, self.network
-        self.last_sample = sample_of(self.trees, version, frame, self.centres, *about)
+        self.last_sample = sample_of(
+            self.trees, version, frame, self.centres, self.name, self.began, network=self.network
+        )
         return self.last_sample
 
     @property
@@ -149,8 +151,8 @@ class Compressor:
             "earlier": list(self._earlier),
             "network": self.network,
         }
-        # The trees grow after a sample was made. The sample is kept too, so that a restarted trainer trains the same
-        # model again that the detector uses.
+        # The trees have grown since the last sample. It is stored, too, so that a restarted trainer trains the model
+        # that the detector uses.
         for name, message in (("sample", self.last_sample), ("detector", self.detector)):
             if message is not None:
                 own, metadata[name] = pack(message, name)
@@ -159,7 +161,7 @@ class Compressor:
 
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings, name: str = "") -> Compressor:
-        """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
+        """Restore a compressor from its `state`; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings, name, str(metadata.get("network", "")))  # which an older checkpoint lacks
         self.began, self.frame = int(metadata["began"]), int(metadata["frame"])
         self.box = Box(*metadata["box"]) if metadata["box"] else None
@@ -178,7 +180,7 @@ class Compressor:
         return {name: tree.leaves for name, tree in self.trees.items()}
 
     def _follow(self, box: Box | None) -> None:
-        """Append the centre of a box. Samples have complete blocks only, so that motion is trained once a block."""
+        """Append the centre of a box. Samples contain complete blocks, so that motion is trained once per block."""
         self._path.append(box.centre if box else (np.nan, np.nan))
         if len(self._path) == self.settings.search.motion_frames:
             self.centres = np.array(self._path)
@@ -188,9 +190,10 @@ class Compressor:
         """Whether there is a new leaf, and the trees have grown by an eighth or the interval is over."""
         if not all(self.trees[name].nodes for name, tree in TREES.items() if tree.required):
             return False
-        leaves, last = self.leaves, self.last_sample
-        waited = last is not None and self.frame - last.frame >= self.settings.coreset.sample_interval
-        return leaves > self._sampled_leaves and (waited or leaves >= _GROWTH * self._sampled_leaves)
+        leaves = self.leaves
+        last_frame = self.last_sample.frame if self.last_sample is not None else math.inf
+        is_interval_over = self.frame - last_frame >= self.settings.coreset.sample_interval
+        return leaves > self._sampled_leaves and (is_interval_over or leaves >= _GROWTH * self._sampled_leaves)
 
 
 def sample_of(
@@ -203,21 +206,22 @@ def sample_of(
     network: str = "",
 ) -> Sample:
     """The sample of all trees of an object that have a leaf."""
-    summaries = {each: tree.sample() for each, tree in trees.items() if tree.nodes}
+    summaries = {kind: tree.sample() for kind, tree in trees.items() if tree.nodes}
     return Sample(version, frame, summaries, centres, name, began, network)
 
 
 def _rows_of(tree: Tree, training: TrainingRows) -> Float32:
-    """The rows that a tree takes."""
+    """The rows of a tree: those of its label, or all of them with their labels, times the roots of their weights."""
     rows: Float32 = training.rows
     if tree.label is not None:
-        of_label: Bool = training.labels == tree.label
-        return rows[of_label]
-    d, roots = rows.shape[1], np.sqrt(training.weights, dtype=np.float32)[:, None]
+        has_label: Bool = training.labels == tree.label
+        return rows[has_label]
+    d = rows.shape[1]
+    roots = np.sqrt(training.weights, dtype=np.float32)[:, None]
     wide = np.empty((len(rows), d + tree.more_columns), np.float32)
     np.multiply(rows, roots, out=wide[:, :d])
-    wide[:, d], wide[:, d + 1], wide[:, d + 2 :] = 1, training.labels, _RIGHT
-    if training.offsets is not None:
-        wide[:, d + 2 :] = training.offsets
+    wide[:, d] = 1
+    wide[:, d + 1] = training.labels
+    wide[:, d + 2 :] = _RIGHT if training.offsets is None else training.offsets
     wide[:, d:] *= roots
     return wide

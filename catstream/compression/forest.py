@@ -18,21 +18,21 @@ from catstream.messages import storage
 from catstream.messages.kinds import DetectorState, Features, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix
 
-_KIND = "forest 3"  # and the version of what a checkpoint holds
-_MOST_STATES = 256  # messages whose detector states are kept: a detector that is restarted continues after one of them
+_KIND = "forest 3"  # kind of file, and the version of its contents
+_MAX_STATES = 256  # messages whose detector states are stored: a restarted detector continues after one of them
 
 
 class Forest:
-    """Takes the features of every frame, and returns the samples of the objects whose trees have grown enough.
+    """Inserts the features of every frame, and returns the samples of the objects whose trees have grown enough.
 
-    An object begins with its first features, with new trees or with those of an earlier stream. If a message has no
-    part for it, its trees are dropped. The same messages make the same samples, bit for bit, also across `save` and
-    `load`.
+    An object begins with its first features, with new trees or with those of an earlier stream. If a message lacks an
+    object, its trees are dropped. The same messages make the same samples, bit for bit, also across `save` and `load`.
 
-    seq, frame   number of the newest message, and of its frame
+    seq          number of the newest message
+    frame        number of its frame
     time         of that frame, in seconds
-    version      of the newest sample. All objects share one count, so that no version is ever used twice
-    compressors  the compressor of each object, by name
+    version      of the newest sample; all objects share one count, so that no version is used twice
+    compressors  by the names of their objects
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -40,10 +40,10 @@ class Forest:
         self.seq = self.version = 0
         self.frame, self.time = -1, 0.0
         self.compressors: dict[str, Compressor] = {}
-        self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MOST_STATES)  # of the last messages
+        self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MAX_STATES)  # of the last messages
 
     def check_features(self, features: Features) -> None:
-        """Raise ProtocolError if rows have another length than those before, or are of another network."""
+        """Raise ProtocolError if rows differ in length from earlier ones, or are of another network."""
         if others := {compressor.network for compressor in self.compressors.values()} - {features.network}:
             raise ProtocolError(
                 f"features are of the network {features.network or 'none'}, those before of {max(others) or 'none'}: "
@@ -63,14 +63,14 @@ class Forest:
     def take(
         self,
         features: Features,
-        learned: Mapping[str, Compressor] = MappingProxyType({}),
-        after_each: Callable[[], object] = lambda: None,
+        continued: Mapping[str, Compressor] = MappingProxyType({}),
+        after_object: Callable[[], object] = lambda: None,
     ) -> list[Sample]:
-        """Insert the features of one frame, and call `after_each` after each object; returns the samples that are due.
+        """Insert the features of one frame, calling `after_object` after each object; returns the samples that are due.
 
-        A message whose `seq` was processed before is ignored. `learned` are the compressors of the objects that begin
-        in it with a saved model. ProtocolError if a message before it is missing, or its rows have another length than
-        those before; nothing of it is inserted then.
+        A message that was processed before is ignored, by its `seq`. Objects that begin with a saved model have their
+        compressor in `continued`. ProtocolError if an earlier message is missing. The caller checks features that were
+        received from another process by `check_features`.
         """
         if features.seq <= self.seq:
             return []
@@ -79,30 +79,32 @@ class Forest:
                 f"features {features.seq} came after {self.seq}: {features.seq - self.seq - 1} are missing, "
                 "send from the one after the last acknowledged"
             )
-        self.check_features(features)  # before the first tree takes its rows, so that all trees hold the same frames
-        before = self.compressors | {name: learned.get(name) for name, each in features.objects.items() if each.begins}
-        self.compressors = {
-            name: before.get(name) or Compressor(self.settings, name, features.network) for name in features.objects
-        }
+        compressors: dict[str, Compressor] = {}
+        for name, part in features.objects.items():
+            compressor = continued.get(name) if part.begins else self.compressors.get(name)
+            compressors[name] = compressor or Compressor(self.settings, name, features.network)
+        self.compressors = compressors
         samples: list[Sample] = []
         for name, part in features.objects.items():
-            compressor = self.compressors[name]
+            compressor = compressors[name]
             if part.begins:
                 self._add(compressor.begin(features.frame, self.version + 1), samples)
             self._add(compressor.take(features.frame, part, self.version + 1), samples)
-            after_each()
+            after_object()
         self.seq, self.frame, self.time = features.seq, features.frame, float(features.time)
         states = {name: part.detector for name, part in features.objects.items() if part.detector is not None}
         self._states.append((self.seq, states))
         return samples
 
     def states_at(self, seq: int | None) -> dict[str, DetectorState]:
-        """The state of each object's detector after message `seq`, or the newest one, by name.
+        """The detector states of the objects, by name, after message `seq`, or after the nearest one that is stored.
 
-        If that is not stored any more, after the nearest message of which it is.
+        Those after the newest message if `seq` is None.
         """
-        before = [states for number, states in self._states if seq is None or number <= seq][-1:]
-        return (before or [states for _, states in self._states] or [{}])[0]
+        if not self._states:
+            return {}
+        earlier = [states for number, states in self._states if seq is None or number <= seq]
+        return earlier[-1] if earlier else self._states[0][1]
 
     def _add(self, sample: Sample | None, samples: list[Sample]) -> None:
         """Add a sample, if there is one, to those of a frame."""
@@ -126,7 +128,7 @@ class Forest:
         own = list(self.object_counters().values())
         names = dict.fromkeys(name for counters in own for name in counters)
         highest = {name for name in names if name in ("version", "level")}
-        total = {name: (max if name in highest else sum)(each[name] for each in own) for name in names}
+        total = {name: (max if name in highest else sum)(counters[name] for counters in own) for name in names}
         return {"seq": self.seq, "objects": len(own)} | total | {"version": self.version}
 
     def object_counters(self) -> dict[str, dict[str, float]]:
@@ -150,7 +152,7 @@ class Forest:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], settings: Settings) -> Forest:
-        """Restore what `save` wrote.
+        """Load a forest from a file of `save`.
 
         ProtocolError if the file is damaged; ServiceError if it is not a checkpoint, or one of another version of
         catstream; SettingsError if it was made with another coreset size.
@@ -188,7 +190,7 @@ class Forest:
 
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings) -> Forest:
-        """Restore what `state` returned; KeyError, TypeError or ValueError if it is something else."""
+        """Restore a forest from its `state`; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings)
         self.seq, self.frame, self.version = (int(metadata[name]) for name in ("seq", "frame", "version"))
         self.time = float(metadata.get("time", 0.0))  # which an older checkpoint lacks
@@ -200,7 +202,7 @@ class Forest:
 
 
 def _array(_: type, numbers: Any) -> Any:
-    """An array of a state, which is encoded as lists of numbers."""
+    """Decode an array of a state, which is encoded as lists of numbers."""
     return np.array(numbers)
 
 

@@ -25,10 +25,9 @@ _LEVELS = 64  # no stream has 2**64 leaves
 class CoresetTree:
     """A coreset of a stream of rows, by merge and reduce.
 
-    For p rows it keeps at most log2(p / n) + 1 nodes, O(n d log p) bytes. Inserting a
-    row costs O(n d) on average, and the same at any p. For every orthonormal Y,
-    `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, where A are all inserted rows, C the rows of
-    all nodes and the pending ones, and c is `dropped_energy`.
+    For p rows it stores at most log2(p / n) + 1 nodes, O(n d log p) bytes. Inserting a row costs O(n d) on average,
+    whatever p is. For every orthonormal Y, `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, where A are all inserted rows, C
+    the rows of all nodes and the pending rows, and c is `dropped_energy`.
 
     Parameters
     ----------
@@ -51,14 +50,14 @@ class CoresetTree:
             raise ValueError(f"a coreset needs at least 1 row, got size={size}")
         self.size = size
         self.nodes: list[Node] = []
-        self._leaf = np.empty((0, 0), np.float32)  # memory for the next leaf, and its number of rows so far
-        self._filled = 0
-        self._sampled: list[Node] = []  # nodes of the last sample, and its rows
-        self._rows = np.empty((0, 0), np.float32)
+        self._leaf = np.empty((0, 0), np.float32)  # memory for the next leaf
+        self._filled = 0  # number of rows in it
+        self._sampled: list[Node] = []  # nodes of the last sample
+        self._rows = np.empty((0, 0), np.float32)  # rows of the last sample
 
     @property
     def pending(self) -> np.ndarray:
-        """The newest rows, fewer than fill a leaf, float32 (k, d); later rows do not change them."""
+        """The newest rows, fewer than a leaf has, float32 (k, d); later rows do not change them."""
         return self._leaf[: self._filled]
 
     @property
@@ -86,7 +85,7 @@ class CoresetTree:
 
     @property
     def dropped_energy(self) -> float:
-        """c of the paper: the part of ||A||^2 that the reductions lost."""
+        """c of the paper: the energy, as a part of ||A||^2, that the reductions have dropped."""
         return sum(node.dropped for node in self.nodes)
 
     @property
@@ -97,35 +96,34 @@ class CoresetTree:
     def insert(self, rows: np.ndarray) -> None:
         """Add rows, float32 (k, d), in the order of the stream.
 
-        ProtocolError if they have another length than those before, or numbers that are not finite.
+        ProtocolError if their length differs from that of earlier rows, or if a number is not finite.
         """
-        rows = self._checked(rows)
+        self.extend(self._checked(rows))
+
+    def extend(self, rows: np.ndarray) -> None:
+        """Add rows as `insert` does, without its checks: those of a message were checked when it was received."""
         while len(rows):
-            if not self._filled:  # a node has the array before
+            if not self._filled:  # a node owns the previous array
                 self._leaf = np.empty((self.size, rows.shape[1]), np.float32)
-            elif self._filled == len(self._leaf):  # the pending rows of a tree that was read or copied
-                left = np.empty((self.size - self._filled, rows.shape[1]), np.float32)
-                self._leaf = np.vstack([self._leaf, left])
-            room = self.size - self._filled
-            taken, rows = rows[:room], rows[room:]
-            self._leaf[self._filled : self._filled + len(taken)] = taken
-            self._filled += len(taken)
+            elif self._filled == len(self._leaf):  # the pending rows of a loaded or copied tree
+                self._leaf = np.vstack([self._leaf, np.empty((self.size - self._filled, rows.shape[1]), np.float32)])
+            count = min(len(rows), self.size - self._filled)
+            self._leaf[self._filled : self._filled + count] = rows[:count]
+            self._filled += count
+            rows = rows[count:]
             if self._filled == self.size:
                 self._filled = 0
                 self._push(Node.leaf(self._leaf))
 
     def copy(self) -> Self:
-        """A tree with the same content: rows that are inserted into one are not in the other."""
+        """An independent tree with the same content."""
         tree = type(self)(self.size)
         tree.nodes = list(self.nodes)  # nodes and pending rows never change
         tree._leaf, tree._filled = self.pending, self._filled
         return tree
 
     def merged(self, other: CoresetTree) -> Self:
-        """A tree of both streams, as if their rows had been inserted into one; the two trees are not changed.
-
-        The bound holds for both streams together.
-        """
+        """A new tree of both streams, with the bound of one tree into which all rows were inserted."""
         if other.reduction != self.reduction:
             raise ProtocolError(
                 f"a tree of coreset.reduction={self.reduction} cannot merge one of {other.reduction}: "
@@ -153,7 +151,7 @@ class CoresetTree:
     def sample(self) -> Summary:
         """A hierarchical sample of at most 2n rows (paper, "Coreset Appearance Model").
 
-        The rows of nodes that the last sample had are kept: most nodes are the same for many frames.
+        The rows of nodes that the last sample contained are reused: most nodes are the same for many frames.
         """
         self._rows = sample(self.nodes, self.size, self._sampled, self._rows)
         self._sampled = list(self.nodes)
@@ -175,12 +173,12 @@ class CoresetTree:
 
     @staticmethod
     def from_state(arrays: Arrays, metadata: Metadata) -> CoresetTree:
-        """The tree that `state` described, of its own class; ProtocolError if it is something else."""
+        """Restore a tree, of its own class, from its `state`; ProtocolError if it is something else."""
         try:
             tree = REDUCTIONS[metadata["reduction"]](int(metadata["size"]))
             for i, node in enumerate(metadata["nodes"]):
-                rows, total, whole = arrays[f"rows.{i}"], arrays[f"sum.{i}"], float.fromhex(node["energy"])
-                tree.nodes.append(Node(int(node["level"]), rows, int(node["count"]), total, whole))
+                level, count, energy = int(node["level"]), int(node["count"]), float.fromhex(node["energy"])
+                tree.nodes.append(Node(level, arrays[f"rows.{i}"], count, arrays[f"sum.{i}"], energy))
             pending = arrays["pending"]
             tree._check(pending)
             tree._leaf, tree._filled = tree._checked(pending), len(pending)
@@ -192,17 +190,17 @@ class CoresetTree:
         nodes = [*self.nodes, node]
         while len(nodes) > 1 and self._to_merge(nodes[-2], nodes[-1]):
             nodes[-2:] = [self._merged(nodes[-2], nodes[-1])]
-        self.nodes = nodes  # at once: Ctrl-C during a reduction loses no node
+        self.nodes = nodes  # one assignment: Ctrl-C during a reduction loses no node
 
     def _to_merge(self, older: Node, newer: Node) -> bool:
-        """Whether two neighbouring nodes are merged into one."""
+        """Whether to merge two neighbouring nodes into one."""
         return older.level == newer.level
 
     def _merged(self, older: Node, newer: Node) -> Node:
         return older.merged(newer)
 
     def _is_count(self, count: int, level: int) -> bool:
-        """Whether a node of this level can summarise so many rows."""
+        """Whether a node of this level can summarise this number of rows."""
         return count == self.size << level
 
     def _checked(self, rows: np.ndarray) -> np.ndarray:
@@ -224,8 +222,8 @@ class CoresetTree:
         if pending.ndim != 2 or pending.dtype != np.float32 or len(pending) >= self.size:
             raise ValueError(f"pending rows of {pending.dtype} {pending.shape}")
         for node in self.nodes:
-            whole = node.rows.shape == (self.size, self.width) and node.sum.shape == (self.width,)
-            if not whole or node.rows.dtype != np.float32 or node.sum.dtype != np.float64:
+            has_shape = node.rows.shape == (self.size, self.width) and node.sum.shape == (self.width,)
+            if not has_shape or node.rows.dtype != np.float32 or node.sum.dtype != np.float64:
                 raise ValueError(f"a node of {node.rows.dtype} {node.rows.shape}")
             if not 0 <= node.level < _LEVELS or not self._is_count(node.count, node.level):
                 raise ValueError(f"a node of level {node.level} and {node.count} rows")
@@ -236,7 +234,7 @@ class CoresetTree:
 class FrequentDirections(CoresetTree):
     """A sketch of a stream of rows in constant memory (Liberty 2013; Ghashami et al. 2016).
 
-    It keeps one node of n rows and fewer than n pending ones: each new leaf is stacked below the node, and the 2n rows
+    It stores one node of n rows and fewer than n pending rows: a new leaf is stacked below the node, and the 2n rows
     are shrunk to n, see `catstream.compression.reduce.shrink`. In addition to the bound of a tree, for every unit
     vector y, `0 <= ||A y||^2 - ||C y||^2 <= c / (n + 1) <= ||A||^2 / (n + 1)`, for one stream and for merged ones. Here
     c is `dropped_energy`, which is larger than that of a tree because all directions are shrunk.
@@ -267,7 +265,7 @@ REDUCTIONS: dict[str, type[CoresetTree]] = {kind.reduction: kind for kind in (Co
 
 
 def pack_trees(trees: Mapping[str, CoresetTree]) -> tuple[Arrays, Metadata]:
-    """Arrays and metadata of several trees; the name of each array begins with that of its tree."""
+    """Arrays and metadata of several trees; the names of arrays begin with the name of their tree."""
     arrays: Arrays = {}
     metadata: Metadata = {}
     for name, tree in trees.items():
@@ -277,7 +275,7 @@ def pack_trees(trees: Mapping[str, CoresetTree]) -> tuple[Arrays, Metadata]:
 
 
 def unpack_trees(arrays: Arrays, metadata: Metadata) -> dict[str, CoresetTree]:
-    """The trees that `pack_trees` described; ProtocolError if it is something else."""
+    """Restore trees that `pack_trees` packed; ProtocolError if it is something else."""
     return {
         name: CoresetTree.from_state(storage.with_prefix(arrays, f"{name}."), state) for name, state in metadata.items()
     }

@@ -1,8 +1,8 @@
 """Extent: the size and the aspect ratio (width to height) of the object.
 
-The appearance model alone prefers windows that are too small: they hold less background. The extent head learns how
+The appearance model alone prefers windows that are too small: they contain less background. The extent head learns how
 well a window fits, from windows of the object that fit and windows that are too large, too small, too wide or too high.
-The size head and the aspect head learn from the same windows by how many steps a window is too large or too wide.
+From the same windows, the size head and the aspect head learn how many steps a window is too large or too wide.
 """
 
 from __future__ import annotations
@@ -15,51 +15,48 @@ import numpy as np
 from catstream.base.box import Window
 from catstream.base.settings import ExtentSettings
 
-_SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect ratio that is tried to the next
-#: Change of the logarithm by a step.
+_SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect ratio to the next
+#: The same as a difference of logarithms.
 SIZE_CHANGE, ASPECT_CHANGE = math.log(1 + _SIZE_STEP), math.log(1 + _ASPECT_STEP)
 
-_SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a change that is applied in one frame, of its logarithm
+_SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a change, as a logarithm, that is applied in one frame
 _PENALTY = 0.3  # weight of |log f|, for a change by the factor f
 _LABEL_STEPS = 16  # steps between the labels 0 and 1 of the size and the aspect head
-_OFFSET_WEIGHT = 0.02  # weight of the squared steps that a window is off
+_OFFSET_WEIGHT = 0.02  # weight of the squared error of a window, in steps
 _LARGE_OFFSET = 1.0  # steps from which this cost grows linearly
-_GROWTH = 1.18  # factor of size that no object grows by in a frame
+_MAX_GROWTH = 1.18  # factor of size by which no object grows in a frame
 
 
 class Trial(NamedTuple):
-    """A window, and the steps by which it is too large and too wide."""
+    """A window of a wrong extent, and the steps by which it is too large and too wide."""
 
     window: Window
     larger: int = 0
     wider: int = 0
 
 
-def followed(before: Window, window: Window, resize: bool) -> Window:
-    """The window of a detection, its size and aspect ratio smoothed; they stay as before unless `resize`.
+def smooth(before: Window, window: Window, *, resize: bool) -> Window:
+    """Smooth the size and the aspect ratio of a detection's window; they stay as before unless `resize`.
 
-    A size change beyond a factor of 1.18 is a detection of the object elsewhere: the window is taken as it is.
+    A window whose size changes by more than a factor of 1.18 shows the object elsewhere, and is returned unchanged.
     """
     growth = math.sqrt(window.area / before.area)
-    if not 1 / _GROWTH < growth < _GROWTH:
+    if not 1 / _MAX_GROWTH < growth < _MAX_GROWTH:
         return window
     if not resize:
         return before.centred(*window.centre)
-    grown = growth**_SIZE_RATE
-    stretched = math.sqrt(window.w / window.h * before.h / before.w) ** _ASPECT_RATE
-    return before.scaled(grown * stretched, grown / stretched).centred(*window.centre)
+    size_factor = growth**_SIZE_RATE
+    aspect_factor = math.sqrt(window.w / window.h * before.h / before.w) ** _ASPECT_RATE
+    return before.scaled(size_factor * aspect_factor, size_factor / aspect_factor).centred(*window.centre)
 
 
 def trials(window: Window, settings: ExtentSettings) -> list[list[Trial]]:
-    """Windows of wrong sizes, then windows of wrong aspect ratios.
-
-    Those that are not searched are left out, and both are if `weight` is 0.
-    """
+    """Windows of wrong sizes, then windows of wrong aspect ratios; only of what is searched, none if `weight` is 0."""
     if not settings.weight:
         return []
     sizes = [Trial(window.scaled(size(k)), larger=k) for k in _steps(settings.size_count)]
     aspects = [Trial(window.scaled(*stretch(k)), wider=k) for k in _steps(settings.aspect_count)]
-    return [each for each in (sizes, aspects) if each]
+    return [kind for kind in (sizes, aspects) if kind]
 
 
 def offset_label(steps: int) -> float:
@@ -72,31 +69,31 @@ def offset_label(steps: int) -> float:
 
 
 def offset_cost(row: np.ndarray, head: np.ndarray, bias: float) -> float:
-    """Cost of the steps by which a window is too large or too wide as the size or the aspect head predicts it.
+    """Huber loss of the steps by which a window is too large or too wide, as the size or the aspect head predicts.
 
-    It is Huber's function, because the prediction for an object that looks new may be wrong by many steps. The features
-    of the window and the head are float32 (d,).
+    The loss is robust, because the prediction for a new appearance may be wrong by many steps. The features of the
+    window and the head are float32 (d,).
     """
-    off = abs(float(row @ head) + bias - 0.5) * _LABEL_STEPS
-    return _OFFSET_WEIGHT * (off**2 if off < _LARGE_OFFSET else _LARGE_OFFSET * (2 * off - _LARGE_OFFSET))
+    error = abs(float(row @ head) + bias - 0.5) * _LABEL_STEPS
+    return _OFFSET_WEIGHT * (error**2 if error < _LARGE_OFFSET else _LARGE_OFFSET * (2 * error - _LARGE_OFFSET))
 
 
-def cost(change: float, now: float = 0.0, prior: float = 0.0) -> float:
-    """Cost of the change of a logarithm that differs from that of the first window by `now` already."""
-    return _PENALTY * abs(change) + prior * (change + now) ** 2
+def cost(change: float, deviation: float = 0.0, prior: float = 0.0) -> float:
+    """Cost of a change of log f, which already deviates from that of the first window by `deviation`."""
+    return _PENALTY * abs(change) + prior * (change + deviation) ** 2
 
 
 def _steps(count: int) -> list[int]:
-    """Steps to try, smallest or narrowest first, without 0."""
+    """The steps of `count` sizes or aspect ratios, smallest or narrowest first, without 0."""
     return [k for k in range(-(count // 2), count // 2 + 1) if k]
 
 
 def size(step: float) -> float:
-    """Factor of both sides."""
+    """Factor of width and height that changes the size by a number of steps."""
     return float((1 + _SIZE_STEP) ** step)
 
 
 def stretch(step: float) -> tuple[float, float]:
-    """Factors of width and height that change the aspect ratio and keep the area."""
+    """Factors of width and height that change the aspect ratio by a number of steps, at the same area."""
     root = (1 + _ASPECT_STEP) ** (step / 2)
     return root, 1 / root

@@ -16,13 +16,13 @@ from catstream.messages.kinds import Model
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoreMap:
-    """Features of a part of a frame at one scale, and the score of each window in them.
+    """Features of a part of a frame at one scale, and the scores of all windows in them.
 
     cells    of rows x columns
-    scores   float32 (rows - 7, columns - 7), each of the window whose first cell is there
+    scores   float32 (rows - 7, columns - 7), of the window whose first cell has the same index
     origin   corner of the first cell in the frame, (x, y) in pixels
     step     width and height of a cell, in pixels of the frame
-    vectors  from which those of the cells were sampled; None without a descriptor, or of a region of the frame
+    vectors  from which those of the cells were sampled; None without a descriptor, or for a region of the frame
     """
 
     cells: Cells
@@ -37,7 +37,7 @@ class ScoreMap:
     ) -> ScoreMap:
         """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0.
 
-        If the frame has a descriptor, it computes the vectors around the window, unless they are given.
+        If the frame has a descriptor, it computes the vectors around the window, unless `vectors` has them.
         """
         margin = MARGIN if frame.descriptor is None or vectors is not None else EDGE
         patch = frame.around(window, side, margin)
@@ -48,7 +48,8 @@ class ScoreMap:
             scores = np.zeros((side - WINDOW + 1,) * 2, np.float32)
         else:
             scores = cells.respond(model.weights, model.bias)
-        step, (x, y) = (window.w / WINDOW, window.h / WINDOW), window.centre
+        x, y = window.centre
+        step = window.w / WINDOW, window.h / WINDOW
         return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step, vectors)
 
     @classmethod
@@ -66,7 +67,7 @@ class ScoreMap:
         return cls.within(frame, frame.region_around(window), window, model)
 
     def complete(self, frame: Pyramid, place: tuple[int, int], model: Model) -> tuple[ScoreMap, int, int]:
-        """The map, row and column of a window with all its features: a map of its own if vectors are missing here."""
+        """The map, row and column of a window with all its features: a map of its own if this one lacks vectors."""
         if frame.descriptor is None or self.cells.vectors is not None:
             return self, *place
         return ScoreMap.around(frame, self.window(*place), WINDOW, model), 0, 0
@@ -77,11 +78,13 @@ class ScoreMap:
         return Window(x + column * w, y + row * h, WINDOW * w, WINDOW * h)
 
     def place(self, window: Window) -> tuple[float, float]:
-        """Row and column, between the cells, of the window with the same centre: the inverse of `window`."""
-        (x, y), (w, h), (left, top) = window.centre, self.step, self.origin
+        """Row and column, in fractions, of the window with the same centre: the inverse of `window`."""
+        x, y = window.centre
+        w, h = self.step
+        left, top = self.origin
         return (y - top) / h - WINDOW / 2, (x - left) / w - WINDOW / 2
 
-    def highest(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
+    def argmax(self, penalty: np.ndarray | float = 0.0) -> tuple[int, int]:
         """Row and column of the window with the highest score less a penalty."""
         row, column = divmod(int((self.scores - penalty).argmax()), self.scores.shape[1])
         return row, column
@@ -89,42 +92,46 @@ class ScoreMap:
     def best(self, penalty: np.ndarray | float = 0.0) -> tuple[float, Window]:
         """The score of the window with the highest score less a penalty; and the window.
 
-        The window is refined between the cells, by a parabola through the scores in each direction.
+        The position of the window is interpolated, by a parabola through the neighbouring scores in both directions.
         """
-        scores, (row, column) = self.scores, self.highest(penalty)
+        scores = self.scores
+        row, column = self.argmax(penalty)
         window = self.window(row + vertex(scores[:, column], row), column + vertex(scores[row], column))
         return float(scores[row, column]), window
 
-    def apart(self, window: Window) -> ScoreMap:
-        """The same, but the score of each window that touches another one is -inf."""
+    def non_overlapping(self, window: Window) -> ScoreMap:
+        """The same map, with the score -inf for all windows that overlap another one."""
         (x, y), (w, h) = self.origin, self.step
         rows, columns = self.scores.shape
-        top, left = y + h * np.arange(rows), x + w * np.arange(columns)
-        beyond = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
+        top = y + h * np.arange(rows)
+        left = x + w * np.arange(columns)
+        above_or_below = (top >= window.y + window.h) | (top + WINDOW * h <= window.y)
         beside = (left >= window.x + window.w) | (left + WINDOW * w <= window.x)
-        return replace(self, scores=np.where(beyond[:, None] | beside, self.scores, np.float32(-np.inf)))
+        return replace(self, scores=np.where(above_or_below[:, None] | beside, self.scores, np.float32(-np.inf)))
 
 
-def non_maximum_suppression(scores: np.ndarray, most: int, apart: int, least: float = -np.inf) -> list[tuple[int, int]]:
-    """The highest windows with a score above `least`, each more than `apart` cells from any higher one.
+def non_maximum_suppression(
+    scores: np.ndarray, count: int, radius: int, threshold: float = -np.inf
+) -> list[tuple[int, int]]:
+    """Return up to `count` windows with a score above a threshold, as (row, column), highest score first.
 
-    Returns up to `most` pairs (row, column), highest first.
+    A window suppresses all others up to `radius` cells away.
     """
-    left = scores.copy()
+    scores = scores.copy()
     maxima = []
-    for _ in range(most):
-        row, column = divmod(int(left.argmax()), left.shape[1])
-        if not left[row, column] > least:
+    for _ in range(count):
+        row, column = divmod(int(scores.argmax()), scores.shape[1])
+        if not scores[row, column] > threshold:
             break
         maxima.append((row, column))
-        left[max(row - apart, 0) : row + apart + 1, max(column - apart, 0) : column + apart + 1] = -np.inf
+        scores[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1] = -np.inf
     return maxima
 
 
 def vertex(values: np.ndarray, i: int) -> float:
-    """Offset of the vertex of the parabola through three neighbours, -0.5 to 0.5."""
+    """Offset of the vertex of the parabola through value i and its two neighbours, -0.5 to 0.5."""
     if not 0 < i < len(values) - 1:
         return 0.0
-    before, here, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
-    bend = before - 2 * here + after
-    return min(max((before - after) / (2 * bend), -0.5), 0.5) if bend < 0 else 0.0
+    before, value, after = float(values[i - 1]), float(values[i]), float(values[i + 1])
+    curvature = before - 2 * value + after
+    return min(max((before - after) / (2 * curvature), -0.5), 0.5) if curvature < 0 else 0.0

@@ -23,7 +23,8 @@ import numpy as np
 from catstream.base.box import Box, Window
 from catstream.base.settings import RunSettings, Settings
 from catstream.base.threads import one_thread
-from catstream.detection.search import SAME_OVERLAP, Detection, fitted
+from catstream.detection.context import FrameContext
+from catstream.detection.search import SAME_OVERLAP, Detection, fit_extent
 from catstream.detection.similarity import Similarity
 from catstream.errors import SettingsError, VideoError
 from catstream.features.cells import Cells
@@ -185,7 +186,8 @@ def _fitted(frame: Pyramid, window: Window, searched: _Template) -> Seen:
     """A window at its best size and aspect ratio; the learned aspect ratio is likelier than others."""
     size = math.sqrt(window.area / searched.window.area)
     likely = searched.window.scaled(size).centred(*window.centre)
-    found = fitted(frame, Detection(0.0, window), likely, searched.model, searched.settings.extent)
+    context = FrameContext(frame, searched.model, searched.settings)
+    found = fit_extent(context, Detection(0.0, window), likely)
     return searched.seen(ScoreMap.around(frame, found.window, WINDOW, searched.model), 0, 0, found.window)
 
 

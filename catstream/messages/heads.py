@@ -61,7 +61,7 @@ class Tree:
 
 
 #: Penalty of the least squares of the object's mean against the background's mean and covariance.
-BETWEEN_RIDGE = 1.0
+DISCRIMINANT_RIDGE = 1.0
 
 #: All trees, by name. Object and background share a regression: least squares of the object's mean against the
 #: background's mean and covariance. Only the one-class classifier uses the object's rows.

@@ -12,23 +12,23 @@ import numpy as np
 import scipy.linalg
 
 
-def between(background: np.ndarray, towards: np.ndarray, penalty: float) -> np.ndarray:
-    """The least-squares direction between two classes: w = (S + penalty I)^-1 towards, float32 (d,).
+def discriminant(background: np.ndarray, difference: np.ndarray, penalty: float) -> np.ndarray:
+    """The regularised linear discriminant of two classes: w = (S + penalty I)^-1 difference, float32 (d,).
 
-    S is the covariance of the background, float32 (r, d); `towards` is the mean of the object minus that of the
+    S is the covariance of the background, float32 (r, d); `difference` is the mean of the object minus that of the
     background.
     """
     centred = background - background.mean(axis=0)
     solve = _solver(centred @ centred.T, penalty * len(centred))
-    direction: np.ndarray = (towards - centred.T @ solve(centred @ towards)) / np.float32(penalty)
+    direction: np.ndarray = (difference - centred.T @ solve(centred @ difference)) / np.float32(penalty)
     return direction
 
 
 class Regression:
-    """The weights and biases that minimise ||A [w; b] - y||^2 / r + penalty ||w||^2, for labels y and penalties.
+    """The weights and the bias that minimise ||A [w; b] - y||^2 / r + penalty ||w||^2, for several labels y.
 
-    The products of the rows A are computed once, and factored once for each penalty; then a label costs O(r d). They
-    are float32 (r, d + 1): [x, 1], or any left rotation of them and the labels.
+    The Gram matrix of the rows A is computed once, and factored once for each penalty; then labels cost O(r d). The
+    rows are float32 (r, d + 1): [x, 1], or any left rotation of them and the labels.
     """
 
     def __init__(self, rows: np.ndarray) -> None:
@@ -48,7 +48,7 @@ class Regression:
 
 
 def _solver(gram: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Solves (gram + penalty I) z = right for any right side, by its Cholesky factor; changes the array."""
+    """Return a function that solves (gram + penalty I) z = y by the Cholesky factor; overwrites `gram`."""
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     factor = scipy.linalg.cho_factor(gram, overwrite_a=True, check_finite=False)
     return partial(scipy.linalg.cho_solve, factor, check_finite=False)  # which can be pickled

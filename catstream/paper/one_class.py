@@ -42,7 +42,9 @@ def one_class(rows: np.ndarray, origin: np.ndarray, nu: float = 0.5) -> np.ndarr
     centred = rows - origin
     gram = centred @ centred.T
     if not gram.any():
-        raise ProtocolError(f"none of the {len(rows)} rows of the object differs from the background: give another box")
+        raise ProtocolError(
+            f"none of the {len(rows)} rows of the object differs from the background: choose another box"
+        )
     machine = OneClassSVM(kernel="precomputed", nu=nu).fit(gram)
     normal: np.ndarray = machine.dual_coef_[0].astype(np.float32) @ centred[machine.support_]
     return normal

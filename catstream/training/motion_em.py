@@ -10,7 +10,7 @@ import numpy as np
 
 from catstream.base.arrays import Bool, Float64
 from catstream.messages.kinds import Motion
-from catstream.numerics.kalman import OBSERVED, TRANSITION, constant_velocity
+from catstream.numerics.kalman import OBSERVATION, TRANSITION, constant_velocity
 
 FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
@@ -86,8 +86,8 @@ def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lag
     process = (push.T @ push + spread - together - together.T) / len(push)
 
     seen = _present(centres)
-    error = centres[seen] - states[seen] @ OBSERVED.T
-    observation = error.T @ error / len(error) + OBSERVED @ covariances[seen].mean(axis=0) @ OBSERVED.T
+    error = centres[seen] - states[seen] @ OBSERVATION.T
+    observation = error.T @ error / len(error) + OBSERVATION @ covariances[seen].mean(axis=0) @ OBSERVATION.T
     return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
 
 

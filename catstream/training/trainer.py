@@ -1,12 +1,12 @@
-"""The trainer: takes a sample of the coreset trees, and returns a model.
+"""The trainer: trains a model on a sample of the coreset trees.
 
-What `teaching.classifier` uses of the trees for the weights of the score:
+The classifiers of `teaching.classifier` compute the weights of the score from these parts of the trees:
 
     least-squares  the mean of the object; the mean and the rows of the background
     joint          the same, and the rows of the loss tree
     one-class      the rows of the object; the mean of the background
 
-The means of object and background also scale the score, and the rows of the extent tree are used in each case.
+All of them scale the score by the means of object and background, and use the rows of the extent tree.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from catstream.base.settings import Settings
 from catstream.errors import ProtocolError
-from catstream.messages.heads import BETWEEN_RIDGE, TREES, Head, Tree
+from catstream.messages.heads import DISCRIMINANT_RIDGE, TREES, Head, Tree
 from catstream.messages.kinds import Model, Motion, Sample
 from catstream.numerics import ridge
 from catstream.training.motion_em import learn_motion
@@ -28,25 +28,26 @@ class Trainer:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._regressions: dict[str, dict[str, ridge.Regression]] = {}  # of the last samples, by object and tree
+        self._regressions: dict[str, dict[str, ridge.Regression]] = {}  # of the last sample, by object and tree
 
     def train(self, sample: Sample) -> Model:
         """Train a model on a sample, in time that depends on n only.
 
         The score is scaled to 0 at the mean of the background and 1 at the mean of the object, so that the scores of
-        all models are comparable. ProtocolError if object and background are the same in the sample.
+        all models are comparable. ProtocolError if object and background have the same mean in the sample.
         """
         self._regressions[sample.object] = self._regressions.pop(sample.object, {})
-        if len(self._regressions) > self.settings.run.objects_most:  # the longest ago: it was forgotten
+        if len(self._regressions) > self.settings.run.objects_most:  # the oldest is that of a forgotten object
             del self._regressions[next(iter(self._regressions))]
         background_mean = sample.trees["background"].mean
-        apart = sample.trees["object"].mean - background_mean
-        # Very few rows may give a direction in which the object does not score higher: it is left out.
-        useful = [scaled for each in self._directions(sample) if (scaled := _unit_contrast(each, apart)) is not None]
-        weights = _unit_contrast(np.sum(useful, axis=0) if useful else _between(sample), apart)
+        difference = sample.trees["object"].mean - background_mean
+        # Very few rows may give a direction in which the object does not score higher: it is not used.
+        scaled = [_unit_contrast(direction, difference) for direction in self._directions(sample)]
+        useful = [direction for direction in scaled if direction is not None]
+        weights = _unit_contrast(np.sum(useful, axis=0) if useful else _discriminant(sample), difference)
         if weights is None:
             raise ProtocolError(
-                f"sample {sample.version} has no difference between object and background: give another box"
+                f"object and background have the same mean in sample {sample.version}: choose another box"
             )
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
@@ -61,9 +62,9 @@ class Trainer:
 
             return [one_class(sample.trees["object"].rows, sample.trees["background"].mean)]
         if settings.teaching.classifier == "least-squares":
-            return [_between(sample)]
+            return [_discriminant(sample)]
         return [
-            _between(sample),
+            _discriminant(sample),
             *(
                 self._fitted(sample, tree, head)[0]
                 for tree in TREES.values()
@@ -73,10 +74,10 @@ class Trainer:
         ]
 
     def _head_vectors(self, sample: Sample, weights: np.ndarray) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-        """The vectors of the heads that do not add to the score, and the biases of those that have one.
+        """The vectors and the biases of the heads that do not add to the score.
 
-        The others are fitted to the residual of the labels, label - weights @ row: detection adds both products when it
-        chooses size and aspect.
+        A head without a bias is fitted to the residual of its labels, label - weights @ row, because detection adds
+        both products when it selects size and aspect ratio.
         """
         vectors, biases = {}, {}
         for tree in TREES.values():
@@ -89,32 +90,30 @@ class Trainer:
         return vectors, biases
 
     def _fitted(
-        self, sample: Sample, tree: Tree, head: Head, beside: np.ndarray | None = None
+        self, sample: Sample, tree: Tree, head: Head, score_weights: np.ndarray | None = None
     ) -> tuple[np.ndarray, float]:
-        """Weights and bias of a head; with `beside`, of what its label has beyond the product with these weights."""
+        """Weights and bias of a head; with `score_weights`, fitted to the residual of its labels."""
         rows = sample.trees[tree.name].rows
         d = rows.shape[1] - tree.more_columns
         labels = rows[:, d + 1 + tree.heads.index(head)]
-        if beside is not None:
-            labels = labels - rows[:, :d] @ beside
-        known, rows = self._regressions[sample.object], rows[:, : d + 1]
-        if tree.name not in known or not np.array_equal(known[tree.name].rows, rows):  # not those of the last sample
-            known[tree.name] = ridge.Regression(rows)
-        return known[tree.name].fit(labels, head.penalty)
+        if score_weights is not None:
+            labels = labels - rows[:, :d] @ score_weights
+        regressions = self._regressions[sample.object]
+        inputs = rows[:, : d + 1]
+        if tree.name not in regressions or not np.array_equal(regressions[tree.name].rows, inputs):
+            regressions[tree.name] = ridge.Regression(inputs)
+        return regressions[tree.name].fit(labels, head.penalty)
 
 
-def _between(sample: Sample) -> np.ndarray:
-    """Least squares of the object's mean against the background's mean and covariance.
-
-    Its contrast is positive if the means differ.
-    """
+def _discriminant(sample: Sample) -> np.ndarray:
+    """The linear discriminant of object and background; its contrast is positive if the means differ."""
     background = sample.trees["background"]
-    return ridge.between(background.rows, sample.trees["object"].mean - background.mean, BETWEEN_RIDGE)
+    return ridge.discriminant(background.rows, sample.trees["object"].mean - background.mean, DISCRIMINANT_RIDGE)
 
 
-def _unit_contrast(direction: np.ndarray, apart: np.ndarray) -> np.ndarray | None:
-    """A direction scaled so that the means differ by 1 along it; None if the object's mean is not the higher one."""
-    contrast = float(direction @ apart)
+def _unit_contrast(direction: np.ndarray, difference: np.ndarray) -> np.ndarray | None:
+    """Scale a direction so that the means differ by 1 along it; None if the object's mean is not the higher one."""
+    contrast = float(direction @ difference)
     return direction / np.float32(contrast) if contrast > 0 else None
 
 

@@ -70,7 +70,7 @@ def test_an_incomplete_checkpoint_is_detected_and_the_previous_one_is_used(kept,
     newest(kept).write_bytes(whole[: int(share * len(whole))])
     store = CheckpointStore(kept)
     assert store.load(SETTINGS).seq == 50
-    assert "damaged checkpoints: 1, the one of frame 49 was used" in store.trouble
+    assert "damaged checkpoints: 1; that of frame 49 was used" in store.trouble
     assert "cannot be used" in caplog.text
 
 
@@ -103,7 +103,7 @@ def test_if_no_checkpoint_is_valid_learning_starts_anew_and_that_is_reported(kep
         path.write_bytes(b"")
     store = CheckpointStore(kept)
     assert store.load(SETTINGS).seq == 0
-    assert "damaged checkpoints: 2, everything is learned again" in store.trouble
+    assert "damaged checkpoints: 2; training starts again" in store.trouble
 
 
 def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, monkeypatch):

@@ -273,14 +273,12 @@ def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, m
     assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
 
 
-@pytest.mark.parametrize("other", [{}, {"anna"}], ids=["alone", "of two"])
-def test_rows_of_another_length_are_rejected_and_nothing_of_any_object_is_stored(settings, messages, other):
+def test_features_of_another_length_or_network_are_rejected(settings, messages):
     forest = Forest(settings)
-    first, second = ({name: next(messages) for name in (*other, "ben")} for _ in range(2))
-    forest.take(merged(1, **first))
-    before = forest.object_counters()
-    bad = changed(second["ben"], training={EXTENT: TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)})
-    with pytest.raises(ProtocolError, match="same settings"):
-        forest.take(merged(2, **second | {"ben": bad}))
-    assert (forest.object_counters(), forest.seq) == (before, 1)
-    forest.take(merged(2, **second))
+    forest.take(next(messages))
+    message = next(messages)
+    forest.check_features(message)
+    rows = TrainingRows.labelled(np.ones((3, WIDTH - 1)), 1)
+    for bad in (changed(message, training={EXTENT: rows}), dataclasses.replace(message, network="another")):
+        with pytest.raises(ProtocolError, match="same settings"):
+            forest.check_features(bad)

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.base.box import Box, Window
-from catstream.base.settings import SearchSettings
-from catstream.detection.objects import assigned
-from catstream.detection.search import Detection, local
+from catstream.base.settings import Settings
+from catstream.detection.context import FrameContext
+from catstream.detection.objects import assign
+from catstream.detection.search import Detection, local_search
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
@@ -33,15 +34,15 @@ def detection(score, x, around=None):
 
 def test_detections_at_different_places_stay_the_same():
     found = {"anna": detection(0.9, 100), "ben": detection(0.8, 120)}
-    assert assigned(found, APART, CONTEXT) == found
-    assert assigned({}, {}, CONTEXT) == {}
+    assert assign(found, APART, CONTEXT) == found
+    assert assign({}, {}, CONTEXT) == {}
 
 
 @pytest.mark.parametrize("order", [("anna", "ben"), ("ben", "anna")])
 def test_of_two_objects_at_one_place_the_one_with_the_higher_score_keeps_it(order):
     both = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     found = {name: both[name] for name in order}
-    result = assigned(found, APART, CONTEXT)
+    result = assign(found, APART, CONTEXT)
     assert result["anna"] is found["anna"]
     assert result["ben"].score == 0
     assert list(result) == list(order)
@@ -52,7 +53,7 @@ def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
     states = {name: state(100 * i) for i, name in enumerate(("left", "right", "middle"))}
     for middle, kept in ((0.7, {"left", "right"}), (0.95, {"middle"})):
         found = {"left": detection(0.9, 100), "right": detection(0.8, 124), "middle": detection(middle, 112)}
-        result = assigned(found, states, CONTEXT)
+        result = assign(found, states, CONTEXT)
         assert {name for name, each in result.items() if each.score > 0} == kept
 
 
@@ -64,7 +65,7 @@ def test_no_two_objects_ever_have_one_place(objects, random):
 
     found = {str(i): detection(score, x, around(x)) for i, (score, x) in enumerate(objects)}
     states = {name: state(100 * i) for i, name in enumerate(found)}
-    result = assigned(found, states, CONTEXT)
+    result = assign(found, states, CONTEXT)
     boxes = [each.window.box(CONTEXT) for each in result.values() if each.score > 0]
     assert boxes
     assert all(one.overlap(other) <= 0.5 for one, other in combinations(boxes, 2))
@@ -73,17 +74,17 @@ def test_no_two_objects_ever_have_one_place(objects, random):
 def test_objects_whose_first_boxes_overlap_may_stay_at_one_place():
     found = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     together = {"anna": state(100), "ben": state(110)}
-    assert assigned(found, together, CONTEXT) == found
+    assert assign(found, together, CONTEXT) == found
     one_later = {"anna": state(100), "ben": state(110, first_frame=7)}
-    assert assigned(found, one_later, CONTEXT)["ben"].score == 0
+    assert assign(found, one_later, CONTEXT)["ben"].score == 0
 
 
 def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng):
     frame = Pyramid(rng.integers(0, 256, (200, 300, 3), np.uint8))
     window = Window.around(Box(100, 50, 40, 40), CONTEXT)
     row = ScoreMap.around(frame, window, WINDOW, None).cells.row(0, 0)
-    found = local(frame, window, Model(1, 0, row, 0.0), SearchSettings())
-    result = assigned({"anna": Detection(1e9, found.window), "ben": found}, APART, CONTEXT)["ben"]
+    found = local_search(FrameContext(frame, Model(1, 0, row, 0.0), Settings()), window)
+    result = assign({"anna": Detection(1e9, found.window), "ben": found}, APART, CONTEXT)["ben"]
     assert 0 < result.score < found.score
     assert result.window.box(CONTEXT).overlap(found.window.box(CONTEXT)) <= 0.5
     assert result.around is found.around

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from catstream.base.box import Window
 from catstream.base.settings import Settings
 from catstream.detection import belief
-from catstream.detection.belief import at_rest, measured, predicted
+from catstream.detection.belief import at_rest, predict, update
 from catstream.messages.kinds import DetectorState, Motion
 
 SETTINGS = Settings()
@@ -62,7 +62,7 @@ def test_a_redetected_object_trains_nothing_and_a_lost_one_changes_nothing_and_i
 @given(states(), SCORES, st.booleans())
 def test_a_lost_object_needs_at_least_the_score_to_return_that_it_needs_to_stay(state, score, redetected):
     lost, present = (
-        belief.updated(dataclasses.replace(state, level=level), score, redetected, BELIEF).level
+        belief.update_level(dataclasses.replace(state, level=level), score, redetected, BELIEF).level
         for level in ("lost", "weak")
     )
     assert present != "lost" or lost == "lost"
@@ -70,14 +70,14 @@ def test_a_lost_object_needs_at_least_the_score_to_return_that_it_needs_to_stay(
 
 @given(states(), SCORES, st.booleans())
 def test_an_object_is_distrusted_from_its_redetection_until_it_scores_high(state, score, redetected):
-    after = belief.updated(state, score, redetected, BELIEF)
+    after = belief.update_level(state, score, redetected, BELIEF)
     assert after.trusted == (score >= BELIEF.trusted_score or (state.trusted and not redetected))
     assert (after.level == "redetected") == (not after.trusted and after.level != "lost")
 
 
 def test_an_object_that_was_never_found_is_lost_whatever_it_scores():
     state = DetectorState(0, "lost", WINDOW, WINDOW, None)
-    assert belief.updated(state, 2.0, False, BELIEF).level == "lost"
+    assert belief.update_level(state, 2.0, False, BELIEF).level == "lost"
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def moving(motion: Motion, frames: int = 60) -> np.ndarray:
     """The estimate of an object that went 3 pixels right and 1 up a frame, to (100 + 3 frames, 200 - frames)."""
     estimate = at_rest((100, 200), motion)
     for frame in range(1, frames + 1):
-        estimate = measured(predicted(estimate, motion), motion, (100 + 3 * frame, 200 - frame))
+        estimate = update(predict(estimate, motion), motion, (100 + 3 * frame, 200 - frame))
     return estimate
 
 
@@ -98,7 +98,7 @@ def test_a_lost_object_coasts_to_a_stop(motion):
     estimate = moving(motion)
     (x, y, *velocity), *_ = estimate
     for _ in range(500):
-        estimate = predicted(estimate, motion, lost=True)
+        estimate = predict(estimate, motion, lost=True)
     assert np.hypot(*estimate[0, 2:]) < 1e-6
     assert np.hypot(*(estimate[0, :2] - (x, y))) < 5.01 * np.hypot(*velocity)
 
@@ -106,15 +106,15 @@ def test_a_lost_object_coasts_to_a_stop(motion):
 def test_an_object_that_reappears_has_a_higher_belief_than_one_that_never_left(motion):
     never_left, back = moving(motion), moving(motion)
     for _ in range(30):
-        back = predicted(back, motion, lost=True)
+        back = predict(back, motion, lost=True)
     shares = []
     for estimate in (never_left, back):
-        expected = predicted(estimate, motion)
+        expected = predict(estimate, motion)
         x, y = expected[0, :2]
-        shares.append((measured(expected, motion, (x + 5, y))[0, 0] - x) / 5)
+        shares.append((update(expected, motion, (x + 5, y))[0, 0] - x) / 5)
     assert shares[0] < 0.3 < 0.6 < shares[1]
 
 
 def test_a_jump_is_a_new_start_at_rest(motion):
-    estimate = measured(predicted(moving(motion), motion), motion, (40, 40))
+    estimate = update(predict(moving(motion), motion), motion, (40, 40))
     np.testing.assert_array_equal(estimate, at_rest((40, 40), motion))

@@ -39,9 +39,9 @@ class Follower(Detector):
 
     def step(self, image):
         frame = Pyramid(image)
-        found = self.look(frame, self.seq + 1)
+        detection = self.search(frame, self.seq + 1)
         self.seq += 1
-        return self.settle(found, frame, self.seq, 0.0)
+        return self.update(detection, frame, self.seq, 0.0)
 
     def go_on(self, seq, state, model):
         self.seq = seq
@@ -311,7 +311,7 @@ def test_a_resumed_search_continues_bit_for_bit(scene, learned, similarity):
 
 
 def test_a_model_of_other_features_is_rejected(similarity):
-    with pytest.raises(ProtocolError, match="learn it again"):
+    with pytest.raises(ProtocolError, match="train it again"):
         Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, similarity)
 
 
@@ -325,7 +325,7 @@ def test_a_box_of_a_past_frame_is_searched_for_in_those_since_and_only_its_own_r
     assert track.box.overlap(now) > 0.8
     _, alone = Detectors(Settings()).begin("", first, START)
     assert all((features.training[group].rows == alone.training[group].rows).all() for group in GROUPS)
-    detectors.step(later[-1], given={"": (track, features)})
+    detectors.step(later[-1], results={"": (track, features)})
     track, _ = detectors.correct("", first, START, later=later)
     assert (track.seq, track.began) == (2, 0)
     assert track.box.overlap(now) > 0.8

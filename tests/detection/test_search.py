@@ -6,8 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.base.box import Window
+from catstream.base.settings import Settings
 from catstream.detection import search
-from catstream.detection.search import due
+from catstream.detection.context import FrameContext
+from catstream.detection.search import due_part
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
@@ -32,7 +34,7 @@ def test_windows_of_a_region_lie_in_it(image, rng):
 @given(st.integers(0, 10**6), st.integers(1, 30), st.integers(1, 60))
 def test_each_part_is_due_once_in_an_interval_or_in_as_many_frames_as_there_are_parts(seq, interval, count):
     frames = max(interval, count)
-    parts = [part for number in range(seq, seq + frames) if (part := due(number, interval, count)) is not None]
+    parts = [part for number in range(seq, seq + frames) if (part := due_part(number, interval, count)) is not None]
     assert sorted(parts) == list(range(count))
 
 
@@ -41,7 +43,7 @@ def visited(monkeypatch):
     """The regions that are searched, with the size of their windows, in order."""
     found = []
 
-    def within(_, region, window, __):
+    def within(_, region, window, __, **___):
         found.append((region, window))
         return ScoreMap(Cells.of(np.zeros((64, 64, 3), np.uint8)), np.zeros((1, 1), np.float32), (0.0, 0.0), (1.0, 1.0))
 
@@ -57,7 +59,7 @@ def test_in_a_round_each_window_of_each_size_is_searched_for_and_a_frame_costs_n
     frame, window, model = Pyramid(np.zeros((240, 320, 3), np.uint8)), Window(100, 90, side, side), Model(0, 0, None, 0)
     for seq in range(200):
         before = len(visited)
-        search._elsewhere(frame, window, seq, interval, model)
+        search._search_elsewhere(FrameContext(frame, model, Settings(), seq), window, interval)
         assert sum(region.cells(sized) for region, sized in visited[before:]) < 1.2 * 16_384
     for factor in (0.8, 1.0, 1.25):
         w = side * factor
@@ -76,10 +78,10 @@ def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):
 
 def test_maxima_suppress_their_neighbours_and_stop_at_the_threshold(rng):
     scores = rng.normal(size=(30, 40)).astype(np.float32)
-    found = non_maximum_suppression(scores, 12, apart=3)
+    found = non_maximum_suppression(scores, 12, radius=3)
     values = [scores[place] for place in found]
     assert values == sorted(values, reverse=True)
     assert values[0] == scores.max()
     for i, (row, column) in enumerate(found):
         assert all(max(abs(row - r), abs(column - c)) > 3 for r, c in found[:i])
-    assert non_maximum_suppression(np.eye(5, dtype=np.float32), 9, apart=1, least=0.5) == [(0, 0), (2, 2), (4, 4)]
+    assert non_maximum_suppression(np.eye(5, dtype=np.float32), 9, radius=1, threshold=0.5) == [(0, 0), (2, 2), (4, 4)]

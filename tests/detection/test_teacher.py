@@ -6,6 +6,7 @@ import pytest
 from catstream.base.box import Window
 from catstream.base.settings import Settings
 from catstream.detection import teacher
+from catstream.detection.context import FrameContext
 from catstream.detection.teacher import affine_copies
 from catstream.features.cells import Cells
 from catstream.features.layout import COLOURS, WINDOW, row_length
@@ -30,7 +31,7 @@ def model(rng):
 
 def cut(frame, model, around=None, window=OBJECT):
     """Training rows of group "appearance", and which of them are the object, near misses and background."""
-    rows = teacher.training_at(frame, window, 3, model, SETTINGS, around)[APPEARANCE]
+    rows = teacher.training_at(FrameContext(frame, model, SETTINGS, 3), window, around)[APPEARANCE]
     own = rows.labels == 1
     return rows, own, (rows.labels > 0) & ~own, rows.labels == 0
 
@@ -85,7 +86,7 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
 
 def test_a_wrong_size_or_aspect_ratio_is_labelled_with_a_gaussian_of_its_steps_and_with_the_steps(frame, model):
     settings = SETTINGS.replace({"extent.size_count": 5, "extent.aspect_count": 3})
-    training = teacher.training_at(frame, OBJECT, 3, model, settings)
+    training = teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
     extents = training[EXTENT]
     np.testing.assert_array_equal(extents.rows[0], own)
@@ -97,11 +98,12 @@ def test_a_wrong_size_or_aspect_ratio_is_labelled_with_a_gaussian_of_its_steps_a
 
 
 def test_without_a_weight_of_the_extent_head_it_has_no_rows(frame, model):
-    assert set(teacher.training_at(frame, OBJECT, 3, model, SETTINGS.replace({"extent.weight": 0}))) == {APPEARANCE}
+    settings = SETTINGS.replace({"extent.weight": 0})
+    assert set(teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)) == {APPEARANCE}
 
 
 def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
-    rows = teacher.hard_negatives(frame, OBJECT, model, SETTINGS.teaching)
+    rows = teacher.hard_negatives(FrameContext(frame, model, SETTINGS), OBJECT)
     scores = rows.rows @ model.weights
     assert 0 < len(rows) <= SETTINGS.teaching.hard_negatives
     assert list(scores) == sorted(scores, reverse=True)
@@ -114,7 +116,7 @@ def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
     for used in (True, False):
         settings = SETTINGS.replace({"teaching.colours": used})
         first, training = teacher.first_training(frame, OBJECT, np.random.default_rng(1), settings)
-        groups = [*training.values(), *teacher.training_at(frame, OBJECT, 3, model, settings).values()]
+        groups = [*training.values(), *teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT).values()]
         assert all(group.rows[:, COLOURS].any() == used for group in groups)
         assert first.weights[COLOURS].any() == used
 

@@ -8,7 +8,9 @@ from catstream.numerics import ridge
 def test_between_is_the_solution_of_the_large_system(rng):
     background, towards = rng.normal(size=(30, 12)).astype(np.float32), rng.normal(size=12).astype(np.float32)
     system = np.cov(background, rowvar=False, bias=True) + 0.7 * np.eye(12)
-    np.testing.assert_allclose(ridge.between(background, towards, 0.7), np.linalg.solve(system, towards), rtol=1e-4)
+    np.testing.assert_allclose(
+        ridge.discriminant(background, towards, 0.7), np.linalg.solve(system, towards), rtol=1e-4
+    )
 
 
 def test_fit_minimises_the_squared_error(rng):

@@ -76,7 +76,7 @@ def test_the_heads_of_size_and_aspect_predict_their_label(cuts):
 
 
 def test_an_object_like_the_background_is_rejected(sample):
-    with pytest.raises(ProtocolError, match="give another box"):
+    with pytest.raises(ProtocolError, match="choose another box"):
         Trainer(Settings()).train(with_tree(sample, "object", sample.trees["background"]))
 
 

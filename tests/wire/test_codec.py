@@ -168,7 +168,7 @@ def test_arrays_travel_row_by_row_whatever_their_layout():
 def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
     detectors, ((image, box),) = Detectors(Settings()), rendered.render(1, (320, 240))
     pyramid = Pyramid(image)
-    _, features = detectors.step(pyramid, given={"": detectors.begin("", pyramid, box)})
+    _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
     (limit,) = get_type_hints(RunSettings, include_extras=True)["objects_most"].__metadata__
     largest = limit.le * len(encode(features)) + LARGEST_GIVEN_MODELS
     assert largest < CHANNELS["features"].limit == CHANNELS["training"].limit

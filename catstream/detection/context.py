@@ -1,0 +1,43 @@
+"""`FrameContext`: a frame, and the model and settings with which its windows are scored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from catstream.base.box import Window
+from catstream.base.settings import Settings
+from catstream.detection.similarity import Similarity
+from catstream.features.pyramid import Pyramid, Region
+from catstream.features.score_map import ScoreMap
+from catstream.features.vectors import VectorMap
+from catstream.messages.kinds import Model
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameContext:
+    """A frame in which one object is searched.
+
+    pyramid     the frame
+    model       of the object
+    settings    of the run
+    seq         number of the frame's message, which selects the periodic tasks of a frame
+    similarity  to the object of a saved model; None without a saved model
+    """
+
+    pyramid: Pyramid
+    model: Model
+    settings: Settings
+    seq: int = 0
+    similarity: Similarity | None = None
+
+    def scores_around(self, window: Window, side: int, vectors: VectorMap | None = None) -> ScoreMap:
+        """Scores of all windows in `side` x `side` cells around a window: see `ScoreMap.around`."""
+        return ScoreMap.around(self.pyramid, window, side, self.model, vectors)
+
+    def scores_within(self, region: Region, window: Window, *, described: bool = False) -> ScoreMap:
+        """Scores of all windows of a size in a region: see `ScoreMap.within`."""
+        return ScoreMap.within(self.pyramid, region, window, self.model, described=described)
+
+    def scores_of_frame(self, window: Window) -> ScoreMap:
+        """Scores of all windows of a size in the frame: see `ScoreMap.whole`."""
+        return ScoreMap.whole(self.pyramid, window, self.model)
