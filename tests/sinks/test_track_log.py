@@ -261,10 +261,16 @@ def table(path, columns, separator=",", change=lambda rows: rows, encoding="utf-
         {"columns": COLUMNS, "separator": "\t", "ending": "\r\n"},
         {"columns": COLUMNS, "change": lambda rows: sorted(rows, key=lambda row: row["object"])},
         {"columns": COLUMNS, "change": lambda rows: rows[::-1]},
-        {"columns": COLUMNS, "change": lambda rows: [row | {"frame": f"{row['frame']}.0", "model_version": "1.0"} for row in rows]},
-        {"columns": [f'"{column}"' for column in COLUMNS], "change": lambda rows: [{f'"{k}"': f'"{v}"' for k, v in row.items()} for row in rows]},
+        {
+            "columns": COLUMNS,
+            "change": lambda rows: [row | {"frame": f"{row['frame']}.0", "model_version": "1.0"} for row in rows],
+        },
+        {
+            "columns": [f'"{column}"' for column in COLUMNS],
+            "change": lambda rows: [{f'"{k}"': f'"{v}"' for k, v in row.items()} for row in rows],
+        },
     ],
-)  # fmt: skip
+)
 def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp_path, form):
     frames = list(Log(table(tmp_path / "t.csv", **form)).frames())
     assert [frame.number for frame in frames] == list(range(5))
@@ -279,13 +285,18 @@ def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp
     [
         ({"columns": COLUMNS[1:]}, "lacks the column frame"),
         ({"columns": [*COLUMNS[:3], *COLUMNS[5:]]}, "lacks the column x and y"),
-        ({"columns": COLUMNS, "separator": ";", "change": lambda rows: [row | {"x": "1,5"} for row in rows]},
-         "line 2 is no track .*decimal comma"),
+        (
+            {"columns": COLUMNS, "separator": ";", "change": lambda rows: [row | {"x": "1,5"} for row in rows]},
+            "line 2 is no track .*decimal comma",
+        ),
         ({"columns": COLUMNS, "change": lambda rows: [*rows, rows[3]]}, "two rows of ben in frame 1"),
-        ({"columns": COLUMNS, "change": lambda rows: [row | {"frame": 0.5} for row in rows]}, "'0.5' is no whole number"),
+        (
+            {"columns": COLUMNS, "change": lambda rows: [row | {"frame": 0.5} for row in rows]},
+            "'0.5' is no whole number",
+        ),
         ({"columns": COLUMNS, "change": lambda rows: [row | {"x": "nan"} for row in rows]}, "line 2 is no track"),
     ],
-)  # fmt: skip
+)
 def test_a_csv_file_that_is_ambiguous_is_an_error_that_says_what_is_wrong(tmp_path, form, words):
     with pytest.raises(VideoError, match=words):
         list(Log(table(tmp_path / "t.csv", **form)).frames())
