@@ -17,6 +17,7 @@ from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import TREES
 from catstream.pipeline import Pipeline
+from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
 UNIT = Path(__file__).parents[2] / "deploy" / "catstream@.service"
@@ -219,13 +220,23 @@ def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed,
     assert frames(killed / "new") == [*range(32)]
 
 
-def test_the_files_of_a_resumed_run_are_cut_before_it_receives_a_frame(killed, said, monkeypatch):
+def test_the_files_of_a_resumed_run_are_whole_before_it_receives_a_frame(killed, said, monkeypatch):
     monkeypatch.setattr(Pipeline, "by_frame", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    table = killed / "out" / "demo.csv"
-    whole = table.read_bytes()
-    table.write_bytes(whole + b"32,1.0")
+    logs = [killed / "out" / "demo.ndjson", killed / "out" / "demo.csv"]
+    before = [[frame.tracks for frame in Log(log).frames()] for log in logs]
+    for log in logs:
+        log.write_bytes(log.read_bytes() + b"32,1.0")
     assert said("track", "--resume", killed / "kept")[0] == 130
-    assert table.read_bytes() == whole
+    assert [[frame.tracks for frame in Log(log).frames()] for log in logs] == before
+
+
+def test_a_resumed_run_drops_a_video_and_destinations_if_it_is_told_so(killed, succeed):
+    kept, table = killed / "kept", killed / "more.csv"
+    succeed("track", "--resume", kept, "--write", table)
+    assert str(table) in Job.load(kept).results.write
+    succeed("track", "--resume", kept, "--no-video", "--no-write")
+    results = Job.load(kept).results
+    assert (results.output, results.video, results.write) == (killed / "out", False, ())
 
 
 @pytest.mark.parametrize("words", [["track", "--resume"], ["save", "one", "--state"]], ids=" ".join)

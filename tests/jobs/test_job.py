@@ -145,4 +145,5 @@ def test_the_files_of_a_state_are_restored_with_the_models_that_are_searched_for
 def test_a_resumed_run_keeps_the_options_of_its_destinations_unless_some_are_given():
     earlier = Results(write=("mqtt://host/yard",), options=SinkOptions(rate=5.0))
     assert Results().after(earlier) == earlier
+    assert Results(video=False, write=()).after(Results(video=True, write=("-",))) == Results(video=False, write=())
     assert Results(options=SinkOptions(events=("lost",))).after(earlier).options == SinkOptions(events=("lost",))

@@ -98,14 +98,16 @@ def test_a_run_of_a_live_source_is_resumed_with_its_first_frame(tmp_path):
         assert next(iter(pipeline)).frame == before.frame + 1
 
 
-def test_the_times_of_a_live_run_go_on_if_the_clock_was_set_back_before_it_is_resumed(tmp_path, monkeypatch):
+@pytest.mark.parametrize("change", [-3600, 3600])
+def test_the_times_of_a_live_run_go_on_if_the_clock_was_set_before_it_is_resumed(tmp_path, monkeypatch, change):
     source, now = "demo:1", time.time()
     with Pipeline(source, first_box(source), state=tmp_path / "kept") as pipeline:
         before = [track.time for track in islice(pipeline, 30)]
-    monkeypatch.setattr(time, "time", lambda: now - 3600)
+    monkeypatch.setattr(time, "time", lambda: now + change)
     with Pipeline(resume=tmp_path / "kept") as pipeline:
         times = [*before, next(iter(pipeline)).time]
     assert times == sorted(times)
+    assert times[-1] < times[-2] + 600
 
 
 @pytest.mark.parametrize("action", ["always", "error"])
