@@ -187,7 +187,7 @@ def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int
 
 def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> None:
     """Raise an error of this kind if another process has locked a file."""
-    with contextlib.suppress(FileNotFoundError, PermissionError), descriptor(path) as handle:
+    with contextlib.suppress(OSError), descriptor(path) as handle:
         if is_locked(handle):
             raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
 

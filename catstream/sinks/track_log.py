@@ -29,7 +29,7 @@ from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
 from catstream.base.text import listed
-from catstream.errors import VideoError
+from catstream.errors import ProtocolError, VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import State, Track
 from catstream.sinks.database import read_database, read_database_head
@@ -46,6 +46,7 @@ from catstream.sinks.destinations import (
 )
 from catstream.sinks.reports import Warnings
 from catstream.video.source import is_live
+from catstream.wire.codec import decode_json
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
 
@@ -235,14 +236,16 @@ class Log:
         with self.path.open("rb") as file:
             for number, line in enumerate(file, 1):
                 end += len(line)
-                if number == 1 and _is_first_line(self.path, line):
+                if number == 1 and self.path.suffix == ".csv":
                     continue
                 if problem:
                     self._report(problem)
                     problem = ""
                 try:
-                    track, seconds = parse(line.decode())
-                except (KeyError, TypeError, ValueError) as error:
+                    track, seconds = parse(line.decode("utf-8-sig"))
+                except (KeyError, TypeError, ValueError, ProtocolError) as error:
+                    if Head.from_json(line) is not None:  # the first line, or that of a log which was joined to another
+                        continue
                     problem = f"{self.path}, line {number} is no track ({error})"
                     is_cut = not line.endswith(b"\n") or not line.strip()
                 else:
@@ -276,20 +279,16 @@ class Log:
         return parse
 
 
-def _is_first_line(path: Path, line: bytes) -> bool:
-    """Whether the first line of a file is the head, or the names of the columns."""
-    return path.suffix == ".csv" or Head.from_json(line) is not None
-
-
 def _parse_json(line: str) -> tuple[Track, float]:
-    """The track of a line; raise ValueError, KeyError or TypeError if it is none. Other fields are ignored."""
-    fields = json.loads(line)
-    known = {name: value for name, value in fields.items() if name in Track.__dataclass_fields__}
-    return Track(**{**known, "box": fields["box"] and Box(*fields["box"])}), nan
+    """The track of a line; raise ProtocolError if it is none. Fields that a track lacks are ignored."""
+    return decode_json(line.encode(), Track), nan
 
 
 def _parse_row(row: Mapping[str, str]) -> tuple[Track, float]:
-    """The same of a row of a CSV file. The track has no `pts`, `began` and `doubtful`, which are not in the file."""
+    """The same of a row of a CSV file; raise ValueError or KeyError if it is none.
+
+    The track has no `pts`, `began` and `doubtful`, which are not in the file.
+    """
     box = Box(*(_number(row[side]) for side in "xywh")) if row["x"] else None
     frame = _integer(row["frame"])
     track = Track(

@@ -113,7 +113,9 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, 
     assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
 
 
-@pytest.mark.parametrize(("log", "words"), [("none.csv", "is no log"), ("a.txt", "is no log"), ("a.csv", "no tracks")])
+@pytest.mark.parametrize(
+    ("log", "words"), [("none.csv", "is no log"), ("a.txt", "is no log"), ("a.csv", "lacks the column seconds")]
+)
 def test_a_file_that_is_no_log_is_not_exported(fail, tmp_path, log, words):
     for name in ("a.txt", "a.csv"):
         (tmp_path / name).write_text("frame\nsomething else\n")
