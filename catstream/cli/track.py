@@ -23,14 +23,7 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted, listed
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
-from catstream.cli.view import PORT, Address, AddressType, with_token
-from catstream.cli.write import check_used, with_sink_options, with_table
-from catstream.errors import require_extra
-from catstream.jobs.job import Results, SinkOptions
-from catstream.jobs.state import contains_run, files_of_state
-from catstream.messages.kinds import Track
-from catstream.pipeline import Pipeline
-from catstream.processes.options import (
+from catstream.cli.options import (
     FOLDER,
     PATH,
     with_files,
@@ -40,6 +33,13 @@ from catstream.processes.options import (
     with_part,
     with_reading,
 )
+from catstream.cli.view import PORT, Address, AddressType, with_token
+from catstream.cli.write import check_used, with_sink_options, with_table
+from catstream.errors import require_extra
+from catstream.jobs.job import Results, SinkOptions
+from catstream.jobs.state import contains_run, files_of_state
+from catstream.messages.kinds import Track
+from catstream.pipeline import Pipeline
 from catstream.sinks.destinations import STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from shlex import quote
@@ -18,11 +18,12 @@ import msgspec
 
 from catstream.base.box import Box
 from catstream.base.files import writing
-from catstream.base.names import UNNAMED, by_name, check_count
+from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_count
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
+from catstream.video.source import ALL_FRAMES, source_text
 
 #: Files of saved models: of one object without a name, or by name.
 Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
@@ -115,7 +116,7 @@ class Job:
     source: str = field(default="", repr=False)  # it may contain a password
     boxes: dict[str, Box] = field(default_factory=dict)
     models: dict[str, Path] = field(default_factory=dict)
-    part: slice = field(default_factory=lambda: slice(None))
+    part: slice = field(default_factory=lambda: ALL_FRAMES)
     settings: Settings = field(default_factory=Settings)
     size: tuple[int, int] | None = None
     results: Results = Results()
@@ -134,6 +135,46 @@ class Job:
                 "give one of them"
             )
         check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
+
+    @classmethod
+    def new(
+        cls,
+        source: str | os.PathLike[str] | int | None,
+        boxes: Boxes | None = None,
+        settings: Settings | Mapping[str, object] | None = None,
+        *,
+        models: Models | None = None,
+        part: slice = ALL_FRAMES,
+        results: Results | None = None,
+        paused: bool = False,
+    ) -> Job:
+        """The job of a new run, by the arguments of `catstream.Pipeline`."""
+        if source is None:
+            raise SettingsError("missing source: a new run needs a video, a folder of images, a camera or a stream")
+        return cls(
+            boxes={} if boxes is None else boxes_by_name(boxes),
+            models={name: file.absolute() for name, file in files_by_name(models).items()},
+            results=results or Results(),
+        ).resumed(source, settings, part=part, paused=paused)
+
+    def resumed(
+        self,
+        source: str | os.PathLike[str] | int | None = None,
+        settings: Settings | Mapping[str, object] | None = None,
+        *,
+        part: slice = ALL_FRAMES,
+        results: Results | None = None,
+        paused: bool = False,
+    ) -> Job:
+        """The job of the next part of the run; what is not given stays."""
+        return replace(
+            self,
+            source=self.source if source is None else source_text(source),
+            part=self.part if part == ALL_FRAMES else part,
+            settings=settings if isinstance(settings, Settings) else self.settings.replace(settings or {}),
+            results=self.results if results is None else results.after(self.results),
+            paused=paused,
+        )
 
     def save(self, folder: Path) -> Path:
         """Write the job to a folder, readable by its owner only: the source may contain a password. Returns the file.

@@ -19,7 +19,7 @@ from catstream.jobs.state import TREES
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
 
-UNIT = Path(__file__).parents[2] / "deploy" / "catstream@.service"
+UNIT = Path(__file__).parents[2] / "services" / "catstream@.service"
 OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]
 
 
