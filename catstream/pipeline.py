@@ -76,7 +76,7 @@ class Pipeline:
         Whether the run starts paused: `catstream resume` continues it, for example once all subscribers are there.
     results : Results
         The files that the program writes, stored in the state folder for the program that resumes the run. A run that
-        is resumed keeps those of each kind that are not given again.
+        is resumed continues those of each kind without a new one.
     save_model : path, or a mapping of names to paths
         Files for what was learned of the objects, written as by `catstream save` once the processes have ended, however
         the run ended. One path is for the only object. By default those of `results`.
@@ -98,7 +98,7 @@ class Pipeline:
     results, earlier_results : Results
         The files that the program writes, with those of the run that is resumed; and those of that run alone.
     after : int or None
-        As given; another value counts if it is set before the start.
+        The argument; another value counts if it is set before the start.
     saved_models : list of Path
         At the end: the files of `save_model` that were written.
 
@@ -163,8 +163,8 @@ class Pipeline:
             raise ServiceError(_ONCE)
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
-            settings, shown = self.settings, without_password(self.source)
-            endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, shown))
+            settings, source = self.settings, without_password(self.source)
+            endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, source))
             if self._state is not None:
                 stack.enter_context(locked_for_run(self._state, self._earlier, self._job))
             job = self._started(str(endpoint))
@@ -279,7 +279,7 @@ class Pipeline:
         """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees.
 
         And of the tracks that were received here (`rows`), and how often a process was restarted (`restarts`). If
-        frames of a file were left out, how many were `damaged`, and if they had
+        frames of a file were skipped, how many were `damaged`, and if they had
         another size than the first one, how many were `scaled`; of a live source, how many frames were `skipped`, and
         its number of `reconnects`.
         """

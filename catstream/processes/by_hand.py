@@ -63,9 +63,8 @@ def parser(name: str) -> ArgumentParser:
         made.add_argument("source", metavar="SOURCE", help="A video, a folder of images, a camera or a stream.")
         box = "An object in the first frame, in pixels; may be repeated with names."
         made.add_argument("--box", dest="boxes", action="append", default=[], metavar="[NAME=]X,Y,W,H", help=box)
-        made.add_argument(
-            "--resume", action="store_true", help="Continue after the last message of an earlier detector."
-        )
+        resume = "Continue after the last message of an earlier detector."
+        made.add_argument("--resume", action="store_true", help=resume)
     return made
 
 

@@ -54,8 +54,8 @@ def _search(command: Command, desired: DesiredState, detectors: Detectors, model
     check_room(name, desired, detectors.settings.run.objects_most)
     if model is None:
         raise ObjectError("missing saved model: search needs the file of one")
-    desired = desired.begun(name, replace(model, begins=seq + 1))
-    check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
+    desired = desired.with_object(name, replace(model, begins=seq + 1))
+    check_sizes({name: item.size for name, item in desired.objects.items() if item.begins > seq and item.model})
     effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
     return desired, answer(command, detectors, True, effect, name)
 
@@ -63,7 +63,7 @@ def _search(command: Command, desired: DesiredState, detectors: Detectors, model
 def _forget(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
     name = _tracked(command, desired)
     desired = desired.without(name)
-    waits = "" if desired.objects else ": no object is left, so the run waits for a box"
+    waits = "" if desired.objects else ": no object remains, so the run waits for a box"
     effect = f"{listed([name])} is no longer tracked {_moment(detectors)}{waits}"
     return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
 
