@@ -30,11 +30,8 @@ Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
 _NAME = "job.safetensors"
 
-#: Settings that do not affect the training: a run can be resumed with other values.
-_FREE = {
-    *("run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"),
-    *("run.open_seconds", "run.silent_seconds", "run.poll_seconds"),
-}
+#: Settings that do not affect the training, beside all times: a run can be resumed with other values.
+_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +239,8 @@ def changed_setting(before: Settings, after: Settings) -> str:
     'coreset.size=64, not 32'
     """
     ours, theirs = before.values(), after.values()
-    changed = (name for name in sorted(ours.keys() - _FREE) if ours[name] != theirs[name])
+    fixed = (name for name in sorted(ours.keys() - _FREE) if not name.endswith("_seconds"))
+    changed = (name for name in fixed if ours[name] != theirs[name])
     return next((f"{name}={ours[name]}, not {theirs[name]}" for name in changed), "")
 
 
