@@ -146,7 +146,7 @@ def served(stream: Stream, messages: int, settings: Settings) -> list[tuple[int,
     """Measure the compressor process: a row for each fifth of the messages."""
     rows = []
     with TemporaryDirectory(prefix="catstream-") as folder:
-        command = [sys.executable, "-m", "catstream.processes", "compressor"]
+        command = [sys.executable, "-P", Path(__file__).parents[1] / "services" / "compressor.py"]
         options = ["--set", f"run.endpoint={folder}", "--state", f"{folder}/state"]
         with (
             subprocess.Popen([*command, *options], stderr=subprocess.DEVNULL) as process,

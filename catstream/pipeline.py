@@ -21,17 +21,16 @@ from typing import Literal, Self
 from catstream.base.addresses import without_password
 from catstream.base.files import check_distinct, check_file
 from catstream.base.forks import check_not_forked, forked, generation
-from catstream.base.names import Boxes, boxes_by_name, check_boxes
+from catstream.base.names import Boxes
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
-from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.jobs.job import Job, Models, Results, files_by_name
-from catstream.jobs.saved_model import check_files
+from catstream.jobs.probe import prepared, probe
 from catstream.jobs.state import last_seq, last_time, locked_for_run, saved
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
-from catstream.video.source import ALL_FRAMES, is_live, open_source, source_text
+from catstream.video.source import ALL_FRAMES
 from catstream.wire.endpoint import private_folder, reserve_endpoint
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
@@ -77,7 +76,7 @@ class Pipeline:
         Whether the run starts paused: `catstream resume` continues it, for example once all subscribers are there.
     results : Results
         The files that the program writes, stored in the state folder for the program that resumes the run. A run that
-        is resumed keeps those of each kind that are not given again.
+        is resumed continues those of each kind without a new one.
     save_model : path, or a mapping of names to paths
         Files for what was learned of the objects, written as by `catstream save` once the processes have ended, however
         the run ended. One path is for the only object. By default those of `results`.
@@ -99,7 +98,7 @@ class Pipeline:
     results, earlier_results : Results
         The files that the program writes, with those of the run that is resumed; and those of that run alone.
     after : int or None
-        As given; another value counts if it is set before the start.
+        The argument; another value counts if it is set before the start.
     saved_models : list of Path
         At the end: the files of `save_model` that were written.
 
@@ -135,56 +134,22 @@ class Pipeline:
         results: Results | None = None,
         save_model: Models | None = None,
     ) -> None:
-        if state is not None and resume is not None:
-            raise SettingsError("state starts a new run, and resume continues one: give one of them")
-        if resume is not None and not (box is None and model is None):
-            raise SettingsError(
-                "a resumed run continues with the objects that it had: give neither a box nor a model, and add others "
-                "with catstream set-box or catstream search once it runs"
-            )
+        _check_exclusive(state, resume, box, model)
         start_server()  # it imports while this process opens the source
-        self._resumed_job = Job.load(Path(resume)) if resume is not None else None
-        # Paths are absolute from the start: the program may change its current folder during the run.
+        self._earlier = None if resume is None else Job.load(Path(resume))
+        if self._earlier is None:
+            job = Job.new(source, box, settings, models=model, part=part, results=results, paused=paused)
+        else:
+            job = self._earlier.resumed(source, settings, part=part, results=results, paused=paused)
+        self._save_models = job.results.models if save_model is None else _writable(save_model)
+        info = probe(job)
+        self._job = job = prepared(job, info)
         self._state = Path(state or resume or "").absolute() if state or resume else None
-        boxes = {} if box is None else boxes_by_name(box)
-        models = {name: file.absolute() for name, file in files_by_name(model).items()}
-        job = self._resumed_job or Job()
-        job = replace(
-            job,
-            boxes=boxes or job.boxes,
-            models=models or job.models,
-            source=source_text(source) if source is not None else job.source,
-            part=job.part if part == ALL_FRAMES else part,
-            settings=settings if isinstance(settings, Settings) else job.settings.replace(settings or {}),
-            results=job.results if results is None else results.after(job.results),
-            paused=paused,
-        )
-        saved_models = {name: file.absolute() for name, file in files_by_name(save_model).items()}
-        for file in saved_models.values():
-            check_file(file)
-        check_distinct((f"the saved model of {name or 'the object'}", file) for name, file in saved_models.items())
-        if not job.source:
-            raise SettingsError("a new run needs a source: give one")
-        if job.settings.run.lockstep and is_live(job.source):
-            raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
-        # The source is closed here, because the detector opens it, and a camera can be open in one program only.
-        with open_source(job.source, part=job.part, settings=job.settings.run) as first:
-            self.name, self.frames, self.rate, self.size = first.name, first.frames, first.rate, first.size
-            self.live = first.live
-        check_boxes(job.boxes, *self.size)
-        path = job.source if self.live else str(Path(job.source).absolute())
-        settings = job.settings.for_length(self.frames)
-        if settings.features.network:
-            settings = settings.replace({"features.network": str(Path(settings.features.network).absolute())})
-        network = digest_of(descriptor_of(settings, job.network))
-        self._job = replace(job, source=path, size=self.size, settings=settings, network=network)
-        self.source, self.part, self.settings, self.results = path, job.part, settings, job.results
-        self.boxes = job.boxes
-        self.earlier_results = self._resumed_job.results if self._resumed_job is not None else Results()
-        check_files(job.models, settings, network)
-        if self._resumed_job is not None and self._state is not None:
-            self._resumed_job.check_fits(self._job, self._state)
-        self._save_models = job.results.models if save_model is None else saved_models
+        if self._earlier is not None and self._state is not None:
+            self._earlier.check_fits(job, self._state)
+        self.name, self.frames, self.rate, self.size, self.live = info
+        self.source, self.boxes, self.part, self.settings = job.source, job.boxes, job.part, job.settings
+        self.results, self.earlier_results = job.results, self._earlier.results if self._earlier else Results()
         self.saved_models: list[Path] = []
         self.after = after
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
@@ -198,10 +163,10 @@ class Pipeline:
             raise ServiceError(_ONCE)
         with ExitStack() as stack:
             folder = stack.enter_context(private_folder())
-            settings, shown = self.settings, without_password(self.source)
-            endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, shown))
+            settings, source = self.settings, without_password(self.source)
+            endpoint = stack.enter_context(reserve_endpoint(settings.run.endpoint, folder, settings.run.keys, source))
             if self._state is not None:
-                stack.enter_context(locked_for_run(self._state, self._resumed_job, self._job))
+                stack.enter_context(locked_for_run(self._state, self._earlier, self._job))
             job = self._started(str(endpoint))
             self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
             self._supervisor = Supervisor(job, folder, self._start)
@@ -217,13 +182,13 @@ class Pipeline:
         measures it if the clock of the machine was set meanwhile.
         """
         passed = 0.0
-        if self.live and self._resumed_job is not None and self._state is not None:
+        if self.live and self._earlier is not None and self._state is not None:
             passed = last_time(self._state) + self.settings.run.checkpoint_seconds
         return replace(
             self._job,
             endpoint=endpoint,
             state=self._state,
-            resume=self._resumed_job is not None,
+            resume=self._earlier is not None,
             since=time.monotonic() - passed,
         )
 
@@ -314,7 +279,7 @@ class Pipeline:
         """At the end: the number of features messages that were `sent`, and `stored` in the coreset trees.
 
         And of the tracks that were received here (`rows`), and how often a process was restarted (`restarts`). If
-        frames of a file were left out, how many were `damaged`, and if they had
+        frames of a file were skipped, how many were `damaged`, and if they had
         another size than the first one, how many were `scaled`; of a live source, how many frames were `skipped`, and
         its number of `reconnects`.
         """
@@ -370,9 +335,32 @@ class Pipeline:
     @property
     def _start(self) -> int:
         """Number of the last frame before the run: that of the caller, or of the checkpoint."""
-        if self._resumed_job is None or self._state is None:
+        if self._earlier is None or self._state is None:
             return 0
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
         if self.after is not None and not self.live:
             return self.after
         return max(last_seq(self._state), self.after or 0)
+
+
+def _check_exclusive(state: object, resume: object, box: object, model: object) -> None:
+    """Raise SettingsError for arguments that exclude each other."""
+    if state is not None and resume is not None:
+        raise SettingsError("state and resume are mutually exclusive (new run / existing run)")
+    if resume is not None and not (box is None and model is None):
+        raise SettingsError(
+            "a resumed run continues with the objects that it had: omit box and model, and add others with "
+            "catstream set-box or catstream search once it runs"
+        )
+
+
+def _writable(files: Models) -> dict[str, Path]:
+    """The files of saved models by name, absolute, because the program may change its current folder during the run.
+
+    ServiceError if one cannot be written.
+    """
+    paths = {name: file.absolute() for name, file in files_by_name(files).items()}
+    check_distinct((f"the saved model of {name or 'the object'}", path) for name, path in paths.items())
+    for path in paths.values():
+        check_file(path)
+    return paths

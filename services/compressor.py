@@ -1,6 +1,6 @@
 """Owns the coreset trees: features in, samples out: `python services/compressor.py --help`."""
 
-from catstream.processes.__main__ import start
+from catstream.processes.by_hand import main
 
 if __name__ == "__main__":
-    start("compressor")
+    main("compressor")

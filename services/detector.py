@@ -1,6 +1,6 @@
-"""Tracks the objects in each frame, and sends tracks and features: `python services/detector.py --help`."""
+"""Tracks the objects in each frame; sends tracks and features: `python services/detector.py --help`."""
 
-from catstream.processes.__main__ import start
+from catstream.processes.by_hand import main
 
 if __name__ == "__main__":
-    start("detector")
+    main("detector")

@@ -1,6 +1,6 @@
 """Trains a model on each sample: `python services/trainer.py --help`."""
 
-from catstream.processes.__main__ import start
+from catstream.processes.by_hand import main
 
 if __name__ == "__main__":
-    start("trainer")
+    main("trainer")

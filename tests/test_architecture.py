@@ -77,7 +77,7 @@ IMPORTERS = {
     ],
     "threadpoolctl": ["catstream/base/threads.py", "catstream/reports/provenance.py"],
     "psutil": ["catstream/loadtest/latency.py"],
-    "click": ["catstream/cli", "catstream/processes/__main__.py", "catstream/processes/options.py"],
+    "click": ["catstream/cli"],
     "starlette": ["catstream/web"],
     "uvicorn": ["catstream/web/server.py"],
     "prometheus_client": ["catstream/web/prometheus.py"],

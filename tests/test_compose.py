@@ -12,12 +12,11 @@ from urllib.parse import urlsplit
 import pytest
 import yaml
 
-from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.cli import group
 from catstream.client.subscription import subscribe
 from catstream.messages.kinds import Health
-from catstream.processes.__main__ import main
+from catstream.processes.by_hand import parser
 from catstream.processes.start_server import NAMES
 from catstream.web.app import pipeline_site
 from catstream.web.server import Server
@@ -30,6 +29,7 @@ ROOT = Path(__file__).parents[1]
 SERVICES = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
 WITH_KEYS = yaml.safe_load((ROOT / "docker-compose.keys.yml").read_text())["services"]
 IMAGE = (ROOT / "services" / "Dockerfile").read_text()
+PLACE = "/opt/catstream/services"  # in the image
 PROCESSES = pytest.mark.parametrize("name", NAMES)
 
 
@@ -50,10 +50,9 @@ def words(name):
 
 
 def parsed(name):
-    """What the command line of a service says, read by the parser of `catstream.processes`."""
-    with main.make_context("catstream.processes", words(name)) as context:
-        verb, command, rest = main.resolve_command(context, words(name))
-        return verb, command.make_context(verb, rest, parent=context).params
+    """The entry point of a service, and its arguments."""
+    place, *rest = words(name)
+    return place, vars(parser(name).parse_args(rest))
 
 
 def settings(name):
@@ -78,7 +77,9 @@ def test_there_is_a_service_for_each_process_one_for_the_page_and_one_for_the_ne
 
 @PROCESSES
 def test_each_process_accepts_its_command_line(name):
-    assert parsed(name)[0] == name
+    assert parsed(name)[0] == f"{PLACE}/{name}.py"
+    assert (ROOT / "services" / f"{name}.py").exists()
+    assert f"COPY services {PLACE}" in IMAGE
 
 
 def test_all_meet_on_the_loopback_of_their_own_network_and_the_page_alone_is_published_on_this_host_alone():
@@ -115,7 +116,7 @@ def test_a_process_that_dies_resumes_from_its_state():
 def test_the_video_is_mounted_read_only_and_named_by_the_user():
     _, options = parsed("detector")
     assert f"{SERVICES['detector']['working_dir']}/{options['source']}" == "/videos/walk.mp4"
-    assert options["boxes"] == {"": Box(1, 2, 30, 40)}
+    assert options["boxes"] == ["1,2,30,40"]
     assert [filled_in(volume, VIDEOS="/films") for volume in SERVICES["detector"]["volumes"]] == ["/films:/videos:ro"]
     for name in ("SOURCE", "BOX"):
         assert f"${{{name}:?" in " ".join(SERVICES["detector"]["command"])
@@ -154,7 +155,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
     path, truth = demo_video(60)
     keys.create(tmp_path / "pipeline")
     keys.allow(tmp_path / "pipeline", "phone", "watch", tmp_path / "phone")
-    here = {"/keys": str(tmp_path), "/state": str(tmp_path / "state")}
+    here = {"/keys": str(tmp_path), "/state": str(tmp_path / "state"), PLACE: str(ROOT / "services")}
     here["tcp://0.0.0.0:5700"] = tcp.replace("127.0.0.1", "0.0.0.0")
     monkeypatch.chdir(path.parent)
     with ExitStack() as stack:
@@ -164,7 +165,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
             for there, place in here.items():
                 variables = {key: value.replace(there, place) for key, value in variables.items()}
                 line = [word.replace(there, place) for word in line]
-            service = [sys.executable, "-m", "catstream.processes", *line]
+            service = [sys.executable, "-P", *line]
             process = stack.enter_context(subprocess.Popen(service, env=os.environ | variables))
             stack.callback(process.kill)
         with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
@@ -178,7 +179,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
 
 def test_the_image_is_pinned_runs_the_processes_and_is_nobody_in_particular():
     assert "pip install --require-hashes -r requirements.lock" in IMAGE
-    assert 'ENTRYPOINT ["python", "-P", "-m", "catstream.processes"]' in IMAGE
+    assert 'ENTRYPOINT ["python", "-P"]' in IMAGE
     last = IMAGE.rpartition("FROM ")[2]
     assert re.search(r"^USER (?!root)\w+$", last, re.MULTILINE)
     assert last.index("USER ") < last.index("import catstream"), "the kernels belong to who runs them"

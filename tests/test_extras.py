@@ -22,7 +22,7 @@ for module in {[module for _, modules in EXTRAS.values() for module in modules]}
 import catstream
 catstream.Tracker, catstream.Pipeline, catstream.subscribe, catstream.control
 from catstream.cli import COMMANDS, load_command
-from catstream.processes.__main__ import main
+import catstream.processes.by_hand
 import catstream.evaluation.runs, catstream.evaluation.accuracy
 for name in COMMANDS:
     load_command(name)

@@ -23,14 +23,7 @@ from catstream.base.files import check_file
 from catstream.base.names import UNNAMED, check_name, split_name
 from catstream.base.text import counted
 from catstream.cli.common import complain, screen, table
-from catstream.client.control import Control, control
-from catstream.client.registry import address_of, locate
-from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
-from catstream.errors import ServiceError, SilenceError
-from catstream.jobs.job import Job
-from catstream.jobs.state import learned
-from catstream.messages.kinds import Health, run_state
-from catstream.processes.options import (
+from catstream.cli.options import (
     FOLDER,
     PATH,
     NumberRange,
@@ -39,6 +32,13 @@ from catstream.processes.options import (
     with_keys,
     with_overwrite,
 )
+from catstream.client.control import Control, control
+from catstream.client.registry import address_of, locate
+from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
+from catstream.errors import ServiceError, SilenceError
+from catstream.jobs.job import Job
+from catstream.jobs.state import learned
+from catstream.messages.kinds import Health, run_state
 from catstream.wire.channels import CHANNELS, PUBLIC
 from catstream.wire.endpoint import Endpoint, Place, find
 

@@ -10,8 +10,8 @@ import click
 
 from catstream.base.settings import describe
 from catstream.cli.common import CommandGroup, screen, table
+from catstream.cli.options import PATH, with_json
 from catstream.errors import SettingsError
-from catstream.processes.options import PATH, with_json
 from catstream.wire.channels import CHANNELS, Role
 from catstream.wire.keys import ROLES, allow, clients, create, revoke
 

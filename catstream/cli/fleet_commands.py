@@ -22,11 +22,11 @@ from catstream.base.files import check_file, write_atomically, writing
 from catstream.base.names import UNNAMED, split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
+from catstream.cli.options import PATH, with_json, with_keys, with_overwrite
 from catstream.cli.view import fleet_view
 from catstream.client.registry import Registry
 from catstream.errors import FleetError
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.processes.options import PATH, with_json, with_keys, with_overwrite
 
 if TYPE_CHECKING:
     from catstream.fleet.fleet import Fleet

@@ -26,8 +26,8 @@ from catstream.cli.common import (
     with_json_file,
     write_json,
 )
+from catstream.cli.options import FOLDER, PATH, NumberRange, with_settings
 from catstream.errors import CatstreamError
-from catstream.processes.options import FOLDER, PATH, NumberRange, with_settings
 
 if TYPE_CHECKING:
     from catstream.evaluation.accuracy import Row

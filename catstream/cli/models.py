@@ -13,10 +13,10 @@ from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
+from catstream.cli.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 from catstream.errors import CatstreamError, VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.saved_model import merge as merged
-from catstream.processes.options import PATH, NumberRange, with_overwrite, with_skip_damaged
 
 if TYPE_CHECKING:
     from catstream.finding.files import File

@@ -8,8 +8,8 @@ import click
 
 from catstream.base.files import check_file
 from catstream.cli.common import INTERRUPTS, CommandGroup
+from catstream.cli.options import PATH, with_overwrite
 from catstream.errors import require_extra
-from catstream.processes.options import PATH, with_overwrite
 
 _Levels = tuple[float, float, float]
 

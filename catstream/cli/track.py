@@ -23,6 +23,16 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted, listed
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
+from catstream.cli.options import (
+    FOLDER,
+    PATH,
+    with_files,
+    with_object,
+    with_overrides,
+    with_overwrite,
+    with_part,
+    with_reading,
+)
 from catstream.cli.view import PORT, Address, AddressType, with_token
 from catstream.cli.write import check_used, with_sink_options, with_table
 from catstream.errors import require_extra
@@ -30,16 +40,6 @@ from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
-from catstream.processes.options import (
-    FOLDER,
-    PATH,
-    with_files,
-    with_given,
-    with_object,
-    with_overwrite,
-    with_part,
-    with_reading,
-)
 from catstream.sinks.destinations import STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 
@@ -73,14 +73,14 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @click.option("--continue", "continues", is_flag=True, help="Resume the run in --state if there is one, or start it.")
 @with_object
 @with_part
-@with_given
+@with_overrides
 @with_reading
 @with_table(sinks=True)
 def track(**options: Any) -> None:
     """Track one or several objects in a video.
 
-    An object is given by its box in the first frame, or by a saved model. If
-    none is given, tracking starts after `catstream set-box`, or after a box is
+    An object is specified by its box in the first frame, or by a saved model.
+    Without one, tracking starts after `catstream set-box`, or after a box is
     drawn on the web page.
 
     Several objects have names: --box NAME=X,Y,W,H or --model NAME=FILE for each
@@ -100,7 +100,7 @@ def track(**options: Any) -> None:
 
     With --state, a checkpoint is written every two seconds. After a power failure,
     a crash or Ctrl-C, --resume continues the run with the objects that it had,
-    and with the same source, settings and results unless they are given again.
+    and with the same source, settings and results unless options change them.
     --state with --continue resumes the run if there is one in the folder, and
     starts it otherwise: the same line for a service at each of its starts.
 
@@ -147,17 +147,17 @@ def track(**options: Any) -> None:
 class _Run:
     """A run with the options of the command.
 
-    given   the settings that were given
-    boxes   the objects in the first frame, by name
-    models  the saved models of objects that are searched for, by name
-    saved   the files for what is learned of each object, by name
-    view    address of the web page; None for none
+    overrides  the settings that differ from the defaults, or from those of the run that is resumed
+    boxes      the objects in the first frame, by name
+    models     the saved models of objects that are searched for, by name
+    saved      the files for what is learned of each object, by name
+    view       address of the web page; None for none
     """
 
     source: str | None
     boxes: dict[str, Box]
     models: dict[str, Path]
-    given: dict[str, object]
+    overrides: dict[str, object]
     part: slice
     output: Path | None
     video: bool | None
@@ -205,7 +205,7 @@ class _Run:
                     console.print(f"missing results, which another program removed: {', '.join(missing)}")
         if self.resume is not None and not progress.frames and not interrupted:
             console.print(
-                f"no frames were left to track, the run in {self.resume} is complete: to track the source again, "
+                f"no frames remained to track, the run in {self.resume} is complete: to track the source again, "
                 "start a new run in another folder (--state DIR)"
             )
         saved = pipeline.saved_models
@@ -225,27 +225,27 @@ class _Run:
     def _check_options(self) -> None:
         """Raise UsageError if the options contradict each other."""
         if self.state and self.resume:
-            raise click.UsageError("--state starts a new run, and --resume continues one: give one of them")
+            raise click.UsageError("--state and --resume are mutually exclusive (new run / existing run)")
         if self.continues and not self.state:
-            raise click.UsageError("--continue needs the folder of the run, which may not exist yet: --state DIR")
+            raise click.UsageError("missing --state DIR: --continue needs the folder of the run, which it may create")
         if not self.resume and not self.source:
-            raise click.UsageError("a run needs SOURCE: a video, a folder of images, a camera or a stream")
+            raise click.UsageError("missing SOURCE: a video, a folder of images, a camera or a stream")
         if (self.resume or self.continues) and self.overwrite:
             option = "--continue" if self.continues else "--resume"
             raise click.UsageError(
-                f"{option} continues the existing results, and --overwrite replaces them: give one of them"
+                f"{option} and --overwrite are mutually exclusive (continue / replace the existing results)"
             )
         if self.write and self.no_write:
             raise click.UsageError("--write and --no-write are mutually exclusive")
         if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
-            raise click.UsageError("--save-model FILE is for a single object: for each of several, give NAME=FILE")
+            raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
 
     def _pipeline(self) -> Pipeline:
         """The pipeline of the run, not started; a resumed run continues the results of its earlier part."""
         return Pipeline(
             self.source,
             self.boxes or None,
-            self.given | ({"run.lockstep": True} if self.lockstep else {}),
+            self.overrides | ({"run.lockstep": True} if self.lockstep else {}),
             model=self.models or None,
             part=self.part,
             state=self.state,
@@ -367,7 +367,7 @@ class _Run:
 
 
 def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
-    """Descriptions of boxes that can be followed, but hardly are what was meant.
+    """Descriptions of boxes that can be tracked, but are probably a mistake.
 
     Such a box is that of the whole frame, or one of two that are the same; or it reaches out of the frame or covers
     more than a quarter of it, and its four numbers may be two corners.
@@ -399,7 +399,7 @@ def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
 
 
 @dataclass(slots=True)
-class _Counted:
+class _ObjectCounts:
     """The counters of an object: frames in which it was tracked, and present; the newest version of its model."""
 
     frames: int = 0
@@ -428,7 +428,7 @@ class RunProgress:
         self._started = self._now()
         self._first = self._shown = 0.0
         self.frames = 0
-        self._objects: dict[str, _Counted] = {}
+        self._objects: dict[str, _ObjectCounts] = {}
 
     def line(self, console: Console) -> Progress:
         """The line that `show` updates."""
@@ -455,10 +455,10 @@ class RunProgress:
         self._first = self._first or now - self._started
         self.frames += 1
         for name, track in tracks.items():
-            each = self._objects.setdefault(name, _Counted())
-            each.frames += 1
-            each.present += track.box is not None
-            each.version = track.model_version
+            counts = self._objects.setdefault(name, _ObjectCounts())
+            counts.frames += 1
+            counts.present += track.box is not None
+            counts.version = track.model_version
         if not line.disable and now - self._shown >= _REFRESH_SECONDS:
             self._shown = now
             present = sum(track.box is not None for track in tracks.values())
@@ -489,9 +489,9 @@ class RunProgress:
             lines = [f"{frames}, present in {alone.present}, {rate}, model version {alone.version}"]
         else:
             lines = [f"{frames}, {rate}"]
-            for name, each in self._objects.items():
-                present = f"present in {each.present} of {each.frames} frames"
-                lines.append(f"  {name or '(no name)'}: {present}, model version {each.version}")
+            for name, counts in self._objects.items():
+                present = f"present in {counts.present} of {counts.frames} frames"
+                lines.append(f"  {name or '(no name)'}: {present}, model version {counts.version}")
         if self._pipeline.live:
             skipped = counted(self._detector("skipped"), "frame")
             reconnects = counted(self._detector("reconnects"), "reconnect")

@@ -10,8 +10,8 @@ import click
 
 from catstream.base.files import state_home, write_atomically
 from catstream.cli.attach import with_endpoint, with_fleet_address
+from catstream.cli.options import Decorator, combined, with_keys
 from catstream.errors import ServiceError
-from catstream.processes.options import Decorator, combined, with_keys
 
 if TYPE_CHECKING:
     from catstream.web.app import Site

@@ -17,10 +17,10 @@ from catstream.base.names import split_name
 from catstream.base.text import counted, listed
 from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
 from catstream.cli.common import INTERRUPTS
+from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
 from catstream.client.subscription import subscribe
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
-from catstream.processes.options import PATH, NumberRange, combined, with_overwrite
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, SINKS, About, Head, Origin, TrackedFrame
 from catstream.sinks.events import KINDS

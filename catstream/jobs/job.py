@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from shlex import quote
@@ -18,22 +18,20 @@ import msgspec
 
 from catstream.base.box import Box
 from catstream.base.files import writing
-from catstream.base.names import UNNAMED, by_name, check_count
+from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_count
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
+from catstream.video.source import ALL_FRAMES, source_text
 
 #: Files of saved models: of one object without a name, or by name.
 Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
 _NAME = "job.safetensors"
 
-#: Settings that do not affect the training: a run can be resumed with other values.
-_FREE = {
-    *("run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"),
-    *("run.open_seconds", "run.silent_seconds", "run.poll_seconds"),
-}
+#: Settings that do not affect the training, beside all times: a run can be resumed with other values.
+_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +113,7 @@ class Job:
     source: str = field(default="", repr=False)  # it may contain a password
     boxes: dict[str, Box] = field(default_factory=dict)
     models: dict[str, Path] = field(default_factory=dict)
-    part: slice = field(default_factory=lambda: slice(None))
+    part: slice = field(default_factory=lambda: ALL_FRAMES)
     settings: Settings = field(default_factory=Settings)
     size: tuple[int, int] | None = None
     results: Results = Results()
@@ -134,6 +132,46 @@ class Job:
                 "give one of them"
             )
         check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
+
+    @classmethod
+    def new(
+        cls,
+        source: str | os.PathLike[str] | int | None,
+        boxes: Boxes | None = None,
+        settings: Settings | Mapping[str, object] | None = None,
+        *,
+        models: Models | None = None,
+        part: slice = ALL_FRAMES,
+        results: Results | None = None,
+        paused: bool = False,
+    ) -> Job:
+        """The job of a new run, by the arguments of `catstream.Pipeline`."""
+        if source is None:
+            raise SettingsError("missing source: a new run needs a video, a folder of images, a camera or a stream")
+        return cls(
+            boxes={} if boxes is None else boxes_by_name(boxes),
+            models={name: file.absolute() for name, file in files_by_name(models).items()},
+            results=results or Results(),
+        ).resumed(source, settings, part=part, paused=paused)
+
+    def resumed(
+        self,
+        source: str | os.PathLike[str] | int | None = None,
+        settings: Settings | Mapping[str, object] | None = None,
+        *,
+        part: slice = ALL_FRAMES,
+        results: Results | None = None,
+        paused: bool = False,
+    ) -> Job:
+        """The job of the next part of the run; what is not given stays."""
+        return replace(
+            self,
+            source=self.source if source is None else source_text(source),
+            part=self.part if part == ALL_FRAMES else part,
+            settings=settings if isinstance(settings, Settings) else self.settings.replace(settings or {}),
+            results=self.results if results is None else results.after(self.results),
+            paused=paused,
+        )
 
     def save(self, folder: Path) -> Path:
         """Write the job to a folder, readable by its owner only: the source may contain a password. Returns the file.
@@ -201,7 +239,8 @@ def changed_setting(before: Settings, after: Settings) -> str:
     'coreset.size=64, not 32'
     """
     ours, theirs = before.values(), after.values()
-    changed = (name for name in sorted(ours.keys() - _FREE) if ours[name] != theirs[name])
+    fixed = (name for name in sorted(ours.keys() - _FREE) if not name.endswith("_seconds"))
+    changed = (name for name in fixed if ours[name] != theirs[name])
     return next((f"{name}={ours[name]}, not {theirs[name]}" for name in changed), "")
 
 

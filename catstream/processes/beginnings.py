@@ -57,7 +57,7 @@ class Beginnings:
         return beginnings
 
     def _due(self, frame: Frame, names: set[str]) -> Iterator[Beginning]:
-        """The objects whose first frame this is, or that a restarted process has not begun yet, except `names`."""
+        """The objects whose first frame this is, or that a restarted process has to begin again, except `names`."""
         commands, detectors = self._commands, self._detectors
         for name, desired in [*commands.desired.objects.items()]:  # the samples are numbered in their order
             if name in names or (name in detectors.detectors and desired.begins != detectors.seq + 1):
@@ -112,5 +112,5 @@ class Beginnings:
             result = detectors.begin(name, first, box, frame.time, pyramids)
             box = (detectors.detectors[name].box or box) if len(frames) > 1 else box
             effect = f"{'another' if name in commands.desired.objects else 'the'} object{suffix} begins {place}"
-            commands.desired = commands.desired.begun(name, DesiredObject(box, detectors.seq + 1))
+            commands.desired = commands.desired.with_object(name, DesiredObject(box, detectors.seq + 1))
         return Beginning(name, result), answer(command, detectors, True, effect, name, detectors.seq)

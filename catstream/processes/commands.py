@@ -153,7 +153,7 @@ class Commands(AbstractContextManager["Commands"]):
                 _log.warning("the desired state cannot be written to %s (%s)", file, error.strerror)
                 problem = f"; a resumed run will not know it, as {file} cannot be written ({error.strerror})"
         if desired == self._stored:  # otherwise the file may name a model that is not needed any more
-            self.models.keep_only({each.model for each in desired.objects.values()})
+            self.models.keep_only({item.model for item in desired.objects.values()})
         for answered in answers:
             self._responder.answer(replace(answered, reason=answered.reason + problem) if answered.done else answered)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from catstream.base.names import UNNAMED, check_count, check_name
 from catstream.base.text import listed
@@ -27,74 +27,80 @@ def execute(
 
     ObjectError or SettingsError if it cannot be executed. The `detectors` are not changed.
     """
-    return _VERBS[command.verb](command, desired, detectors, model)
+    return _VERBS[command.verb](_Execution(command, desired, detectors, model))
 
 
-def _pause(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Outcome:
-    if desired.paused or command.seconds is None:
-        return replace(desired, paused=True), answer(command, detectors, True, f"paused {_moment(detectors)}")
-    if command.seconds > 0:  # it ends by itself, and changes nothing that is stored
-        effect = f"paused for {command.seconds:g} s {_moment(detectors)}"
-        return desired, answer(command, detectors, True, effect)
-    return _resume(command, desired, detectors, model)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Execution:
+    """A command in its circumstances, with a method for each verb: see `execute`."""
+
+    command: Command
+    desired: DesiredState
+    detectors: Detectors
+    model: DesiredObject | None
+
+    def pause(self) -> Outcome:
+        seconds = self.command.seconds
+        if self.desired.paused or seconds is None:
+            return self._done(replace(self.desired, paused=True), f"paused {self._moment}")
+        if seconds > 0:  # it ends by itself, and changes nothing that is stored
+            return self._done(self.desired, f"paused for {seconds:g} s {self._moment}")
+        return self.resume()
+
+    def resume(self) -> Outcome:
+        effect = f"resumed {self._moment}" if self.desired.objects else "waiting for a box"
+        return self._done(replace(self.desired, paused=False), effect)
+
+    def stop(self) -> Outcome:
+        return self._done(replace(self.desired, stopped=True), f"the stream ends {self._moment}")
+
+    def search(self) -> Outcome:
+        name, seq = object_of(self.command, self.desired), self.detectors.seq
+        check_room(name, self.desired, self.detectors.settings.run.objects_most)
+        if self.model is None:
+            raise ObjectError("missing saved model: search needs the file of one")
+        desired = self.desired.with_object(name, replace(self.model, begins=seq + 1))
+        check_sizes({name: item.size for name, item in desired.objects.items() if item.begins > seq and item.model})
+        effect = f"{listed([name])} is searched for from frame {seq} on, by model {self.model.version}"
+        return self._done(desired, effect, name)
+
+    def forget(self) -> Outcome:
+        name = _tracked(self.command, self.desired)
+        desired = self.desired.without(name)
+        waits = "" if desired.objects else ": no object remains, so the run waits for a box"
+        effect = f"{listed([name])} is no longer tracked {self._moment}{waits}"
+        _, answered = self._done(desired, effect, name)
+        return desired, replace(answered, box=None, version=0)
+
+    def save(self) -> Outcome:
+        """The client writes the file."""
+        name = _tracked(self.command, self.desired)
+        detector = self.detectors.detectors.get(name)
+        if detector is None or detector.state is None or not detector.model.version:
+            problem = "nothing was learned of the object yet: try again once there is a model (catstream status)"
+        elif detector.state.is_sought:
+            problem = "the object of the saved model was not found yet: try again once it was"
+        else:
+            return self._done(self.desired, f"model {detector.model.version} {self._moment}", name)
+        return self.desired, answer(self.command, self.detectors, False, problem, name)
+
+    def _done(self, desired: DesiredState, effect: str, name: str | None = None) -> Outcome:
+        return desired, answer(self.command, self.detectors, True, effect, name)
+
+    @property
+    def _moment(self) -> str:
+        """When the command is executed, in words."""
+        return f"after frame {self.detectors.seq - 1}" if self.detectors.seq else "before the first frame"
 
 
-def _resume(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
-    effect = f"resumed {_moment(detectors)}" if desired.objects else "waiting for a box"
-    return replace(desired, paused=False), answer(command, detectors, True, effect)
-
-
-def _stop(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
-    effect = f"the stream ends {_moment(detectors)}"
-    return replace(desired, stopped=True), answer(command, detectors, True, effect)
-
-
-def _search(command: Command, desired: DesiredState, detectors: Detectors, model: DesiredObject | None) -> Outcome:
-    name, seq = object_of(command, desired), detectors.seq
-    check_room(name, desired, detectors.settings.run.objects_most)
-    if model is None:
-        raise ObjectError("missing saved model: search needs the file of one")
-    desired = desired.begun(name, replace(model, begins=seq + 1))
-    check_sizes({name: each.size for name, each in desired.objects.items() if each.begins > seq and each.model})
-    effect = f"{listed([name])} is searched for from frame {seq} on, by model {model.version}"
-    return desired, answer(command, detectors, True, effect, name)
-
-
-def _forget(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
-    name = _tracked(command, desired)
-    desired = desired.without(name)
-    waits = "" if desired.objects else ": no object is left, so the run waits for a box"
-    effect = f"{listed([name])} is no longer tracked {_moment(detectors)}{waits}"
-    return desired, replace(answer(command, detectors, True, effect, name), box=None, version=0)
-
-
-def _save(command: Command, desired: DesiredState, detectors: Detectors, _: DesiredObject | None) -> Outcome:
-    """The client writes the file."""
-    name = _tracked(command, desired)
-    detector = detectors.detectors.get(name)
-    if detector is None or detector.state is None or not detector.model.version:
-        problem = "nothing was learned of the object yet: try again once there is a model (catstream status)"
-    elif detector.state.is_sought:
-        problem = "the object of the saved model was not found yet: try again once it was"
-    else:
-        effect = f"model {detector.model.version} {_moment(detectors)}"
-        return desired, answer(command, detectors, True, effect, name)
-    return desired, answer(command, detectors, False, problem, name)
-
-
-_VERBS: dict[str, Callable[..., Outcome]] = {
-    "pause": _pause,
-    "resume": _resume,
-    "stop": _stop,
-    "search": _search,
-    "forget": _forget,
-    "save": _save,
+_VERBS: dict[str, Callable[[_Execution], Outcome]] = {
+    "pause": _Execution.pause,
+    "resume": _Execution.resume,
+    "stop": _Execution.stop,
+    "search": _Execution.search,
+    "forget": _Execution.forget,
+    "save": _Execution.save,
 }
-
-
-def _moment(detectors: Detectors) -> str:
-    """When a command was executed, in words."""
-    return f"after frame {detectors.seq - 1}" if detectors.seq else "before the first frame"
 
 
 def answer(

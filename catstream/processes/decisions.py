@@ -1,6 +1,6 @@
 """The decisions of the processes, as pure functions: where a detector continues, and for what it waits; what is stored.
 
-The desired state is what commands have set. It is kept on disk, for a detector that is restarted.
+Commands set the desired state. It is stored on disk for a detector that is restarted.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _REST = 9.0  # from one checkpoint to the next, times the duration of the last o
 
 @dataclass(frozen=True, slots=True)
 class DesiredObject:
-    """An object that is to be followed.
+    """An object that is to be tracked.
 
     box     the object in its first frame; the last box in the saved model if the object begins with one
     begins  seq of the message of its first frame
@@ -45,7 +45,7 @@ class DesiredObject:
 
 @dataclass(frozen=True, slots=True)
 class DesiredState:
-    """The state that a detector keeps until a command changes it.
+    """The state of a run that holds until a command changes it.
 
     objects  the objects by name, in the order in which they began; none before a box is set
     paused   whether tracking is paused
@@ -56,13 +56,13 @@ class DesiredState:
     paused: bool = False
     stopped: bool = False
 
-    def begun(self, name: str, each: DesiredObject) -> DesiredState:
-        """The state after an object has begun, in the place of another one of its name."""
-        return replace(self, objects=self.without(name).objects | {name: each})
+    def with_object(self, name: str, desired: DesiredObject) -> DesiredState:
+        """The state with one more object, in the place of another one of its name."""
+        return replace(self, objects=self.without(name).objects | {name: desired})
 
     def without(self, name: str) -> DesiredState:
-        """The state after an object was forgotten."""
-        return replace(self, objects={other: each for other, each in self.objects.items() if other != name})
+        """The state without an object."""
+        return replace(self, objects={other: item for other, item in self.objects.items() if other != name})
 
     def save(self, path: Path) -> None:
         """Write the state to a file atomically; OSError if it cannot be written."""
@@ -102,10 +102,9 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, cont
 
     Frames of a live source cannot be read again: the stream continues after the last one that was learned from.
 
-    A first model is kept nowhere. If nothing was learned of any object yet, a file is tracked from the first frame of
-    the first of them again. If nothing was learned of one of several objects, which takes long with the paper's first
-    tracker only, it begins again where it was last. An object of a saved model, of which the compressor has no trees,
-    begins again too.
+    The SCM bootstrap of an object is not stored. If no object has a model yet, a file is tracked again from the first
+    frame of the first object. If one of several objects has no model yet, it restarts at its last known box; only the
+    SCM bootstrap takes that long. An object of a saved model, of which the compressor has no trees, begins again.
 
     Parameters
     ----------
@@ -115,15 +114,15 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, cont
     """
     after = position.processed if live or after is None else after
     seq, repeats = min(after, position.processed), max(after, position.processed)
-    begun = {name: each for name, each in desired.objects.items() if each.begins <= seq}
-    if begun and not live and not position.versions:
-        return Start(min(each.begins for each in begun.values()) - 1, repeats, desired, {})
-    states = {name: state for name, state in position.states.items() if name in begun and name in position.versions}
-    for name, each in begun.items():
+    earlier = {name: item for name, item in desired.objects.items() if item.begins <= seq}
+    if earlier and not live and not position.versions:
+        return Start(min(item.begins for item in earlier.values()) - 1, repeats, desired, {})
+    states = {name: state for name, state in position.states.items() if name in earlier and name in position.versions}
+    for name, item in earlier.items():
         if name not in states:
-            state = None if each.model else position.states.get(name)
-            box = each.box if state is None else state.window.box(context)
-            desired = desired.begun(name, replace(each, box=box, begins=seq + 1))
+            state = None if item.model else position.states.get(name)
+            box = item.box if state is None else state.window.box(context)
+            desired = desired.with_object(name, replace(item, box=box, begins=seq + 1))
     return Start(seq, repeats, desired, states)
 
 

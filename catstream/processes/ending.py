@@ -1,6 +1,7 @@
 """Why and how far a process of a pipeline has ended.
 
-The signals that ask a process to end, the command `stop`, and a source that ends or fails are known here only.
+Only this module handles the signals that ask a process to end; the command `stop`, and a source that ends or fails, end
+a process here.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class ModelFiles:
                 write_atomically(self._file(name), saved.to_bytes(), mode=0o600)
 
     def keep_only(self, names: set[str]) -> None:
-        """Remove all saved models but those of these names; a file that cannot be removed is left to a later call."""
+        """Remove all other saved models; a file that cannot be removed now is removed by a later call."""
         self._models = {name: saved for name, saved in self._models.items() if name in names}
         with suppress(OSError):
             for file in self._folder.glob("*.safetensors"):

@@ -48,9 +48,9 @@ class Outputs(AbstractContextManager["Outputs"]):
             self._owner = stack.enter_context(ResultsSender(endpoint)) if process.owner is not None else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
             self._training = stack.enter_context(Publisher(TRAINING, endpoint))
-            self.previews = stack.enter_context(Previews(endpoint, keeps=is_live(process.job.source)))
+            self.previews = stack.enter_context(Previews(endpoint, stores=is_live(process.job.source)))
             self._stack = stack.pop_all()
-        self._complete = True  # whether no message was given up: after one, none may follow
+        self._complete = True  # whether no message was dropped: none may follow it
 
     def serve_late_joiners(self) -> None:
         """Send the end or the newest preview to new subscribers."""
@@ -74,7 +74,7 @@ class Outputs(AbstractContextManager["Outputs"]):
             self._turn()
 
     def _send_features(self, features: Features | End) -> None:
-        """Send features once there is room; without it they are given up if the process is to end."""
+        """Send features once there is room; after a signal, they are dropped without room."""
         while self.features.window.full and not self._process.ending.signalled:
             self.features.poll(TURN_SECONDS)
             self._turn()
@@ -113,14 +113,14 @@ class Outputs(AbstractContextManager["Outputs"]):
 class Previews(Publisher[Preview]):
     """Sends the newest frame as a small picture, at most ten a second; none is made if there are no subscribers.
 
-    If it `keeps` them, the frames of the last pictures are stored, too, while there are subscribers.
+    With `stores`, it stores the frames of the last pictures while there are subscribers.
     """
 
-    def __init__(self, endpoint: Endpoint, *, keeps: bool = False) -> None:
+    def __init__(self, endpoint: Endpoint, *, stores: bool = False) -> None:
         super().__init__(PREVIEWS, endpoint)
         self._waiting: tuple[int, Frame, dict[str, Box]] | None = None
         self._sent_at = 0.0
-        self._keeps, self._frames = keeps, deque[Frame]()
+        self._stores, self._frames = stores, deque[Frame]()
 
     def show(self, number: int, frame: Frame, boxes: dict[str, Box]) -> None:
         """Send a frame, whose image stays unchanged, unless a newer one arrives before it is due."""
@@ -142,7 +142,7 @@ class Previews(Publisher[Preview]):
         (number, frame, boxes), self._waiting, self._sent_at = self._waiting, None, monotonic()
         height, width = frame.image.shape[:2]
         self.send(Preview(number, frame.time, width, height, boxes, jpeg(frame.image, _SIDE)))
-        if self._keeps:
+        if self._stores:
             most = max(1, _STORED_BYTES // frame.image.nbytes)
             self._frames.append(frame)
             while self._frames[0].time < frame.time - _STORED_SECONDS or len(self._frames) > most:

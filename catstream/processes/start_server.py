@@ -239,12 +239,12 @@ def main(descriptor: int, program: int) -> None:
     signal.set_wakeup_fd(wakes)
     signal.signal(signal.SIGCHLD, lambda *_: None)  # wakes `poll` up
     poll = select.poll()
-    for each in (requests.fileno(), has_ended, os.pidfd_open(program)):
-        poll.register(each, select.POLLIN)
+    for readable in (requests.fileno(), has_ended, os.pidfd_open(program)):
+        poll.register(readable, select.POLLIN)
     running: dict[int, socket.socket] = {}  # the sockets for the answers, by process id
     to_import = [*NAMES]
     while True:
-        ready = [each for each, _ in poll.poll(0 if to_import else None)]
+        ready = [readable for readable, _ in poll.poll(0 if to_import else None)]
         if not ready:
             with suppress(Exception):  # the process imports it again, and reports the error
                 import_module(f"catstream.processes.{to_import.pop(0)}")
@@ -284,7 +284,7 @@ def _run(request: dict[str, str], parent: int, log: int, memory: int) -> None:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.dup2(log, sys.stderr.fileno())
         try:
-            descriptors = {int(each.name) for each in Path("/proc/self/fd").iterdir()}
+            descriptors = {int(entry.name) for entry in Path("/proc/self/fd").iterdir()}
         except FileNotFoundError:  # there is no /proc
             descriptors = {*range(1024)}
         for descriptor in descriptors - {0, 1, 2, memory}:

@@ -42,7 +42,7 @@ EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stre
 ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
 
 _LAST_LINE = 2000  # bytes at the end of a log in which the last line is searched for
-_STEP = 65536  # bytes of a log that are read at once; a longer line is left out
+_STEP = 65536  # bytes of a log that are read at once; a longer line is skipped
 
 _log = logging.getLogger(__name__)
 

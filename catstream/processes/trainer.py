@@ -36,6 +36,6 @@ def main(process: Process) -> None:
 def _totals(trained: dict[str, dict[str, float]]) -> dict[str, float]:
     """The counters of all objects together."""
     return {
-        "version": max((each["version"] for each in trained.values()), default=0.0),
-        "trained": sum(each["trained"] for each in trained.values()),
+        "version": max((counters["version"] for counters in trained.values()), default=0.0),
+        "trained": sum(counters["trained"] for counters in trained.values()),
     }

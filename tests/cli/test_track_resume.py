@@ -20,7 +20,7 @@ from catstream.pipeline import Pipeline
 from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
-UNIT = Path(__file__).parents[2] / "deploy" / "catstream@.service"
+UNIT = Path(__file__).parents[2] / "services" / "catstream@.service"
 OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]
 
 
@@ -139,11 +139,18 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "started with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
         "frames 3 to the last": ["track", "--resume", kept, "--start", "3"],
         "contains no run": ["track", "--resume", tmp_path / "none"],
-        "give one of them": ["track", "--resume", kept, "--state", kept],
+        "--state and --resume are mutually exclusive": ["track", "--resume", kept, "--state", kept],
         "with the objects that it had": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
-        "needs SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
-        "--continue needs the folder": ["track", source, "--continue"],
-        "--continue continues the existing results": ["track", source, "--state", kept, "--continue", "--overwrite"],
+        "missing SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
+        "missing --state DIR": ["track", source, "--continue"],
+        "--continue and --overwrite are": [
+            "track",
+            source,
+            "--state",
+            kept,
+            "--continue",
+            "--overwrite",
+        ],
     }
     for word, command in refusals.items():
         assert word in fail(*command)
@@ -174,7 +181,7 @@ def test_a_complete_run_gets_no_further_rows_but_files_that_it_lacks_and_that_is
     before = (out / "demo.ndjson").read_bytes()
     output, errors = succeed("track", "--resume", kept)
     assert not output
-    assert f"no frames were left to track, the run in {kept} is complete: to track the source again" in errors
+    assert f"no frames remained to track, the run in {kept} is complete: to track the source again" in errors
     (out / "demo.csv").unlink()
     succeed("track", "--resume", kept, "--start", 0, "--end", 6)  # the same frames
     assert frames(out) == list(range(6))

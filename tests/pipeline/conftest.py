@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from catstream.video.source import open_source
 
 FRAMES = 32
+SERVICES = Path(__file__).parents[2] / "services"
 
 
 def share_found(tracks, boxes):
@@ -61,11 +63,11 @@ def alive():
 
 @pytest.fixture
 def service():
-    """Starts `python -P -m catstream.processes ...`; what still runs after the test is killed."""
+    """Starts `python services/NAME.py ...`; what still runs after the test is killed."""
     with ExitStack() as stack:
 
-        def start(*arguments):
-            words = [sys.executable, "-P", "-m", "catstream.processes", *map(str, arguments)]
+        def start(name, *arguments):
+            words = [sys.executable, "-P", SERVICES / f"{name}.py", *map(str, arguments)]
             process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
             stack.callback(process.communicate)
             stack.callback(process.kill)

@@ -85,14 +85,14 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
 
 def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_looks(endpoint, until, monkeypatch):
     monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
-    with Previews(endpoint, keeps=True) as previews:
+    with Previews(endpoint, stores=True) as previews:
         with subscribe(str(endpoint), "previews", timeout=60):
             until(lambda: previews.has_subscribers, previews.turn)
             for number in range(80):
                 previews.show(3, Frame(number, number / 10, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(3.0)] == list(range(30, 80))
             assert [previews.since(time) for time in (2.8, 3.05, 9.0)] == [[]] * 3
-            monkeypatch.setattr("catstream.processes.outputs._KEPT_BYTES", 3 * 48 * 64 * 3)
+            monkeypatch.setattr("catstream.processes.outputs._STORED_BYTES", 3 * 48 * 64 * 3)
             previews.show(3, Frame(80, 8.0, np.zeros((48, 64, 3), np.uint8)), {})
             assert [frame.number for frame in previews.since(7.8)] == [78, 79, 80]
         until(lambda: not previews.since(7.8), previews.turn)

@@ -123,5 +123,5 @@ def test_a_box_is_for_the_only_object_and_continues_it_only_if_something_was_lea
     assert continues(command("set-box", keep=True), "anna", both, tracked)
     assert not continues(command("set-box", keep=True), "ben", both, tracked)
     assert not continues(command("set-box"), "anna", both, tracked)
-    another = both.begun("anna", DesiredObject(BOX, 8))
+    another = both.with_object("anna", DesiredObject(BOX, 8))
     assert not continues(command("set-box", keep=True), "anna", another, tracked), "it begins with the next frame"

@@ -44,7 +44,7 @@ def test_a_desired_state_is_read_as_it_was_written(tmp_path_factory, desired):
 @given(DESIRED, NAMES, st.integers(1, 30))
 def test_an_object_that_begins_is_the_last_one_and_one_that_is_forgotten_leaves_the_others_in_order(desired, name, seq):
     others = [other for other in desired.objects if other != name]
-    begun = desired.begun(name, DesiredObject(BOX, seq))
+    begun = desired.with_object(name, DesiredObject(BOX, seq))
     assert [*begun.objects] == [*others, name]
     assert [*begun.without(name).objects] == others
 

@@ -84,7 +84,7 @@ def test_a_current_folder_that_was_removed_is_no_obstacle(start, tmp_path, monke
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    assert start()[1].turns > 2
+    assert start()[1].watchdog.turns > 2
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 4), (signal.SIGKILL, -signal.SIGKILL)])

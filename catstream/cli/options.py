@@ -91,9 +91,9 @@ def combined(argument: str, value: Callable[..., object], *options: Decorator) -
 
     def decorate(command: Command) -> Command:
         @wraps(command)
-        def wrapped(**given: object) -> object:
-            made = value(**{name: given.pop(name) for name in names})
-            return command(**{argument: made}, **given)
+        def wrapped(**options: object) -> object:
+            combination = value(**{name: options.pop(name) for name in names})
+            return command(**{argument: combination}, **options)
 
         whole: Command = wrapped
         for option in reversed(options):
@@ -112,27 +112,27 @@ with_part = combined(
     click.option("--stride", type=click.IntRange(1), metavar="N", help="Track only every N-th frame."),
 )
 
-#: Adds `--settings`, `--preset` and `--set`, as the argument `given`: a dict of the settings that were given.
-with_given = combined(
-    "given",
+#: Adds `--settings`, `--preset` and `--set`, as the argument `overrides`: a dict of settings.
+with_overrides = combined(
+    "overrides",
     lambda file, preset, pairs: Settings.collect(preset=preset, file=file, overrides=pairs),
     click.option("--settings", "file", type=PATH, help="TOML file of settings."),
     click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings."),
     click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated."),
 )
 
-#: Adds the same options, as the argument `settings`: those that were given, the others by default.
-with_settings = combined("settings", lambda given: Settings.from_values(given), with_given)
+#: Adds the same options, as the argument `settings`: all settings, the others by default.
+with_settings = combined("settings", lambda overrides: Settings.from_values(overrides), with_overrides)
 
 
-def _reading(given: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool) -> dict[str, object]:
+def _reading(overrides: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool) -> dict[str, object]:
     values = {"run.image_rate": fps, "run.skip_damaged": skip_damaged or None, "run.resize": resize or None}
-    return given | {name: value for name, value in values.items() if value is not None}
+    return overrides | {name: value for name, value in values.items() if value is not None}
 
 
-#: Adds `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `given`.
+#: Adds `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `overrides`.
 with_reading = combined(
-    "given",
+    "overrides",
     _reading,
     click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default."),
     with_skip_damaged,

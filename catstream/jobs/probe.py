@@ -1,0 +1,57 @@
+"""What a job needs to know of its source before its processes start."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from catstream.base.names import check_boxes
+from catstream.errors import SettingsError
+from catstream.features.descriptor import descriptor_of, digest_of
+from catstream.jobs.job import Job
+from catstream.jobs.saved_model import check_files
+from catstream.video.source import is_live, open_source
+
+
+class SourceInfo(NamedTuple):
+    """A source, as its first frame says.
+
+    name    for results: the stem of a file, or the name of a folder
+    frames  number of frames, None if it is not known
+    rate    frames per second
+    size    width and height of a frame
+    live    whether it is a camera or a stream
+    """
+
+    name: str
+    frames: int | None
+    rate: float
+    size: tuple[int, int]
+    live: bool
+
+
+def probe(job: Job) -> SourceInfo:
+    """Open the source of a job, and close it again: the detector opens it, and only one program can open a camera.
+
+    SettingsError if the settings do not suit the source, VideoError if it cannot be read.
+    """
+    if job.settings.run.lockstep and is_live(job.source):
+        raise SettingsError("a live source does not wait, so its runs are not reproducible: omit lockstep")
+    with open_source(job.source, part=job.part, settings=job.settings.run) as source:
+        return SourceInfo(source.name, source.frames, source.rate, source.size, source.live)
+
+
+def prepared(job: Job, info: SourceInfo) -> Job:
+    """The job with what depends on its source, and absolute paths: its processes have another current folder.
+
+    BoxError if a box is not in the frame; ServiceError or ProtocolError if a saved model cannot be used.
+    """
+    check_boxes(job.boxes, *info.size)
+    settings = job.settings.for_length(info.frames)
+    if settings.features.network:
+        settings = settings.replace({"features.network": str(Path(settings.features.network).absolute())})
+    network = digest_of(descriptor_of(settings, job.network))
+    check_files(job.models, settings, network)
+    source = job.source if info.live else str(Path(job.source).absolute())
+    return replace(job, source=source, size=info.size, settings=settings, network=network)

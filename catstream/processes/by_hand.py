@@ -1,0 +1,76 @@
+"""Starts one process of a pipeline by hand: `services/detector.py`, `compressor.py` and `trainer.py` call it.
+
+They may be started in any order, as the three containers do; `catstream track` starts and supervises them all.
+"""
+
+from __future__ import annotations
+
+from catstream.base.threads import limit_process
+
+limit_process()  # before anything imports numpy
+
+import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
+from pathlib import Path
+
+from catstream.base.names import boxes_by_name, split_name
+from catstream.base.settings import Settings
+from catstream.errors import CatstreamError, ObjectError
+from catstream.jobs.job import Job
+from catstream.processes.process import run
+
+_ABOUT = {
+    "detector": "Track the objects in the frames of SOURCE; send tracks and features.",
+    "compressor": "Compress the features in coreset trees; send samples.",
+    "trainer": "Train a model on each sample; send models.",
+}
+_EXAMPLE = """
+The three processes connect at an endpoint: a folder for their sockets, or tcp://127.0.0.1:PORT. All need the same
+settings; an environment variable such as CATSTREAM_RUN_ENDPOINT sets one, too.
+
+  mkdir -m 700 run
+  python services/compressor.py --set run.endpoint=run --state checkpoints &
+  python services/trainer.py    --set run.endpoint=run &
+  python services/detector.py   --set run.endpoint=run walk.mp4 --box 120,80,64,48
+"""
+
+
+def main(name: str) -> None:
+    """Run a process with the arguments of the command line, and exit with its code; an error is one line."""
+    options = vars(parser(name).parse_args())
+    try:
+        pairs, boxes = options.pop("pairs"), options.pop("boxes", [])
+        job = Job(**options, settings=Settings.load(overrides=pairs), boxes=boxes_by_name(_by_name(boxes)))
+        sys.exit(run(name, job))
+    except CatstreamError as error:
+        sys.exit(f"catstream: {error}")
+
+
+def parser(name: str) -> ArgumentParser:
+    """The arguments of a process."""
+    made = ArgumentParser(
+        prog=f"services/{name}.py",
+        description=_ABOUT[name],
+        epilog=_EXAMPLE,
+        formatter_class=RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    setting = "One setting; may be repeated."
+    made.add_argument("--set", dest="pairs", action="append", default=[], metavar="GROUP.NAME=VALUE", help=setting)
+    if name != "trainer":
+        made.add_argument("--state", type=Path, help="Folder for the checkpoints or the desired state.")
+    if name == "detector":
+        made.add_argument("source", metavar="SOURCE", help="A video, a folder of images, a camera or a stream.")
+        box = "An object in the first frame, in pixels; may be repeated with names."
+        made.add_argument("--box", dest="boxes", action="append", default=[], metavar="[NAME=]X,Y,W,H", help=box)
+        resume = "Continue after the last message of an earlier detector."
+        made.add_argument("--resume", action="store_true", help=resume)
+    return made
+
+
+def _by_name(texts: list[str]) -> dict[str, str]:
+    """Boxes by the names of their objects; ObjectError if two have the same name."""
+    boxes = dict(split_name(text) for text in texts)
+    if len(boxes) < len(texts):
+        raise ObjectError(f"two boxes of one name (--box {' --box '.join(texts)}): give each object its own name")
+    return boxes
