@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
 from sequences import CHECK, sequences
 from table import command, mean_and_error
 
@@ -122,9 +121,3 @@ def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[
     pairs = zip(rows_of(runs), rows_of(others), strict=True)
     mean, error = mean_and_error(row.auc - other.auc for row, other in pairs)
     return mean or 0.0, error or 0.0
-
-
-def changed(runs: list[EvaluationRun], others: list[EvaluationRun]) -> int:
-    """Return the number of runs with any different box."""
-    pairs = zip(runs, others, strict=True)
-    return sum(not np.array_equal(run.boxes, other.boxes, equal_nan=True) for run, other in pairs)

@@ -15,11 +15,9 @@ measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
 }
 
 measure startup "$python" benchmarks/startup.py --runs 3
-measure objects "$python" benchmarks/objects.py
 measure subscribers "$python" benchmarks/subscribers.py --frames 1500 --runs 1
 measure resume "$python" benchmarks/resume.py --moments 8
 measure loadtest "$catstream" loadtest --streams 2 --duration 20
-measure loadtest-limit "$catstream" loadtest --find-limit --duration 8
 measure speed "$python" benchmarks/speed.py --frames 600 \
     --sequences TLD_01_david TLD_06_car OTB_Woman TLD_10_panda
 "$python" benchmarks/page.py

@@ -94,11 +94,6 @@ def several(*parts: Callable[[Record], Iterable[Table]]) -> Callable[[Record], I
     return lambda record: (table for part in parts for table in part(record))
 
 
-def every(record: Record) -> Iterator[Table]:
-    """Select all tables of a record."""
-    return several(*map(select, range(len(record["tables"]))))(record)
-
-
 def filled(paragraphs: str) -> str:
     """Return paragraphs, which blank lines separate, in lines of at most 120 characters."""
     return "\n\n".join(
@@ -122,18 +117,6 @@ def with_figures(path: Path, found: Mapping[str, Record]) -> str:
     """Return a page of `MARKED` with the figures between its marks."""
     page, figures = path.read_text(encoding="utf-8"), iter(MARKED[path])
     return _MARKS.sub(lambda marks: f"{marks[1]}{next(figures)(found)}\n{marks[2]}", page)
-
-
-def strongest(count: int) -> Callable[[Record], Iterator[Table]]:
-    """Select the complete tracker, and the ingredients that matter most."""
-
-    def chosen(record: Record) -> Iterator[Table]:
-        columns = ("variant", "AUC", "success", "AUC lost", "± standard error", "runs changed")
-        (table,) = select(columns=columns)(record)
-        ranked = sorted(table.rows[1:], key=lambda row: -float(row[3] or 0))
-        yield Table("", columns, [table.rows[0], *ranked[:count]])
-
-    return chosen
 
 
 def faults(record: Record) -> Iterator[Table]:
@@ -189,23 +172,6 @@ def load(record: Record) -> Iterator[Table]:
     success = fmean(stream["success"] for stream in streams)
     milliseconds = [1000 * seconds for seconds in (track["p50"], track["p99"], model["p50"])]
     yield Table("", heads, [(len(streams), record["plan"]["rate"], rate, skipped, *milliseconds, success)])
-
-
-def limit(record: Record) -> Iterator[Table]:
-    """Select the highest rate that met the limits, and the lowest that did not."""
-    met = [step for step in record["steps"] if not step["violations"]]
-    exceeded = [step for step in record["steps"] if step["violations"]]
-    bounds = [max(met, key=_due, default=None), min(exceeded, key=_due, default=None)]
-    rows = [
-        (_due(step), step["followed"], 1000 * step["track"]["p99"], "exceeded" if step["violations"] else "met")
-        for step in bounds
-        if step is not None
-    ]
-    yield Table("", ("frames/s due", "tracked", "track p99, ms", "limits"), rows)
-
-
-def _due(step: Record) -> float:
-    return float(step["rate"])
 
 
 def _accuracy(found: Mapping[str, Record]) -> str:
@@ -313,18 +279,11 @@ _DETAILS_HEAD = """
     The tables that [Results](../docs/results.md) leaves out or shortens, also written by `make results` from the
     records in `benchmarks/results`. [Benchmarks](README.md) describes each measurement."""
 _MORE_HEAD = """
-    The tables of several objects, summaries, saved models and fleets, and of frequent directions in place of the
-    coreset tree, written by `make results` from the records in `benchmarks/results`."""
+    A fleet under faults, and objects that are detected in other videos, written by `make results` from the records in
+    `benchmarks/results`."""
 _ROBUSTNESS = """
-    How much the accuracy depends on the start, on the first box and on the components of the tracker. Written by `make
-    results` from the records in `benchmarks/results`."""
-_OBJECTS = """
-    A rendered video of eight objects, tracked with one to eight of them. See [decision
-    57](../docs/decisions/parameters.md)."""
-_REDUCTION = """
-    For time and memory, the features of one tracked sequence are given to both kinds of `coreset.reduction`; the energy
-    kept is ||C||^2 / ||A||^2 over all trees. Accuracy is measured on the 20 sequences on which the defaults were
-    chosen, from three start frames of each. See [decision 52](../docs/decisions/parameters.md)."""
+    How much the accuracy depends on the start and on the initial box. Written by `make results` from the records in
+    `benchmarks/results`."""
 _STARTS = """
     OPE is one run of each sequence; TRE starts it from several frames; jitter changes the first box by at most 2 %,
     and SRE, of which the first 120 frames are tracked, by 10 to 20 %. Each sequence counts once, with the mean over its
@@ -333,20 +292,6 @@ _STARTS = """
     than half of the frames in its last quarter have an overlap above 0.5. The check sequences are not used to choose
     anything. The table of attributes has the runs of OPE; [Evaluate on your own
     video](../docs/how-to/evaluate.md#6-see-what-is-difficult) defines them."""
-_SAVED = """
-    Each model of `merge.py` is learned from a third of a sequence, and tried in the last third; `one tree` has seen
-    both. `best` is the share of frames in which the best window of the whole frame overlaps the object by half, and
-    `found` the share in which a run that starts with the model has a box that does. The models of `saved_models.py`
-    are learned from the first third of a sequence; `stranger` is the share of frames of other sequences in which a box
-    is reported. Both were measured on ten short sequences that are not on the check list: see
-    [Saved models](../docs/how-to/saved-models.md)."""
-_ACROSS = """
-    An object is learned at three cameras and searched for at a fourth one, by the model of the first camera, by those
-    that a fleet merges, and by one tree that has seen the frames of all three. The cameras are four parts of a
-    long sequence, or rendered scenes with four backgrounds in four lights. `recall` is the share of frames in which the
-    box overlaps the true one by half, `wrong` the share with another box, and `stranger` the share of frames of a
-    camera without the object in which a box is reported. See [the
-    how-to](../docs/how-to/fleet.md)."""
 _FLEET = """
     Six streams on three nodes of one machine with two cores, and a real S3 server as the store. First, three are live,
     and three are short films, as fast as the cores allow, whose trees are compared, bit for bit, with those without
@@ -354,23 +299,6 @@ _FLEET = """
     did not happen in three minutes. Then all are live and slow, so that a core is
     free. The second and the last table begin when Ray has noticed the fault. See [the
     how-to](../docs/how-to/fleet.md)."""
-_SCALE_HEAD = """
-    This page says what one machine pays for a fleet of many streams, and what breaks first. **No fleet of these sizes
-    was run**: the decisions, answers and writes below are the real ones, of streams that do not run; what they add up
-    to is arithmetic."""
-_HEAD_OF_A_FLEET = """
-    The controller looks at all streams twice a second, so the decisions of a turn have to stay well below 0.5 s. In
-    addition, it asks each stream for its figures through Ray, which costs about 0.3 ms of processor time: with more
-    than about a thousand streams, a turn takes longer than 0.5 s, and a failure is noticed later. Streams continue to
-    track meanwhile, and Ray restarts them without the controller. `all are answered` is the time until a client, such
-    as the web page, has the state of all streams. Beyond some thousands of streams, run several fleets: a client names
-    the fleet in the address of a stream."""
-_NODE_OF_A_FLEET = """
-    A stream needs 0.3 to 1 cores, by the size of its frames and their rate; `cores` in the file is what Ray reserves. A
-    node writes the state of each stream every 5 seconds, about
-    14 MB for one object of four trees once it has tracked for long: 100 streams write 280 MB a second to the store.
-    With `every = 30`, it is a sixth of that; a failure then costs a live stream up to 30 s of learning, and no row of
-    a file. Requests to a bucket are one PUT and one listing for each state. Merging is one task on one node."""
 _FOUND = """
     Every fourth object is learned from the first third of its sequence, and searched in frames of the rest and of all
     other sequences. A sighting is right if it overlaps the object by half; the average precision counts all others as
@@ -379,12 +307,6 @@ _FOUND = """
     rendered object is learned in 76 frames before a plain background, and searched before other backgrounds, turned,
     scaled and in other lights. The machine was busy: only the ratios of times count. See [the
     how-to](../docs/how-to/find.md)."""
-_NETWORKS = """
-    The backbones of NanoTrackV2 and of MobileNetV2, prepared with frames of the tuning sequences. See [the
-    how-to](../docs/how-to/network.md)."""
-_INGREDIENTS = """
-    The loss of AUC without one component, on the tuning sequences with three first boxes each; the largest losses. A
-    loss of less than two standard errors may be chance."""
 _SPEED = """
     Each tracker has one core, without decoding; only the three processes decode, and use all cores. A frame of a long
     run takes as long as one at its beginning."""
@@ -401,12 +323,10 @@ _PAPER_DETAILS = """
 _SPEED_DETAILS = """
     `Tracker` in a program of a user, the time of a frame in one process and in three, and that of each stage. The three
     processes and `subscribers.py` decode the video, the others do not."""
-_LIMITS = """
-    [A plot](../docs/images/soak.png) shows the memory over the million messages of `soak.py`."""
 _PEERS = "Beside OpenCV's trackers"
 _STAGES = "Milliseconds a frame, on one core"
+_THREE = several(*map(select, range(3)))
 _SIZES = "Frames/s against the size of the image"
-_SOAK = ("messages", "rows", "us a message", "trees MB", "law MB", "resident MB", "disk MB")
 
 SECTIONS = (
     Section(
@@ -430,11 +350,7 @@ SECTIONS = (
         "Beside the paper",
         _paper,
         (
-            Shown(
-                "tld-defaults",
-                select(without="(?!defaults)"),
-                "success, mean of four first boxes of each video",
-            ),
+            Shown("tld-defaults", select(without="(?!defaults)"), "success, mean of four first boxes of each video"),
             Shown("tld", select(without="(?!cat)"), "success of one run of each video"),
             Shown("root_or_hierarchy-ours", select(), "means of one run of each of the first 20 sequences"),
             Shown(
@@ -464,12 +380,7 @@ SECTIONS = (
         _LOAD,
         (
             Shown("loadtest", load, "one run: latency over all frames; success: mean of the streams"),
-            Shown("loadtest-limit", limit, "one run of one stream at each rate"),
-            Shown(
-                "chaos",
-                faults,
-                "success of one run of each kind, and seconds to recover over all faults",
-            ),
+            Shown("chaos", faults, "success of one run of each kind, and seconds to recover over all faults"),
             Shown("resume", select(), "one run, killed at each moment; seconds: median, longest"),
         ),
     ),
@@ -477,7 +388,6 @@ SECTIONS = (
 
 DETAILS = (
     Section("Accuracy on each sequence", _SEQUENCES, (Shown("accuracy-peers", by_sequence),)),
-    Section("With a network", _NETWORKS, (Shown("network", every),)),
     Section(
         "The paper's experiments",
         _PAPER_DETAILS,
@@ -489,52 +399,17 @@ DETAILS = (
             Shown("bootstrap", select()),
         ),
     ),
-    Section(
-        "Speed",
-        _SPEED_DETAILS,
-        (
-            Shown("speed", speeds),
-            Shown("subscribers", select(without="0 ")),
-        ),
-    ),
-    Section(
-        "Memory and hostile input",
-        _LIMITS,
-        (
-            Shown("soak", select(columns=_SOAK, without="(15|30|60|125|250|500)000 ")),
-            Shown("fuzz", totals),
-        ),
-    ),
+    Section("Speed", _SPEED_DETAILS, (Shown("speed", speeds), Shown("subscribers", select(without="0 ")))),
+    Section("Hostile input", "Inputs of all decoders of messages and files.", (Shown("fuzz", totals),)),
 )
 
 MORE = (
-    Section("Several objects", _OBJECTS, (Shown("objects", every),)),
-    Section("Frequent directions", _REDUCTION, (Shown("reduction", every),)),
-    Section(
-        "Saved models",
-        _SAVED,
-        (
-            Shown("merge", several(select(without="(?!mean)"), select(1))),
-            Shown("saved_models", select(without="(?!mean|±)")),
-        ),
-    ),
-    Section("Across cameras", _ACROSS, (Shown("across_cameras", several(select(1), select(2))),)),
-    Section("A fleet under faults", _FLEET, (Shown("fleet_faults", every), Shown("fleet_faults-free", select(1)))),
-    Section("Objects found again", _FOUND, (Shown("instance", several(*map(select, range(3)))),)),
+    Section("A fleet under faults", _FLEET, (Shown("fleet_faults", _THREE), Shown("fleet_faults-free", select(1)))),
+    Section("Objects found again", _FOUND, (Shown("instance", _THREE),)),
 )
 
 ROBUSTNESS = (
-    Section(
-        "Starts and first boxes",
-        _STARTS,
-        (Shown("robustness", robustness), Shown("shifts", select(0))),
-    ),
-    Section("Ablation", _INGREDIENTS, (Shown("ablation", strongest(9)),)),
-)
-
-SCALE = (
-    Section("The head", _HEAD_OF_A_FLEET, (Shown("fleet_scale", select(0)),)),
-    Section("A node and the store", _NODE_OF_A_FLEET, (Shown("fleet_scale", select(1)),)),
+    Section("Starts and first boxes", _STARTS, (Shown("robustness", robustness), Shown("shifts", select(0)))),
 )
 
 PAGES = (
@@ -542,7 +417,6 @@ PAGES = (
     Page(_NOTES / "details.md", "Details of the results", _DETAILS_HEAD, DETAILS),
     Page(_NOTES / "robustness.md", "Robustness", _ROBUSTNESS, ROBUSTNESS),
     Page(_NOTES / "more-results.md", "More results", _MORE_HEAD, MORE),
-    Page(_NOTES / "scale.md", "How far a fleet goes", _SCALE_HEAD, SCALE),
 )
 
 #: Pages with figures between marks, and what writes them, from the first mark on.

@@ -80,17 +80,15 @@ def _dahlia() -> Sprite:
 
 
 def painted(
-    background: np.ndarray, place: tuple[float, ...], light: float, rng: np.random.Generator, *, empty: bool = False
+    background: np.ndarray, place: tuple[float, ...], light: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, Box]:
     """Return a picture of a dahlia before a background, all of it in a light and with noise; and the dahlia's box.
 
     place : x, y, size in pixels, and angle in degrees
-    empty : leave the dahlia out
     """
     dahlia, image = _dahlia(), background.astype(np.float32)
     matrix = dahlia.turned(np.array(place), np.eye(2, 3))
-    if not empty:
-        dahlia.paint(image, matrix, np.ones(image.shape[:2], np.float32))
+    dahlia.paint(image, matrix, np.ones(image.shape[:2], np.float32))
     noisy = image * light + rng.normal(scale=3.0, size=image.shape)
     return noisy.clip(0, 255).astype(np.uint8), dahlia.box(matrix)
 

@@ -22,15 +22,9 @@ from catstream.errors import CatstreamError
 from catstream.reports.provenance import provenance
 
 _ROOT = Path(__file__).parents[1]
-_DATA = Path(os.environ.get("TRACKING_DATA") or _ROOT.parent / "shared" / "data")
-_PLACES = (
-    "--json",
-    "--data",
-    "--output",
-    "--strips",
-    "--attributes",
-    "--peer-models",
-)  # options with paths of this machine
+_DATA = Path(os.environ.get("TRACKING_DATA", "data"))
+#: Options with paths of this machine.
+_PLACES = ("--json", "--data", "--output", "--strips", "--attributes", "--peer-models")
 
 Cell = str | int | float | None
 
@@ -54,7 +48,9 @@ class Table:
 def command(about: str | None) -> argparse.ArgumentParser:
     """Return a parser with the options of all benchmarks."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=_DATA, help="folder of annotated sequences (default: %(default)s)")
+    parser.add_argument(
+        "--data", type=Path, default=_DATA, help="folder of annotated sequences (default: $TRACKING_DATA or data)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures and their provenance to a file")
     parser.add_argument("--quick", action="store_true", help="a few rendered frames, to test that the benchmark runs")
     return parser
