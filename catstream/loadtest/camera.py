@@ -203,7 +203,7 @@ class Broadcast(ThreadingHTTPServer):
     def _file(self, schedule: Schedule, number: int) -> bytes:
         if not self._is_h264:
             return self._files[schedule.picture(number, len(self._files))]
-        # All but key frames refer to the one before. So the still is a key frame, and the video goes on after its end.
+        # All but keyframes refer to the one before. So the still is a keyframe, and the video goes on after its end.
         return self._files[number % len(self._files) if number > 0 and schedule.frames > 1 else 0]
 
 
