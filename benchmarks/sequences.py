@@ -88,7 +88,7 @@ def painted(
     empty : leave the dahlia out
     """
     dahlia, image = _dahlia(), background.astype(np.float32)
-    matrix = dahlia.turned(np.array(place), np.eye(2, 3))
+    matrix = dahlia.transform(np.array(place), np.eye(2, 3))
     if not empty:
         dahlia.paint(image, matrix, np.ones(image.shape[:2], np.float32))
     noisy = image * light + rng.normal(scale=3.0, size=image.shape)

@@ -133,7 +133,7 @@ def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, 
         raise click.UsageError(f"--zone-margin {options.margin:g} is larger than the frame: no object can leave a zone")
 
 
-def _zones_checked(tracks: Iterable[Track], zones: Mapping[str, Any], endpoint: str, keys: str) -> Iterator[Track]:
+def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], endpoint: str, keys: str) -> Iterator[Track]:
     """Yield tracks; SettingsError as soon as a picture of the pipeline shows that a zone is outside the frame."""
     source = iter(tracks)
     if zones:
@@ -189,7 +189,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in _zones_checked(saying_why_silent(tracks), options.zones, tracks.endpoint, tracks.keys):
+            for track in _with_zone_check(saying_why_silent(tracks), options.zones, tracks.endpoint, tracks.keys):
                 run = run or tracks.run
                 if tracks.run != run and not tracks.endpoint.startswith("fleet://"):  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"
@@ -198,8 +198,8 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
                 if track.frame < max(newest.values(), default=-1) or track.frame == newest.get(track.object):
                     continue
                 with INTERRUPTS.deferred():  # a track is written everywhere or nowhere
-                    for each in sinks:
-                        each.write(TrackedFrame([track]))
+                    for sink in sinks:
+                        sink.write(TrackedFrame([track]))
                     written, newest[track.object] = written + 1, track.frame
                 status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:

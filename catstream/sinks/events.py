@@ -1,4 +1,4 @@
-"""Events: what happens to objects, from their tracks.
+"""Events of objects, detected in their tracks.
 
 >>> from catstream.base.box import Box
 >>> events = Events(SinkOptions(zones={"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, lost_seconds=1))
@@ -77,7 +77,7 @@ class _Object:
 
 
 class Events:
-    """Turns the tracks of a run, in their order, into events; it does no I/O, and time is that of the tracks.
+    """Detects events in the tracks of a run, in their order; it does no I/O, and time is that of the tracks.
 
     A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `options.margin`
     pixels outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.

@@ -42,13 +42,13 @@ _REPEAT_SECONDS = 1.0  # without a track, after which the last picture is sent a
 
 
 class StreamSink:
-    """Starts the process, starts it again if it dies, and counts.
+    """Starts the process, restarts it if it dies, and counts the frames that it misses.
 
     missed  frames that passed while the server accepted no picture, because it was away or slow
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._origin, self.missed = place, origin, 0
+        self._place, self._origin, self._warnings, self.missed = place, origin, Warnings(place), 0
         self._frame = -1  # the last one
         self._accepted = 0.0  # newest moment at which the server is known to have accepted a picture
         self._start()
@@ -63,11 +63,14 @@ class StreamSink:
     def write(self, frame: TrackedFrame) -> None:
         """Count the frame if it is missed; the process receives the tracks from the pipeline itself."""
         if self._process.poll() and monotonic() - self._started > _PAUSE_SECONDS:
+            is_stuck = self._process.returncode == -signal.SIGALRM
+            self._warnings.failed(f"{f'no data accepted for {_STUCK_SECONDS} s' if is_stuck else 'died'}; reconnecting")
             self._stop()
             self._start()
         with suppress(BlockingIOError):
             if os.read(self._output, 4096):
                 self._accepted = monotonic()
+                self._warnings.working()
         if frame.number != self._frame and monotonic() - self._accepted > _LATE_SECONDS:
             self.missed += 1
         self._frame = frame.number
@@ -76,7 +79,7 @@ class StreamSink:
         """End the process, and warn about what the server missed."""
         self._stop()
         if self.missed:
-            Warnings(self._place).log(f"{counted(self.missed, 'frame')} passed while it was away or slow")
+            self._warnings.log(f"{counted(self.missed, 'frame')} passed while it was away or slow")
 
     def _start(self) -> None:
         self._started = monotonic()
