@@ -87,7 +87,7 @@ def painted(
     place : x, y, size in pixels, and angle in degrees
     """
     dahlia, image = _dahlia(), background.astype(np.float32)
-    matrix = dahlia.turned(np.array(place), np.eye(2, 3))
+    matrix = dahlia.transform(np.array(place), np.eye(2, 3))
     dahlia.paint(image, matrix, np.ones(image.shape[:2], np.float32))
     noisy = image * light + rng.normal(scale=3.0, size=image.shape)
     return noisy.clip(0, 255).astype(np.uint8), dahlia.box(matrix)

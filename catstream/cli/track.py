@@ -34,7 +34,7 @@ from catstream.cli.options import (
     with_reading,
 )
 from catstream.cli.view import PORT, Address, AddressType, with_token
-from catstream.cli.write import check_used, with_sink_options, with_table
+from catstream.cli.write import check_options, with_sink_options, with_table
 from catstream.errors import require_extra
 from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
@@ -273,7 +273,7 @@ class _Run:
         if results.video and results.output is None:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
-        check_used(self.options, places)
+        check_options(self.options, places, pipeline.size)
         part, stride = pipeline.part, pipeline.part.step or 1
         head = Head(
             source=without_password(pipeline.source),

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 from rich.console import Console
 
 from catstream.base.names import split_name
@@ -19,11 +18,12 @@ from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endp
 from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
 from catstream.client.subscription import subscribe
-from catstream.errors import VideoError
+from catstream.errors import SilenceError, VideoError
 from catstream.jobs.job import SinkOptions
+from catstream.messages.kinds import Track
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, SINKS, About, Head, Origin, TrackedFrame
-from catstream.sinks.events import KINDS
+from catstream.sinks.events import KINDS, check_zones
 from catstream.sinks.track_log import LOGS, Log, is_log
 from catstream.video.source import open_source
 
@@ -51,9 +51,10 @@ def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dic
             points = tuple((float(x), float(y)) for x, y in pairs)
         except ValueError:
             points = ()
-        if not (name and name not in zones and len(points) > 2 and np.isfinite(points).all()):
-            raise click.BadParameter(f'expected a new NAME="X,Y X,Y X,Y ..." with three corners or more, got {text!r}')
+        if not (name and name not in zones and points):
+            raise click.BadParameter(f'expected NAME="X,Y X,Y X,Y ..." with a new name, got {text!r}')
         zones[name] = points
+    check_zones(zones)
     return zones
 
 
@@ -62,7 +63,7 @@ def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, 
     kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
     if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
         raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
-    return tuple(kinds), NumberRange(0).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
+    return tuple(kinds), NumberRange(0, 86400).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
 
 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
@@ -77,7 +78,7 @@ with_sink_options = combined(
     click.option(
         "--zone-margin",
         "margin",
-        type=NumberRange(0),
+        type=NumberRange(0, 10000),
         default=10,
         metavar="PIXELS",
         help="An object has left a zone if it is farther outside than this; 10 by default.",
@@ -91,7 +92,7 @@ with_sink_options = combined(
     ),
     click.option(
         "--rate",
-        type=NumberRange(0, min_open=True),
+        type=NumberRange(0, 1000, min_open=True),
         default=1,
         metavar="N",
         help="To mqtt://: states of each object per second; 1 by default.",
@@ -101,12 +102,49 @@ with_sink_options = combined(
 )
 
 
-def check_used(options: SinkOptions, places: Iterable[str]) -> None:
-    """Raise UsageError if options were given that none of the destinations has."""
-    if options != SinkOptions() and not any(re.match(r"(mqtt|http)s?://", place) for place in places):
-        raise click.UsageError(
-            "--zone, --when, --rate, --picture and --secret-file are for mqtt:// and http://: add one"
-        )
+#: Field of `SinkOptions` -> the option that sets it.
+_FLAGS = {
+    "zones": "--zone",
+    "margin": "--zone-margin",
+    "events": "--when",
+    "lost_seconds": "--when lost=",
+    "rate": "--rate",
+    "picture": "--picture",
+    "key": "--secret-file",
+}
+
+
+def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, int] | None = None) -> None:
+    """Raise UsageError if an option has no effect; with the `size` of a frame, SettingsError for zones outside."""
+    default, used = SinkOptions(), {name for place in places for name in destinations.sink_of(place).options}
+    for name, flag in _FLAGS.items():
+        if getattr(options, name) != getattr(default, name) and name not in used:
+            users = " or ".join(scheme for scheme, row in SINKS.items() if name in row.options)
+            raise click.UsageError(f"{flag} has no effect on these destinations: add one with {users}, or omit it")
+    of_zones = [kind for kind in ("entered", "left") if kind in options.events]
+    if of_zones and options.events != default.events and not options.zones:
+        raise click.UsageError(f"--when {','.join(of_zones)} has no effect without a zone: add --zone")
+    if options.margin != default.margin and not options.zones:
+        raise click.UsageError("--zone-margin has no effect without a zone: add --zone")
+    if options.zones and not of_zones and "rate" not in used:  # states, which it is for, have zones, too
+        raise click.UsageError("--zone has no effect: add entered or left to --when")
+    check_zones(options.zones, size)
+    if size is not None and options.margin > max(size):
+        raise click.UsageError(f"--zone-margin {options.margin:g} is larger than the frame: no object can leave a zone")
+
+
+def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], endpoint: str, keys: str) -> Iterator[Track]:
+    """Yield tracks; SettingsError as soon as a picture of the pipeline shows that a zone is outside the frame."""
+    source = iter(tracks)
+    if zones:
+        with subscribe(endpoint, "previews", timeout=0, keys=keys) as previews:
+            for track in source:
+                yield track
+                with suppress(SilenceError):
+                    if (preview := next(previews, None)) is not None:
+                        check_zones(zones, (preview.width, preview.height))
+                        break
+    yield from source
 
 
 @click.command()
@@ -137,7 +175,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
-    check_used(options, places)
+    check_options(options, places)
     for place in places:
         destinations.check_sink(place, options)
         if destinations.is_file(place):
@@ -151,7 +189,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in saying_why_silent(tracks):
+            for track in _with_zone_check(saying_why_silent(tracks), options.zones, tracks.endpoint, tracks.keys):
                 run = run or tracks.run
                 if tracks.run != run and not tracks.endpoint.startswith("fleet://"):  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"
@@ -160,8 +198,8 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
                 if track.frame < max(newest.values(), default=-1) or track.frame == newest.get(track.object):
                     continue
                 with INTERRUPTS.deferred():  # a track is written everywhere or nowhere
-                    for each in sinks:
-                        each.write(TrackedFrame([track]))
+                    for sink in sinks:
+                        sink.write(TrackedFrame([track]))
                     written, newest[track.object] = written + 1, track.frame
                 status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:

@@ -1,7 +1,7 @@
 """The camera of a load test: a process that sends known images over HTTP or RTSP at the times of a schedule.
 
 Each frame is sent when it is due, even if the receiver has not read the frames before it; a slow receiver gets frames
-late, but none is left out. The time stamp of a frame in the stream is its due time by `time.monotonic`, so the receiver
+late, but none is dropped. The time stamp of a frame in the stream is its due time by `time.monotonic`, so the receiver
 can compute its number and its age. Over HTTP, the container is NUT, because FFmpeg returns its frames without delay;
 for other containers, and for H.264 over RTSP, it buffers one frame.
 """
@@ -62,8 +62,8 @@ class Schedule:
         >>> [Schedule(0.0, 25.0, 7).picture(number, 3) for number in range(-2, 9)]
         [0, 0, 0, 1, 2, 1, 0, 1, 2, 2, 2]
         """
-        shown, last = min(max(number, 0), self.frames - 1), pictures - 1
-        return last - abs(shown % max(2 * last, 1) - last)
+        number, last = min(max(number, 0), self.frames - 1), pictures - 1
+        return last - abs(number % max(2 * last, 1) - last)
 
 
 class Camera:
@@ -191,10 +191,10 @@ class Broadcast(ThreadingHTTPServer):
             number = schedule.following(monotonic())
             while schedule is self._schedules[stream]:
                 due = schedule.due(number)
-                if (left := due - monotonic()) > 0:
-                    if self._closed.wait(min(left, 1 / _STILL_RATE)):
+                if (seconds := due - monotonic()) > 0:
+                    if self._closed.wait(min(seconds, 1 / _STILL_RATE)):
                         return
-                    if left > 1 / _STILL_RATE:
+                    if seconds > 1 / _STILL_RATE:
                         continue
                     self.late = max(self.late, monotonic() - due)
                 yield due, self._file(schedule, number)
@@ -203,7 +203,7 @@ class Broadcast(ThreadingHTTPServer):
     def _file(self, schedule: Schedule, number: int) -> bytes:
         if not self._is_h264:
             return self._files[schedule.picture(number, len(self._files))]
-        # All but key frames refer to the one before. So the still is a key frame, and the video goes on after its end.
+        # All but keyframes refer to the one before. So the still is a keyframe, and the video goes on after its end.
         return self._files[number % len(self._files) if number > 0 and schedule.frames > 1 else 0]
 
 

@@ -48,10 +48,10 @@ def render(
     for frame in range(frames):
         turn = 2 * np.pi * frame / 240
         left, top = 150 + 90 * np.sin(turn), 90 + 60 * np.sin(1.3 * turn)
-        image, free = lake.seen(np.array([[1, 0, -left], [0, 1, -top]])), np.ones(SIZE[::-1], np.float32)
+        image, free = lake.crop(np.array([[1, 0, -left], [0, 1, -top]])), np.ones(SIZE[::-1], np.float32)
         boxes: dict[str, Box | None] = {}
         for name, sprite, path in reversed(list(zip(NAMES, sprites, paths, strict=False))):
-            place = sprite.turned(path[frame], view)
+            place = sprite.transform(path[frame], view)
             seen = sprite.paint(image, place, free)
             free *= 1 - cv2.warpAffine(sprite.mask, place, SIZE)
             boxes[name] = sprite.box(place) if seen >= VISIBLE else None

@@ -11,14 +11,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from fractions import Fraction
 from http.client import parse_headers
 from socketserver import StreamRequestHandler
 from struct import pack
 from threading import Thread
 from typing import Any
 
-from catstream.errors import ServiceError
+from catstream.video.writer import Encoder
 
 _CLOCK = 90_000  # ticks per second of RTP time stamps of video
 _PERIOD = 2**32 / _CLOCK  # seconds
@@ -28,33 +27,21 @@ _DESCRIPTION = (
     b"v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=load test\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
     b"a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:video\r\n"
 )
-#: As cameras encode: each frame refers to the one before, in one slice, with a key frame every two seconds at 25/s.
-_ENCODER = {
-    "preset": "veryfast",
-    "tune": "zerolatency",
-    "x264-params": "keyint=50:min-keyint=50:scenecut=0:sliced-threads=0",
-}
 
 
 def encode(pictures: Sequence[bytes], size: tuple[int, int], done: Callable[[int], None]) -> list[bytes]:
-    """Encode JPEG files, forwards, then backwards; return one access unit for each frame, the first is a key frame.
+    """Encode JPEG files, forwards, then backwards; return one access unit for each frame, the first is a keyframe.
 
     done : is called with the number of frames so far
     """
     import av
 
-    if "libx264" not in av.codecs_available:
-        raise ServiceError("PyAV has no encoder for H.264 here: pip install --force-reinstall av, or --source mjpeg")
-    decoder, encoder = av.CodecContext.create("mjpeg", "r"), av.CodecContext.create("libx264", "w")
-    encoder.width, encoder.height, encoder.pix_fmt, encoder.options = *size, "yuv420p", _ENCODER
-    encoder.time_base, packets = Fraction(1, 25), []
-    for number, picture in enumerate([*pictures, *pictures[-2:0:-1]]):
-        (decoded,) = decoder.decode(av.Packet(picture))
-        frame = decoded.reformat(format="yuv420p")
-        frame.pts, frame.pict_type = number, 0  # the encoder chooses: each JPEG file is a key frame
-        packets += encoder.encode(frame)
-        done(number + 1)
-    return [bytes(packet) for packet in [*packets, *encoder.encode(None)]]
+    decoder, encoder, packets = av.CodecContext.create("mjpeg", "r"), Encoder(size, rate=25), []
+    for number, picture in enumerate([*pictures, *pictures[-2:0:-1]], 1):
+        (frame,) = decoder.decode(av.Packet(picture))
+        packets += encoder.packets(frame.to_ndarray(format="bgr24"))
+        done(number)
+    return [bytes(packet) for packet in [*packets, *encoder.flush()]]
 
 
 def due_time(pts: float, arrival: float) -> float:

@@ -166,6 +166,7 @@ class Row:
     sized        whether an export needs the size of a frame
     extra        the extra that it needs
     follows_log  whether a file is a log, or is made again from the log when a run is resumed
+    options      fields of `SinkOptions` that a sink uses; any of them is an error if no destination does
     """
 
     home: str
@@ -174,6 +175,7 @@ class Row:
     sized: bool = False
     extra: str = ""
     follows_log: bool = False
+    options: tuple[str, ...] = ()
 
     def load(self) -> Any:
         """Import the class or function; raises MissingExtraError if its extra is not installed."""
@@ -182,6 +184,9 @@ class Row:
         module, _, name = self.home.rpartition(".")
         return getattr(import_module(f"catstream.sinks.{module}"), name)
 
+
+#: Options of the sinks that send events.
+_EVENTS = ("zones", "margin", "events", "lost_seconds", "picture")
 
 #: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
 SINKS = {
@@ -197,10 +202,15 @@ SINKS = {
     "rtsp://": Row("restream.StreamSink", "the pictures with their boxes, live, to an RTSP server, as H.264"),
     "rtmp://": Row("restream.StreamSink", "the same to an RTMP server"),
     ".mcap": Row("mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap"),
-    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker", extra="mqtt"),
-    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt"),
-    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
-    "https://": Row("webhook.Webhook", "the same with TLS"),
+    "mqtt://": Row(
+        "mqtt_sink.MqttSink",
+        "HOST/TOPIC: events and states of objects, for a broker",
+        extra="mqtt",
+        options=(*_EVENTS, "rate"),
+    ),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt", options=(*_EVENTS, "rate")),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "key")),
+    "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "key")),
 }
 
 #: Name of a format -> the export.

@@ -1,4 +1,4 @@
-"""Events: what happens to objects, from their tracks.
+"""Events of objects, detected in their tracks.
 
 >>> from catstream.base.box import Box
 >>> events = Events(SinkOptions(zones={"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, lost_seconds=1))
@@ -8,22 +8,27 @@
 ...         print((event.track.time, event.kind, event.zone))
 (0.0, 'found', '')
 (0.5, 'entered', 'door')
+(1.5, 'left', 'door')
 (1.5, 'lost', '')
 (2.0, 'returned', '')
-(2.0, 'left', 'door')
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import cv2
 import numpy as np
 
+from catstream.errors import SettingsError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
+
+#: x and y, in pixels of the frame.
+Point = tuple[float, float]
 
 #: Kind of an event -> when there is one.
 KINDS = {
@@ -31,7 +36,7 @@ KINDS = {
     "lost": "it has had no box for some seconds",
     "returned": "it has a box again after that",
     "entered": "the centre of its box is in a zone",
-    "left": "the centre is outside the zone again, by more than the margin; or the object ended in it",
+    "left": "the centre is outside the zone again, by more than the margin; or the object was lost or ended in it",
     "ended": "it was forgotten, another object got its name, or the tracks ended",
 }
 
@@ -62,26 +67,25 @@ class Event:
 
 @dataclass(slots=True)
 class _Object:
-    """What is known of an object: its newest track, and how many frames there were up to it; the time of its last box.
-
-    If it has had no box yet, `seen` is None.
-    """
+    """An object: its newest track, the number of frames up to it, the time of its last box (None before the first)."""
 
     track: Track
     frames: int = 0
-    seen: float | None = None
+    box_time: float | None = None
     lost: bool = False
     zones: list[str] = field(default_factory=list)
 
 
 class Events:
-    """Turns the tracks of a run, in their order, into events; it does no I/O, and time is that of the tracks.
+    """Detects events in the tracks of a run, in their order; it does no I/O, and time is that of the tracks.
 
     A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `options.margin`
-    pixels outside. An object that is lost stays in its zones until it is seen elsewhere.
+    pixels outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.
+    SettingsError if a zone cannot be entered, see `check_zones`.
     """
 
     def __init__(self, options: SinkOptions) -> None:
+        check_zones(options.zones)
         self._options = options
         self._zones = {name: np.array(corners, np.float32) for name, corners in options.zones.items()}
         self._objects: dict[str, _Object] = {}
@@ -94,51 +98,102 @@ class Events:
             if track.frame != self._frame:
                 self._frame, self._frames = track.frame, self._frames + 1
             events += self._of(track)
-        for name, known in [*self._objects.items()]:
-            if self._frames - known.frames > _FORGOTTEN_FRAMES:
+        for name, item in [*self._objects.items()]:
+            if self._frames - item.frames > _FORGOTTEN_FRAMES:
                 events += self._end(name)
-        return self._wanted(events)
+        return self._selected(events)
 
     def close(self) -> list[Event]:
         """Return the last events: all objects end."""
-        return self._wanted([event for name in [*self._objects] for event in self._end(name)])
+        return self._selected([event for name in [*self._objects] for event in self._end(name)])
 
     def status(self, name: str) -> dict[str, Any] | None:
         """Whether an object is present, that is found and not lost, and the names of its zones; None if it ended."""
-        known = self._objects.get(name)
-        if known is None:
+        item = self._objects.get(name)
+        if item is None:
             return None
-        return {"present": known.seen is not None and not known.lost, "zones": known.zones}
+        return {"present": item.box_time is not None and not item.lost, "zones": [*item.zones]}
 
-    def _wanted(self, events: list[Event]) -> list[Event]:
+    def _selected(self, events: list[Event]) -> list[Event]:
         return [event for event in events if event.kind in self._options.events]
 
     def _of(self, track: Track) -> Iterator[Event]:
         """Yield the events of a track, except the end of other objects."""
-        known = self._objects.get(track.object)
-        if known is not None and known.track.began != track.began:
+        item = self._objects.get(track.object)
+        if item is not None and item.track.began != track.began:
             yield from self._end(track.object)
-            known = None
-        known = known or self._objects.setdefault(track.object, _Object(track))
-        known.track, known.frames = track, self._frames
+            item = None
+        item = item or self._objects.setdefault(track.object, _Object(track))
+        item.track, item.frames = track, self._frames
         if track.box is None:
-            if known.seen is not None and not known.lost and track.time - known.seen >= self._options.lost_seconds:
-                known.lost = True
-                yield Event("lost", track)
+            if item.box_time is None or item.lost or track.time - item.box_time < self._options.lost_seconds:
+                return
+            item.lost = True
+            yield from self._leave_zones(item)
+            yield Event("lost", track)
             return
-        if known.seen is None or known.lost:
-            yield Event("found" if known.seen is None else "returned", track)
-        known.seen, known.lost = track.time, False
+        if item.box_time is None or item.lost:
+            yield Event("found" if item.box_time is None else "returned", track)
+        item.box_time, item.lost = track.time, False
         for name, corners in self._zones.items():
             inside = cv2.pointPolygonTest(corners, track.box.centre, measureDist=True)  # pixels; negative if outside
-            if name not in known.zones and inside >= 0:
-                known.zones.append(name)
+            if name not in item.zones and inside >= 0:
+                item.zones.append(name)
                 yield Event("entered", track, name)
-            elif name in known.zones and inside < -self._options.margin:
-                known.zones.remove(name)
+            elif name in item.zones and inside < -self._options.margin:
+                item.zones.remove(name)
                 yield Event("left", track, name)
 
     def _end(self, name: str) -> Iterator[Event]:
-        known = self._objects.pop(name)
-        yield from (Event("left", known.track, zone) for zone in known.zones)
-        yield Event("ended", known.track)
+        item = self._objects.pop(name)
+        yield from self._leave_zones(item)
+        yield Event("ended", item.track)
+
+    @staticmethod
+    def _leave_zones(item: _Object) -> Iterator[Event]:
+        while item.zones:
+            yield Event("left", item.track, item.zones.pop(0))
+
+
+def check_zones(zones: Mapping[str, Sequence[Point]], size: tuple[int, int] | None = None) -> None:
+    """Raise SettingsError if a zone is no simple polygon in pixels; with the `size` of a frame, if it is outside.
+
+    >>> check_zones({"door": [(0.1, 0.1), (0.9, 0.1), (0.9, 0.9)]})
+    Traceback (most recent call last):
+    catstream.errors.SettingsError: zone door: all corners are within 0 to 1: use pixels of the frame, not fractions
+    """
+    for name, corners in zones.items():
+        if wrong := _defect(np.array(corners, np.float32), size):
+            raise SettingsError(f"zone {name}: {wrong}")
+
+
+def _defect(corners: np.ndarray, size: tuple[int, int] | None) -> str:
+    """Return what is wrong with the corners of a zone, float32 (n, 2); empty if nothing is."""
+    if len(corners) < 3:
+        return f"a polygon has at least 3 corners, got {len(corners)}"
+    if not np.isfinite(corners).all():
+        return "its corners have to be finite numbers"
+    if corners.min() >= 0 and corners.max() <= 1:
+        return "all corners are within 0 to 1: use pixels of the frame, not fractions"
+    edges = [*zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    if any(_cross(*one, *other) for one, other in combinations(edges, 2)):
+        return "its edges cross: list the corners in their order around it"
+    if cv2.contourArea(corners) < 1:
+        return "its area is less than a pixel: its corners are on a line"
+    if size is None:
+        return ""
+    pixels = corners.clip(-1e6, 1e6).round().astype(np.int32)
+    is_inside = cv2.fillPoly(np.zeros(size[::-1], np.uint8), [pixels], 1).any()
+    return "" if is_inside else f"it is outside the frame of {size[0]}x{size[1]} pixels"
+
+
+def _cross(start: np.ndarray, end: np.ndarray, other_start: np.ndarray, other_end: np.ndarray) -> bool:
+    """Whether two line segments cross at a point inside both."""
+
+    def side(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.sign((b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])))
+
+    return (
+        side(other_start, start, end) * side(other_end, start, end) < 0
+        and side(start, other_start, other_end) * side(end, other_start, other_end) < 0
+    )

@@ -1,13 +1,13 @@
 """An MQTT broker: events, the state of each object, and its discovery by Home Assistant.
 
     TOPIC/availability     "online"; "offline" at the end, and as last will if the connection breaks; retained
-    TOPIC/events           each event, as `Reports` makes it
+    TOPIC/events           each event, as `EventMessages` makes it
     TOPIC/objects/NAME     the newest track of an object, with `present`, `zones` and `sent`, as often as the option
                            `rate` says, and as soon as `present` or `zones` changes; retained, and removed if the object
                            ends. NAME is "-" for the object without a name
     homeassistant/binary_sensor/catstream/ID/config     a sensor for each object, and for each object in each zone
 
-All have QoS 1. While the broker is away, events wait for it, and states are left out, as the next one replaces them.
+All have QoS 1. While the broker is away, events wait for it, and states are dropped, as the next one replaces them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import json
 import ssl
 import sys
 import time
+from enum import Enum, auto
 from hashlib import blake2b
 from typing import Any
 from urllib.parse import SplitResult, unquote
@@ -27,11 +28,19 @@ from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame, redacted
-from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split
+from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventMessages, Warnings, reason_of, split
 
 _LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
 _KEEPALIVE = 30  # seconds without a message after which client and broker test whether the other one is there
+_REPLY_SECONDS = 10  # in which a broker accepts or refuses a connection
 _EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a sensor as unavailable, at least
+
+
+class _Link(Enum):
+    CONNECTING = auto()
+    CONNECTED = auto()
+    REFUSED = auto()
+    LOST = auto()
 
 
 class MqttSink:
@@ -42,22 +51,26 @@ class MqttSink:
 
     def __init__(self, place: str, origin: Origin) -> None:
         url = _checked(place)
-        self._topic, self._options, self._reports = unquote(url.path)[1:], origin.options, Reports(place, origin)
+        self._topic, self._options = unquote(url.path)[1:], origin.options
+        self._messages, self._warnings = EventMessages(origin), Warnings(place)
         self._availability = f"{self._topic}/availability"
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
         self._published = self._acknowledged = self.missed = 0
         self._is_away = self._is_back = False  # a broker that is back may have lost what was retained
+        self._link, self._attempted = _Link.CONNECTING, time.monotonic()
         self._client = client = Client(CallbackAPIVersion.VERSION2)
         client.max_queued_messages_set(QUEUED)
         client.reconnect_delay_set(1, _LONGEST_PAUSE)
         client.will_set(self._availability, "offline", qos=1, retain=True)
-        if url.scheme == "mqtts":
+        self._is_tls = url.scheme == "mqtts"
+        if self._is_tls:
             client.tls_set_context(ssl.create_default_context())
         if url.username is not None:
             client.username_pw_set(unquote(url.username), unquote(url.password or ""))
+        client.on_pre_connect = self._connecting
         client.on_connect, client.on_connect_fail = self._connected, self._not_connected
         client.on_disconnect, client.on_publish = self._disconnected, self._was_published
-        client.connect_async(url.hostname or "", url.port or (8883 if url.scheme == "mqtts" else 1883), _KEEPALIVE)
+        client.connect_async(url.hostname or "", url.port or (8883 if self._is_tls else 1883), _KEEPALIVE)
         client.loop_start()
         self._publish(self._availability, "online", retain=True)
 
@@ -68,15 +81,16 @@ class MqttSink:
 
     def write(self, frame: TrackedFrame) -> None:
         """Publish the events of a frame, and the states that have changed or are due."""
+        self._check_link()
         if self._is_back:
             self._is_back = False
             self._publish(self._availability, "online", retain=True)
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
-        for body in self._reports.update(frame.tracks):
+        for body in self._messages.update(frame.tracks):
             self._publish(f"{self._topic}/events", body)
-        now, status_of = time.monotonic(), self._reports.events.status
+        now, status_of = time.monotonic(), self._messages.events.status
         for track in frame.tracks:
             if track.object not in self._sent:
                 self._announce(track.object)
@@ -95,7 +109,7 @@ class MqttSink:
 
     def close(self) -> None:
         """Publish the last events; wait some seconds until the broker has everything, and warn about what it missed."""
-        for body in self._reports.close():
+        for body in self._messages.close():
             self._publish(f"{self._topic}/events", body)
         for name in [*self._sent]:
             self._remove(name)
@@ -108,7 +122,7 @@ class MqttSink:
             self._client.loop_stop()
         self.missed += self._published - self._acknowledged
         if self.missed:
-            self._reports.tell(f"the broker has not received {counted(self.missed, 'message')}")
+            self._warnings.log(f"the broker has not received {counted(self.missed, 'message')}")
 
     def _publish(self, topic: str, payload: bytes | str, *, retain: bool = False) -> None:
         if self._client.publish(topic, payload, 1, retain).rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:
@@ -143,25 +157,36 @@ class MqttSink:
             topic = f"homeassistant/binary_sensor/catstream/{number}/config"
             self._publish(topic, b"" if ended else json.dumps(config), retain=True)
 
+    def _check_link(self) -> None:
+        if self._link is _Link.CONNECTED:
+            self._warnings.working()
+        elif self._link is _Link.CONNECTING and time.monotonic() - self._attempted > _REPLY_SECONDS:
+            self._warnings.failed(f"no reply within {_REPLY_SECONDS} s, it may not be an MQTT broker")
+
     # Called by paho, in its thread.
+
+    def _connecting(self, *_: object) -> None:
+        self._link, self._attempted = _Link.CONNECTING, time.monotonic()
 
     def _connected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
         if reason.is_failure:
-            self._leave(f"the broker refuses the connection ({reason})")
+            self._lose(_Link.REFUSED, f"the broker refuses the connection ({reason})")
         else:
-            self._is_back, self._is_away = self._is_away, False
-            self._reports.warn("")
+            self._link, self._is_back, self._is_away = _Link.CONNECTED, self._is_away, False
 
     def _not_connected(self, _: Client, __: object) -> None:
-        self._leave(f"no connection ({sys.exception()})")
+        self._lose(_Link.LOST, f"no connection ({reason_of(sys.exception())})")
 
     def _disconnected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
-        if reason.is_failure:
-            self._leave(f"the connection was lost ({reason})")
+        if reason.is_failure and self._link is _Link.CONNECTING:
+            other = "mqtt:// without TLS" if self._is_tls else "mqtts:// with TLS"
+            self._lose(_Link.LOST, f"no MQTT reply: not an MQTT broker, another port, or {other}")
+        elif reason.is_failure and self._link is _Link.CONNECTED:
+            self._lose(_Link.LOST, f"the connection was lost ({reason})")
 
-    def _leave(self, why: str) -> None:
-        self._is_away = True
-        self._reports.warn(f"{why}, it is tried again")
+    def _lose(self, link: _Link, problem: str) -> None:
+        self._link, self._is_away = link, True
+        self._warnings.failed(f"{problem}; reconnecting")
 
     def _was_published(self, *_: object) -> None:
         self._acknowledged += 1

@@ -2,7 +2,8 @@
 
 They are pushed by a process of its own, because FFmpeg blocks all threads of a process while a server does not answer.
 It is this module, run with `-m`: it reads the address, the endpoint and the folder of the keys from standard input,
-and writes a byte for each picture that the server took. The pipeline makes pictures for it only while it is connected.
+and writes a byte for each picture that the server accepted. The stream needs the size of a picture, so the first one
+is awaited before the first attempt to connect. From then on, the pipeline makes pictures only while it is connected.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Generator
+from contextlib import closing, suppress
+from itertools import chain
 from threading import Thread
 from time import monotonic, sleep
 from typing import IO, cast
@@ -28,26 +30,27 @@ from catstream.errors import CatstreamError, SilenceError, VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, redacted
-from catstream.sinks.reports import Warnings, split
+from catstream.sinks.remote import Warnings, reason_of, split
 from catstream.sinks.video_sink import DrawnPictures
-from catstream.video.writer import LiveWriter
+from catstream.video.writer import VideoWriter
 
 _LATE_SECONDS = 2.0  # without a picture, after which the frames that pass are missed
-_STUCK_SECONDS = 15  # in which a server has to take a picture
+_STUCK_SECONDS = 15  # in which a server has to accept a connection or a picture
 _PAUSE_SECONDS = 2.0  # between two attempts to connect
+_RATE = 10  # pictures per second that a pipeline sends at most
 _REPEAT_SECONDS = 1.0  # without a track, after which the last picture is sent again: servers drop a silent stream
 
 
 class StreamSink:
-    """Starts the process, starts it again if it dies, and counts.
+    """Starts the process, restarts it if it dies, and counts the frames that it misses.
 
-    missed  frames that passed while the server took no picture, because it was away or slow
+    missed  frames that passed while the server accepted no picture, because it was away or slow
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._origin, self.missed = place, origin, 0
+        self._place, self._origin, self._warnings, self.missed = place, origin, Warnings(place), 0
         self._frame = -1  # the last one
-        self._taken = 0.0  # when the server took the last picture, as far as it is known
+        self._accepted = 0.0  # newest moment at which the server is known to have accepted a picture
         self._start()
 
     @staticmethod
@@ -60,12 +63,15 @@ class StreamSink:
     def write(self, frame: TrackedFrame) -> None:
         """Count the frame if it is missed; the process receives the tracks from the pipeline itself."""
         if self._process.poll() and monotonic() - self._started > _PAUSE_SECONDS:
+            is_stuck = self._process.returncode == -signal.SIGALRM
+            self._warnings.failed(f"{f'no data accepted for {_STUCK_SECONDS} s' if is_stuck else 'died'}; reconnecting")
             self._stop()
             self._start()
         with suppress(BlockingIOError):
             if os.read(self._output, 4096):
-                self._taken = monotonic()
-        if frame.number != self._frame and monotonic() - self._taken > _LATE_SECONDS:
+                self._accepted = monotonic()
+                self._warnings.working()
+        if frame.number != self._frame and monotonic() - self._accepted > _LATE_SECONDS:
             self.missed += 1
         self._frame = frame.number
 
@@ -73,7 +79,7 @@ class StreamSink:
         """End the process, and warn about what the server missed."""
         self._stop()
         if self.missed:
-            Warnings(self._place).tell(f"{counted(self.missed, 'frame')} passed while it was away or slow")
+            self._warnings.log(f"{counted(self.missed, 'frame')} passed while it was away or slow")
 
     def _start(self) -> None:
         self._started = monotonic()
@@ -95,52 +101,50 @@ class StreamSink:
 
 
 def push(place: str, origin: Origin) -> None:
-    """Push to one place until the pipeline ends; connect again and again, and warn once of each problem."""
-    url, warnings = urlsplit(place), Warnings(place)
-    address = url.hostname or "", url.port or (554 if url.scheme == "rtsp" else 1935)
-    while True:
+    """Push to a server until the pipeline ends; reconnect if the connection fails."""
+    warnings, url = Warnings(place), urlsplit(place)
+    with closing(_pictures(origin)) as pictures:
+        image = next(pictures, None)
+    while image is not None:
+        signal.alarm(_STUCK_SECONDS)  # which kills this process
         try:
-            socket.create_connection(address, _STUCK_SECONDS).close()  # no picture is made for one that is away
-            return _push(place, origin, warnings)
+            socket.getaddrinfo(url.hostname, None)  # FFmpeg does not say that a host is unknown
+            with (
+                closing(VideoWriter(place, _RATE, (image.shape[1], image.shape[0]))) as stream,
+                closing(_pictures(origin, image)) as pictures,
+            ):
+                for picture in chain([image], pictures):
+                    signal.alarm(_STUCK_SECONDS)
+                    stream.write(picture, monotonic())
+                    signal.alarm(0)
+                    warnings.working()
+                    with suppress(BlockingIOError):  # nobody reads while no track arrives
+                        os.write(1, b".")
+            return
         except (OSError, CatstreamError) as error:
-            warnings.warn(f"not connected ({getattr(error, 'strerror', None) or error}), it is tried again")
+            signal.alarm(0)
+            warnings.failed(f"not connected ({reason_of(error.__cause__ or error)}); reconnecting")
         sleep(_PAUSE_SECONDS)
 
 
-def _push(place: str, origin: Origin, warnings: Warnings) -> None:
-    """Connect with the first picture, and push until the pipeline ends; VideoError if the server takes no more."""
+def _pictures(origin: Origin, image: np.ndarray | None = None) -> Generator[np.ndarray]:
+    """Yield each picture until the pipeline ends, and while no tracks arrive the last one again, `image` at first."""
     with (
         Subscription[Track](origin.endpoint, "tracks", timeout=_REPEAT_SECONDS, keys=origin.keys) as tracks,
         closing(DrawnPictures(origin)) as pictures,
-        ExitStack() as stack,
     ):
-        stream: LiveWriter | None = None
-        for image in _images(tracks, pictures):
-            signal.alarm(_STUCK_SECONDS)  # which kills this process
-            if stream is None:
-                stream = stack.enter_context(closing(LiveWriter(place, (image.shape[1], image.shape[0]))))
-            stream.write(image)
-            signal.alarm(0)
-            warnings.warn("")
-            with suppress(BlockingIOError):  # nobody reads while no track arrives
-                os.write(1, b".")
-
-
-def _images(tracks: Subscription[Track], pictures: DrawnPictures) -> Iterator[np.ndarray]:
-    """Yield each picture, and the last one again while no tracks arrive, until the pipeline ends."""
-    image = None
-    while True:
-        try:
-            track = next(tracks, None)
-        except SilenceError:
-            if image is not None:
+        while True:
+            try:
+                track = next(tracks, None)
+            except SilenceError:
+                if image is not None:
+                    yield image
+                continue
+            if track is None:
+                return
+            if (drawn := pictures.update(TrackedFrame([track]))) is not None:
+                image = drawn[0]
                 yield image
-            continue
-        if track is None:
-            return
-        if (drawn := pictures.take(TrackedFrame([track]))) is not None:
-            image = drawn[0]
-            yield image
 
 
 def _end_with_parent() -> None:

@@ -15,7 +15,7 @@ from catstream.video.frames import RATE
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
 
-_KEPT_FRAMES = 256  # whose tracks wait for their picture
+_BACKLOG = 256  # frames whose tracks wait for their picture
 
 
 def open_video(place: str, origin: Origin) -> Sink:
@@ -24,7 +24,7 @@ def open_video(place: str, origin: Origin) -> Sink:
 
 
 class SourceVideo:
-    """An MP4 of the frames that have a track, with their tracks drawn in; it gets its name when it is closed."""
+    """An MP4 of the frames that have a track, with their tracks drawn in."""
 
     last = -1  # when a run is resumed, the video is drawn again from the first frame
 
@@ -42,9 +42,9 @@ class SourceVideo:
             raise
 
     def write(self, frame: TrackedFrame) -> None:
-        image = next((each.image for each in self._frames if each.number == frame.number), None)
+        image = next((source.image for source in self._frames if source.number == frame.number), None)
         if image is None:
-            raise VideoError(f"the source has no frame {frame.number}: give the one that the pipeline tracks")
+            raise VideoError(f"the source has no frame {frame.number}: pass the source that the pipeline tracks")
         self._colours.keep(track.object for track in frame.tracks)
         self._video.write(draw(image, frame.tracks, self._colours), frame.tracks[0].time)
 
@@ -62,10 +62,13 @@ class DrawnPictures:
         self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
         self._colours = Colours()
 
-    def take(self, frame: TrackedFrame) -> tuple[np.ndarray, float] | None:
-        """Keep the tracks; return a picture whose frame is over, uint8 (h, w, 3) BGR, and its time, if there is one."""
+    def update(self, frame: TrackedFrame) -> tuple[np.ndarray, float] | None:
+        """Add tracks; return the next picture whose frame has all its tracks, uint8 (h, w, 3) BGR, and its time.
+
+        None if there is none yet.
+        """
         self._tracks.setdefault(frame.number, []).extend(frame.tracks)
-        if len(self._tracks) > _KEPT_FRAMES:
+        if len(self._tracks) > _BACKLOG:
             del self._tracks[next(iter(self._tracks))]
         if self._picture is None:
             with suppress(SilenceError):
@@ -81,7 +84,7 @@ class DrawnPictures:
         return image, tracks[0].time
 
     def close(self) -> None:
-        """Receive no more pictures: the pipeline makes none if nobody does."""
+        """Unsubscribe: the pipeline makes no pictures without a subscriber."""
         self._previews.close()
 
 
@@ -93,7 +96,7 @@ class PictureVideo:
         self._video: VideoWriter | None = None
 
     def write(self, frame: TrackedFrame) -> None:
-        if (drawn := self._pictures.take(frame)) is not None:
+        if (drawn := self._pictures.update(frame)) is not None:
             image, time = drawn
             self._video = self._video or VideoWriter(self._place, RATE, (image.shape[1], image.shape[0]))
             self._video.write(image, time)

@@ -1,15 +1,18 @@
 """A webhook: each event as JSON, by POST to an address of the user's.
 
-The body is that of `Reports`. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256 of the
-body in hexadecimal digits. After an answer 408, 425, 429 or 5xx, or none, an event is sent again with the same `id`,
-and the events behind it wait. Any other answer but 2xx refuses it.
+The body is that of `EventMessages`. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256 of
+the body in hexadecimal digits. After an answer 408, 425, 429 or 5xx, or none, an event is sent again with the same
+`id`, not before `Retry-After`, and the events behind it wait. Any other answer but 2xx refuses it.
 """
 
 from __future__ import annotations
 
 import hmac
+import time
 from base64 import b64encode
-from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from contextlib import suppress
+from email.utils import parsedate_to_datetime
+from http.client import HTTPConnection, HTTPException, HTTPSConnection, responses
 from queue import SimpleQueue
 from threading import Event, Thread
 from urllib.parse import unquote, urlunsplit
@@ -18,11 +21,12 @@ from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks.destinations import Origin, TrackedFrame
-from catstream.sinks.reports import CLOSE_SECONDS, QUEUED, Reports, split
+from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventMessages, Warnings, reason_of, split
 
 _FORM = "https://[USER:PASSWORD@]HOST[:PORT]/PATH"
 _TIMEOUT = 10.0  # seconds for a connection, and for an answer
 _PAUSE, _LONGEST_PAUSE = 1.0, 60.0  # seconds before an event is sent again, doubled each time
+_LONGEST_RETRY_AFTER = 600.0  # seconds that a receiver may ask to wait
 _AGAIN = {0, 408, 425, 429, *range(500, 600)}  # answers after which it is; 0 for none
 
 
@@ -34,10 +38,11 @@ class Webhook:
 
     def __init__(self, place: str, origin: Origin) -> None:
         self._url, self._key = split(place, _FORM), _key(origin.options)
-        self._reports = Reports(place, origin)
+        self._messages, self._warnings = EventMessages(origin), Warnings(place)
         self._bodies: SimpleQueue[bytes | None] = SimpleQueue()
         self._events = self._delivered = self.missed = 0
         self._hurry, self._closed = Event(), False  # the event ends a pause
+        self._retry_after, self._is_working = 0.0, False  # what the last answer says
         self._thread = Thread(target=self._deliver_all, name="webhook", daemon=True)
         self._thread.start()
 
@@ -48,11 +53,14 @@ class Webhook:
         _key(options)
 
     def write(self, frame: TrackedFrame) -> None:
-        self._queue(self._reports.update(frame.tracks))
+        """Queue the events of a frame."""
+        if self._is_working:
+            self._warnings.working()
+        self._queue(self._messages.update(frame.tracks))
 
     def close(self) -> None:
         """Queue the last events, and deliver for some seconds what waits; warn about what was missed."""
-        self._queue(self._reports.close())
+        self._queue(self._messages.close())
         self._bodies.put(None)
         self._hurry.set()
         self._thread.join(CLOSE_SECONDS)
@@ -60,7 +68,7 @@ class Webhook:
         self._hurry.set()
         self.missed = self._events - self._delivered
         if self.missed:
-            self._reports.tell(f"{counted(self.missed, 'event')} of {self._events} were not delivered")
+            self._warnings.log(f"{counted(self.missed, 'event')} of {self._events} were not delivered")
 
     def _queue(self, bodies: list[bytes]) -> None:
         for body in bodies:
@@ -75,7 +83,8 @@ class Webhook:
             while (status := self._post(body)) in _AGAIN:
                 if self._closed:
                     return
-                pause = _PAUSE if self._hurry.wait(pause) else min(2 * pause, _LONGEST_PAUSE)
+                is_closing = self._hurry.wait(max(pause, self._retry_after))
+                pause = _PAUSE if is_closing else min(2 * pause, _LONGEST_PAUSE)
                 self._hurry.clear()
             self._delivered += status // 100 == 2
 
@@ -89,21 +98,39 @@ class Webhook:
             headers["X-Catstream-Signature"] = f"sha256={hmac.digest(self._key, body, 'sha256').hex()}"
         kind = HTTPSConnection if url.scheme == "https" else HTTPConnection
         connection = kind(url.hostname or "", url.port, timeout=_TIMEOUT)
+        status, problem = 0, ""
         try:
             connection.request("POST", urlunsplit(("", "", url.path or "/", url.query, "")), body, headers)
             answer = connection.getresponse()
+            status, self._retry_after = answer.status, _seconds(answer.getheader("Retry-After", ""))
+            if status // 100 != 2:
+                problem = f"answered {status} {responses.get(status, '')}"
         except (OSError, HTTPException) as error:
-            self._reports.warn(f"no answer ({error}), events wait and are sent again")
-            return 0
+            self._retry_after, problem = 0.0, f"no answer ({reason_of(error)})"
         finally:
             connection.close()
-        again = "events wait and are sent again" if answer.status in _AGAIN else "the event is not sent again"
-        self._reports.warn("" if answer.status // 100 == 2 else f"answered {answer.status} {answer.reason}, {again}")
-        return answer.status
+        self._is_working = not problem
+        if problem:
+            retried = status in _AGAIN
+            self._warnings.failed(f"{problem}; {'retrying' if retried else 'the event is not sent again'}")
+        return status
+
+
+def _seconds(retry_after: str) -> float:
+    """Return the seconds that a header `Retry-After` states, as a number or a date; 0 if it is not valid.
+
+    >>> _seconds("120"), _seconds("Fri, 31 Dec 9999 23:59:59 GMT"), _seconds("soon")
+    (120.0, 600.0, 0.0)
+    """
+    seconds = 0.0
+    with suppress(ValueError, OverflowError):
+        is_number = retry_after.strip().isdecimal()
+        seconds = float(retry_after) if is_number else parsedate_to_datetime(retry_after).timestamp() - time.time()
+    return min(max(seconds, 0.0), _LONGEST_RETRY_AFTER)
 
 
 def _key(options: SinkOptions) -> bytes:
-    """The key; empty to sign nothing."""
+    """Return the key; empty to sign nothing."""
     if options.key is None:
         return b""
     try:
@@ -111,5 +138,5 @@ def _key(options: SinkOptions) -> bytes:
     except OSError as error:
         raise VideoError(f"cannot read the key {options.key}: {error.strerror}") from None
     if not key:
-        raise VideoError(f"{options.key} is empty: write the key that the receiver has, too")
+        raise VideoError(f"{options.key} is empty: write the key of the receiver to it")
     return key

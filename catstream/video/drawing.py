@@ -1,4 +1,4 @@
-"""Draws tracks over their frames, for people to look at, and gives each object a colour."""
+"""Draws tracks over their frames, and assigns each object a colour."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _TEXT_HEIGHT, _MIN_UNIT = 26, 0.75
 
 
 class Colours:
-    """Gives each object a colour, which does not change until the object is dropped.
+    """Assigns each object a colour, which does not change until the object is dropped.
 
-    An object gets the first of the colours that the fewest objects have.
+    A new object gets the first of the least used colours.
 
     Examples
     --------
@@ -59,19 +59,18 @@ class Colours:
         return self._colours[name]
 
     def keep(self, names: Iterable[str]) -> None:
-        """Drop all objects except these; their colours may be given again."""
-        kept = set(names)
-        self._colours = {name: colour for name, colour in self._colours.items() if name in kept}
+        """Drop all objects except these; new objects reuse their colours."""
+        self._colours = {name: self._colours[name] for name in self._colours.keys() & set(names)}
 
 
 def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.ndarray:
     """Draw the boxes over a copy of a frame, and a line of text below it.
 
-    An object that is alone and has no name is drawn in the colour of its state. Other objects have a colour each and
-    their names at their boxes. Their scores are below the frame.
+    An object that is alone and has no name is drawn in the colour of its state. Otherwise each object has its own
+    colour, and its name at its box. The scores are below the frame.
 
     The image is uint8 (h, w, 3), blue green red, the result uint8 (h + k, w, 3) with k rows for the text. There is at
-    least one track; the colours are kept from frame to frame.
+    least one track; `colours` has those of the frames before.
     """
     height, width = image.shape[:2]
     unit = max(width / 640, _MIN_UNIT)
@@ -180,7 +179,7 @@ def _write(canvas: np.ndarray, text: str, left: int, unit: float) -> None:
 
 def _draw_scores(canvas: np.ndarray, drawn: Sequence[tuple[Track, _Colour]], unit: float) -> None:
     """Write the name and score of each object, with a ring in place of the disc if it is absent, and the frame number;
-    if there is not enough room, the number of objects that are left out. An object without a name has its state."""
+    if there is not enough room, the number of omitted objects. An object without a name has its state."""
     width = canvas.shape[1]
     canvas[:] = _DARK
     middle, gap, left = canvas.shape[0] // 2, round(12 * unit), round(8 * unit)

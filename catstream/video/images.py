@@ -21,7 +21,7 @@ IMAGES = {f".{suffix}" for suffix in _IMAGES.split()}
 _PAGED = {".tif", ".tiff", ".webp"}
 _BATCH = 32  # pages of a file that are decoded together
 _ANY = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
-EXPECTED = "give a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
+EXPECTED = "pass a video file, a folder of images, a pattern like images/%05d.png, or rtsp:// and http:// for a stream"
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ def image_files(path: Path) -> list[Path]:
     files = [file for file in files if not file.name.startswith(".")]
     if not files:
         kinds = ", ".join(sorted(suffix[1:] for suffix in IMAGES))
-        raise VideoError(f"there are no images at {str(path)!r}: {EXPECTED} (images are {kinds})")
+        raise VideoError(f"no images at {str(path)!r}: {EXPECTED} (images are {kinds})")
     return sorted(files, key=natural_order)
 
 
@@ -54,7 +54,7 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
 
 
 def pages_of(path: Path) -> list[tuple[Path, int]]:
-    """Return the pages of an image file; an empty list if it is none, or FFmpeg has to read it."""
+    """Return the pages of an image file; an empty list if it is no image, or FFmpeg has to read it."""
     suffix = path.suffix.lower()
     count = _page_count(path) if suffix in IMAGES else 0
     return [(path, page) for page in range(count)] if count == 1 or suffix in _PAGED else []
@@ -64,7 +64,7 @@ def first_pages(files: list[Path]) -> list[tuple[Path, int]]:
     """Return the first page of each file, and log once that there are more."""
     if (count := _page_count(files[0])) > 1:
         _log.warning(
-            "%s has %d pages, of which only the first is read in a folder: give the file itself", files[0], count
+            "%s has %d pages, of which only the first is read in a folder: pass the file itself", files[0], count
         )
     return [(file, 0) for file in files]
 

@@ -1,8 +1,8 @@
 """The demo video as a live source, `demo:SEED`, which needs no camera and never ends.
 
 It has 320 x 240 pixels, and `run.image_rate` frames per second. The seed is a number: it selects the sensor noise. Five
-seconds of the video are shown forwards, backwards, and so on; their images are rendered when they are due for the first
-time, and kept in memory.
+seconds of the video play forwards, backwards, and so on; an image is rendered when it is due for the first time, and
+cached.
 
 Frames that are not read in time are skipped and counted, as those of a camera. Unlike a camera, the video begins when
 its first frame is read, so the box of `first_box` fits whenever the source is opened. A resumed run begins with the
@@ -59,7 +59,7 @@ class LiveDemo(Source):
     ) -> None:
         self._seed = _seed(text)
         super().__init__(f"demo-{self._seed}", rate, _SIZE)
-        self._images: dict[int, np.ndarray] = {}  # that were rendered, by number
+        self._images: dict[int, np.ndarray] = {}  # rendered ones, by number
         self._start = self._number = start
         self._zero, self._idle = since, idle
         self._opened: float | None = None  # time at which the first frame was read
@@ -76,9 +76,9 @@ class LiveDemo(Source):
             self._image(self._start)
             self._opened = monotonic()
         due = self._opened + (self._last + 1 - self._start) / self.rate
-        while not self._closed.is_set() and (left := due - monotonic()) > 0:
-            self._closed.wait(min(left, _IDLE_SECONDS))
-            if left > _IDLE_SECONDS and self._idle is not None and self._idle():
+        while not self._closed.is_set() and (seconds := due - monotonic()) > 0:
+            self._closed.wait(min(seconds, _IDLE_SECONDS))
+            if seconds > _IDLE_SECONDS and self._idle is not None and self._idle():
                 raise StopIteration
         if self._closed.is_set():
             raise StopIteration
@@ -101,7 +101,7 @@ class LiveDemo(Source):
     def _image(self, number: int) -> np.ndarray:
         """An image of the endless video: forwards, then backwards, and so on."""
         last = _IMAGES - 1
-        shown = last - abs(number % (2 * last) - last)
-        if shown not in self._images:
-            self._images[shown], _ = self._demo.image(_BEGIN + shown)
-        return self._images[shown]
+        index = last - abs(number % (2 * last) - last)
+        if index not in self._images:
+            self._images[index], _ = self._demo.image(_BEGIN + index)
+        return self._images[index]

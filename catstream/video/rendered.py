@@ -37,7 +37,7 @@ _NOISES = 4096  # different images of noise, one after the other
 _ZOOM = 1.5  # enlargement of the photograph of the lake; coordinates below are in the enlarged photograph
 _BEHIND = 280  # the last frame in which the dahlia is behind the pagoda
 
-#: Key frames of the dahlia: frame, centre x and y, diameter, angle in degrees.
+#: Keyframes of the dahlia: frame, centre x and y, diameter, angle in degrees.
 _FLIGHT = np.array(
     [
         (0, 800, 190, 104, 0),
@@ -58,10 +58,10 @@ _FLIGHT = np.array(
     ]
 )
 
-#: Key frames of the distractor, the dahlia of another colour.
+#: Keyframes of the distractor, the dahlia of another colour.
 _DECOY = np.array([(0, 400, 60, 96, 0), (40, 560, 110, 92, 60), (110, 760, 420, 88, 200), (180, 1100, 520, 90, 300)])
 
-#: Key frames of the camera: frame, left and top of the view, brightness relative to the photograph.
+#: Keyframes of the camera: frame, left and top of the view, brightness relative to the photograph.
 _CAMERA = np.array(
     [
         (0, 316, 20, 1.0),
@@ -141,18 +141,18 @@ class Demo:
         left, top, light = self.camera[frame]
         sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # camera shake
         view = np.array([[1, 0, -left - sway[0]], [0, 1, -top - sway[1]]])  # lake -> picture
-        image, front = self.lake.seen(view), cv2.warpAffine(self.pagoda, view, SIZE)
+        image, front = self.lake.crop(view), cv2.warpAffine(self.pagoda, view, SIZE)
 
-        self.decoy.paint(image, self.decoy.turned(self.away[frame], view), 1 - front)
-        turn = self.dahlia.turned(self.flight[frame], view)
-        seen = self.dahlia.paint(image, turn, 1 - front if frame <= _BEHIND else np.ones_like(front))
-        box = self.dahlia.box(turn) if seen >= VISIBLE else None
-        shown, boxes = resized(self.lake.with_noise(image * np.float32(light), number), {UNNAMED: box}, self.size)
-        return shown, boxes[UNNAMED]
+        self.decoy.paint(image, self.decoy.transform(self.away[frame], view), 1 - front)
+        transform = self.dahlia.transform(self.flight[frame], view)
+        visible = self.dahlia.paint(image, transform, 1 - front if frame <= _BEHIND else np.ones_like(front))
+        box = self.dahlia.box(transform) if visible >= VISIBLE else None
+        image, boxes = resized(self.lake.with_noise(image * np.float32(light), number), {UNNAMED: box}, self.size)
+        return image, boxes[UNNAMED]
 
 
 def _interpolate(keys: np.ndarray) -> np.ndarray:
-    """Interpolate key frames to one row for each of `FRAMES` frames, and smooth the changes of direction."""
+    """Interpolate keyframes to one row for each of `FRAMES` frames, and smooth the changes of direction."""
     bend = np.hanning(27)[1:-1]
     frames = np.arange(FRAMES + len(bend) - 1) - len(bend) // 2
     lines = (np.interp(frames, keys[:, 0], column) for column in keys[:, 1:].T)
@@ -181,7 +181,7 @@ class Sprite:
     mask: np.ndarray
     outline: np.ndarray
 
-    def turned(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
+    def transform(self, place: np.ndarray, view: np.ndarray) -> np.ndarray:
         """Return the affine map from the sprite to the picture, float64 (2, 3).
 
         `place` has x and y of the centre in the scene, the size of the whole sprite in pixels, and the angle in
@@ -230,8 +230,8 @@ class Lake:
         self._noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
         self._corners = rng.integers(SIZE[::-1], size=(_NOISES, 2))
 
-    def seen(self, view: np.ndarray) -> np.ndarray:
-        """Return the part of it that the camera sees, float32 (h, w, 3), 0 to 255; `view` maps it to the image."""
+    def crop(self, view: np.ndarray) -> np.ndarray:
+        """Return the part in the field of view, float32 (h, w, 3), 0 to 255; `view` maps it to the image."""
         return cv2.warpAffine(self.picture, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
 
     def with_noise(self, image: np.ndarray, number: int) -> np.ndarray:

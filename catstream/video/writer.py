@@ -1,4 +1,4 @@
-"""Writes videos frame by frame, to a file or to a server."""
+"""Encodes images as H.264, and writes them to an MP4 file or to a streaming server."""
 
 from __future__ import annotations
 
@@ -6,89 +6,147 @@ import contextlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 import cv2
 import numpy as np
 
+from catstream.base.addresses import without_password
 from catstream.errors import VideoError
 
-#: Steps of the video's time base per frame: the precision of time stamps if the frame rate is not constant.
+#: Steps of the time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100
+
+#: Seconds between keyframes, at the average rate: a viewer who joins a live stream waits for one.
+_KEYFRAME_SECONDS = 2
 
 #: The largest image, in pixels, that is encoded with the slower preset: 1920x1080 with a line of text below it.
 _LARGE_PIXELS = 1920 * 1200
 
+#: Format and options of a file: fragments of a second, which `close` turns into a regular MP4 with one index.
+_FILE = "mp4", {"movflags": "hybrid_fragmented", "frag_duration": "1000000", "flush_packets": "1"}
 
-class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
-    """Writes an MP4; a context manager, which leaves no file if an error or Ctrl-C ends its block.
+#: Those of a server, by protocol. RTSP over TCP passes firewalls and loses nothing; its timeout is in microseconds.
+_SERVERS: dict[str, tuple[str, dict[str, str]]] = {
+    "rtsp": ("rtsp", {"rtsp_transport": "tcp", "timeout": "3000000"}),
+    "rtmp": ("flv", {}),
+}
 
-    The codec is H.264 if this FFmpeg has it, else MPEG-4. The file is NAME.part until it is closed. If no frame was
-    written, or writing failed, no file is left: an MP4 without its index cannot be read.
 
-    The rate is the average of frames per second. VideoError, also from the constructor, if the file cannot be written.
+class Encoder:
+    """Encodes images as H.264 without delay: each image results in one packet, which refers to the one before it.
+
+    Packets are for the PyAV output `container`, which gets a stream; without one, they are access units in Annex B
+    format. `rate` is the average of frames per second, `size` the width and height of the images. VideoError if this
+    FFmpeg has no encoder.
     """
 
     def __init__(
-        self, path: str | Path, rate: float, size: tuple[int, int], *, pixel_aspect: Fraction = Fraction(1)
+        self, size: tuple[int, int], rate: float, container: Any = None, *, pixel_aspect: Fraction = Fraction(1)
     ) -> None:
         import av  # imported here because only the writing of videos needs it
 
-        self.path = Path(path)
-        self.frames = 0
+        if "libx264" not in av.codecs_available:
+            raise VideoError("PyAV lacks the H.264 encoder libx264: pip install --force-reinstall av")
         self._rate = Fraction(rate).limit_denominator(1001) or Fraction(1, 1001)
-        self._first_time = 0.0
-        self._last_tick = -1
-        self._part = self.path.with_name(self.path.name + ".part")
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._container = av.open(str(self._part.absolute()), "w", format="mp4")
-        except (OSError, av.FFmpegError) as error:
-            raise VideoError(
-                f"cannot write the video {str(path)!r} ({error.strerror}): give a path that you may write to"
-            ) from None
-        h264 = "libx264" in av.codecs_available
-        # Large images use the faster preset: at 3840x2160 it encodes twice as many frames per second.
-        preset = "veryfast" if size[0] * size[1] <= _LARGE_PIXELS else "ultrafast"
-        self._stream: Any = self._container.add_stream(
-            "libx264" if h264 else "mpeg4",
-            rate=self._rate,
-            options={"preset": preset, "crf": "20"} if h264 else {"qscale": "3"},
-        )
-        self._stream.codec_context.time_base = 1 / (self._rate * _TICKS_PER_FRAME)
-        self._stream.thread_count = 1  # the processes of the pipeline already use the cores
-        self._stream.pix_fmt = "yuv420p"
-        # Both encoders subsample colour by 2x2 pixels, so an odd side is padded by one pixel.
-        self._stream.width, self._stream.height = (side + side % 2 for side in size)
-        self._stream.codec_context.sample_aspect_ratio = pixel_aspect
+        self._first_time, self._last_tick = 0.0, -1
+        if container is None:
+            self._context: Any = av.CodecContext.create("libx264", "w")
+            self._encode = self._context.encode
+        else:
+            stream = container.add_stream("libx264", rate=self._rate)
+            self._context, self._encode = stream.codec_context, stream.encode
+        self._context.framerate, self._context.time_base = self._rate, 1 / (self._rate * _TICKS_PER_FRAME)
+        # Colour is subsampled by 2x2 pixels, so an odd side is padded by one pixel.
+        self._context.width, self._context.height = (side + side % 2 for side in size)
+        self._context.pix_fmt, self._context.sample_aspect_ratio = "yuv420p", pixel_aspect
+        self._context.thread_count = 1  # the processes of the pipeline already use the cores
+        self._context.options = {
+            # At 3840x2160, the faster preset encodes twice as many frames per second.
+            "preset": "veryfast" if size[0] * size[1] <= _LARGE_PIXELS else "ultrafast",
+            "tune": "zerolatency",
+            "crf": "22",
+            "g": str(max(1, round(_KEYFRAME_SECONDS * self._rate))),
+        }
+
+    def packets(self, image: np.ndarray, time: float | None = None) -> list[Any]:
+        """Return the packets of an image, uint8 (h, w, 3), blue green red.
+
+        The first `time`, in seconds, is the start of the stream; without times, the rate is constant.
+        """
+        import av
+
+        is_first = self._last_tick < 0
+        if time is None:
+            tick = self._last_tick + (1 if is_first else _TICKS_PER_FRAME)
+        else:
+            self._first_time = time if is_first else self._first_time
+            tick = round((time - self._first_time) * self._rate * _TICKS_PER_FRAME)
+        self._last_tick = max(self._last_tick + 1, tick)  # ticks must increase, even if the times do not
+        down, across = self._context.height - image.shape[0], self._context.width - image.shape[1]
+        even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
+        frame = av.VideoFrame.from_ndarray(even, format="bgr24")
+        frame.pts, frame.time_base = self._last_tick, self._context.time_base
+        return list(self._encode(frame))
+
+    def flush(self) -> list[Any]:
+        """Return the last packets."""
+        return list(self._encode(None))
+
+
+class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
+    """Writes images as H.264 to an MP4 file, or to an RTSP or RTMP server.
+
+    A file grows in fragments of a second: if the process is killed or the disk is full, it is readable up to there.
+    Its folder is made. A file without a frame is removed, and so is one whose `with` block is left by an error or
+    Ctrl-C.
+
+    FFmpeg blocks all threads of the process while it connects to a server, and `write` blocks while the server is slow.
+
+    target : path of a file, or address of a server
+    rate : average of frames per second
+    size : width and height of the images in pixels
+
+    VideoError, also from the constructor, if the target cannot be written to.
+    """
+
+    def __init__(
+        self, target: str | Path, rate: float, size: tuple[int, int], *, pixel_aspect: Fraction = Fraction(1)
+    ) -> None:
+        import av
+
+        self._target, self.frames, self._has_failed = str(target), 0, False
+        server = _SERVERS.get(self._target.partition("://")[0])
+        self._path = None if server else Path(target).absolute()
+        form, options = server or _FILE
+        with self._reporting_errors():
+            if self._path is not None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._container: Any = av.open(str(self._path or target), "w", format=form, container_options=options)
+            self._encoder = Encoder(size, rate, self._container, pixel_aspect=pixel_aspect)
+            if self._path is None:  # a file without a frame has no header: FFmpeg crashes if it completes one
+                self._container.start_encoding()
 
     def write(self, image: np.ndarray, time: float | None = None) -> None:
-        """Add a frame, uint8 (h, w, 3), blue green red, of the size given to the constructor.
-
-        The first time stamp, in seconds of the source, is the start of the video. Without them, the rate is constant.
-        """
-        time = self.frames / float(self._rate) if time is None else time
-        self._first_time = self._first_time if self.frames else time
-        # Time stamps must increase, even if those of the source do not.
-        self._last_tick = max(self._last_tick + 1, round((time - self._first_time) * self._rate * _TICKS_PER_FRAME))
-        frame = _frame(image, self._stream, self._last_tick)
+        """Add a frame, uint8 (h, w, 3), blue green red, of the size given to the constructor; times as in `Encoder`."""
         with self._reporting_errors():
-            self._container.mux(self._stream.encode(frame))
+            self._container.mux(self._encoder.packets(image, time))
         self.frames += 1
 
     def close(self) -> None:
-        """Finish the file and give it its final name."""
+        """Complete the file, or disconnect."""
         try:
             with self._reporting_errors():
-                with self._container:
-                    if self.frames:
-                        self._container.mux(self._stream.encode(None))
-                if self.frames:
-                    self._part.replace(self.path)
+                if self.frames and not self._has_failed:  # a failed container crashes the process
+                    self._container.mux(self._encoder.flush())
+                self._container.close()
+        except VideoError:
+            if self._path is not None:
+                raise
         finally:
-            with contextlib.suppress(OSError):  # the disk may have become read-only
-                self._part.unlink(missing_ok=True)
+            if self._path is not None and not self.frames:
+                with contextlib.suppress(OSError):  # the disk may have become read-only
+                    self._path.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def _reporting_errors(self) -> Iterator[None]:
@@ -97,62 +155,10 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         try:
             yield
         except (OSError, av.FFmpegError) as error:
-            self.frames = 0  # the file is unreadable; writing more to it would crash the process
-            raise VideoError(f"cannot write the video {str(self.path)!r} any more: {error.strerror}") from None
+            self._has_failed = True
+            raise VideoError(f"cannot write the video {without_password(self._target)}: {error.strerror}") from error
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             self.frames = 0
         self.close()
-
-
-class LiveWriter:
-    """Pushes pictures to an RTSP or RTMP server as H.264, each at the time at which it is written; close it.
-
-    FFmpeg blocks all threads of the process while it connects to a server, and `write` blocks while the server is slow.
-    VideoError from the constructor if this FFmpeg has no encoder, from `write` if the server does not take a picture.
-    """
-
-    def __init__(self, address: str, size: tuple[int, int]) -> None:
-        import av
-
-        if "libx264" not in av.codecs_available:
-            raise VideoError("this FFmpeg has no encoder for H.264: install the package av from PyPI")
-        rtsp = address.startswith("rtsp")
-        # TCP, which passes firewalls and loses nothing; the time-out is in microseconds.
-        options = {"rtsp_transport": "tcp", "timeout": "3000000"} if rtsp else {}
-        self._container = av.open(address, "w", format="rtsp" if rtsp else "flv", container_options=options)
-        # A key frame in every 20 pictures: a viewer who joins waits for one.
-        encoding = {"preset": "veryfast", "tune": "zerolatency", "crf": "23", "g": "20"}
-        self._stream: Any = self._container.add_stream("libx264", rate=10, options=encoding)
-        self._stream.codec_context.time_base = Fraction(1, 1000)
-        self._stream.thread_count, self._stream.pix_fmt = 1, "yuv420p"
-        self._stream.width, self._stream.height = (side + side % 2 for side in size)
-        self._started, self._last_tick = monotonic(), -1
-
-    def write(self, image: np.ndarray) -> None:
-        """Push a picture, uint8 (h, w, 3), blue green red, of the size given to the constructor."""
-        import av
-
-        self._last_tick = max(self._last_tick + 1, round(1000 * (monotonic() - self._started)))
-        try:
-            self._container.mux(self._stream.encode(_frame(image, self._stream, self._last_tick)))
-        except (OSError, av.FFmpegError) as error:
-            raise VideoError((error.strerror or str(error)).lower()) from None
-
-    def close(self) -> None:
-        import av
-
-        with contextlib.suppress(OSError, av.FFmpegError):
-            self._container.close()
-
-
-def _frame(image: np.ndarray, stream: Any, tick: int) -> Any:
-    """Return an image as a frame of a stream, at this tick of its time base. An odd side is padded by one pixel."""
-    import av
-
-    down, across = stream.height - image.shape[0], stream.width - image.shape[1]
-    even: Any = cv2.copyMakeBorder(image, 0, down, 0, across, cv2.BORDER_REPLICATE)
-    frame = av.VideoFrame.from_ndarray(even, format="bgr24")
-    frame.pts, frame.time_base = tick, stream.codec_context.time_base
-    return frame

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from catstream.errors import ServiceError
+from catstream.errors import VideoError
 from catstream.loadtest import camera, crowd
 from catstream.loadtest.camera import Broadcast, Schedule
 from catstream.loadtest.rtsp import due_time, encode
@@ -64,7 +64,7 @@ def test_the_same_is_true_of_h264_over_rtsp(monkeypatch, ahead):
 
 def test_h264_without_an_encoder_is_an_error(monkeypatch):
     monkeypatch.setattr("av.codecs_available", set())
-    with pytest.raises(ServiceError, match="--source mjpeg"):
+    with pytest.raises(VideoError, match="PyAV lacks"):
         encode(GREYS, SIZE, lambda _: None)
 
 

@@ -5,9 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.base.box import Box
+from catstream.errors import SettingsError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.sinks.events import Events
+from catstream.sinks.events import Events, check_zones
 
 #: A square of x and y from 40 to 60.
 DOOR = {"door": ((40, 40), (60, 40), (60, 60), (40, 60))}
@@ -37,8 +38,20 @@ def told(events):
         ("1345", ["0 found", "2 entered door", "3 left door", "3 ended"]),  # it ended there
         ("4371", ["0 found", "0 entered door", "3 left door", "3 ended"]),  # 3 and 7 are within the margin
         ("3737", ["0 found", "3 ended"]),  # it never was in the zone
-        ("5...5", ["0 found", "0 entered door", "3 lost", "4 returned", "4 left door", "4 ended"]),
-        ("5...1", ["0 found", "0 entered door", "3 lost", "4 returned", "4 left door", "4 ended"]),
+        (
+            "5...5",
+            [
+                "0 found",
+                "0 entered door",
+                "3 left door",
+                "3 lost",
+                "4 returned",
+                "4 entered door",
+                "4 left door",
+                "4 ended",
+            ],
+        ),
+        ("5...1", ["0 found", "0 entered door", "3 left door", "3 lost", "4 returned", "4 ended"]),
     ],
 )
 def test_a_history_of_an_object(history, expected):
@@ -85,7 +98,7 @@ def test_status_is_what_the_events_have_told():
     events = Events(SinkOptions(DOOR, lost_seconds=2))
     seen = [(events.update([track]), events.status(""))[1] for track in tracks(".5..5")]
     assert [status["present"] for status in seen] == [False, True, True, False, True]
-    assert [status["zones"] for status in seen[1:]] == [["door"]] * 4
+    assert [status["zones"] for status in seen] == [[], ["door"], ["door"], [], ["door"]]
     events.close()
     assert events.status("") is None
 
@@ -105,3 +118,57 @@ def test_whatever_begins_ends(history):
     assert kinds.count("ended") == bool(history)
     assert kinds.count("lost") - kinds.count("returned") in (0, 1)
     assert kinds[-1:] == ["ended"] * bool(history)
+
+
+@given(st.text(".0123456789", max_size=60))
+def test_the_zones_of_an_object_are_those_entered_and_not_left_and_none_while_it_is_lost(history):
+    events, inside = Events(SinkOptions(DOOR, lost_seconds=2)), set()
+    for track in tracks(history):
+        for event in events.update([track]):
+            {"entered": inside.add, "left": inside.discard}.get(event.kind, lambda _: None)(event.zone)
+        status = events.status("")
+        assert set(status["zones"]) == inside
+        assert status["present"] or not inside
+
+
+FRAME = (320, 240)
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        ("0.1,0.1 0.9,0.1 0.9,0.9 0.1,0.9", "not fractions"),
+        ("0,0 1,0 1,1 0,1", "not fractions"),
+        ("1,2 3,4", "at least 3 corners, got 2"),
+        ("50,50 50,50 50,50", "on a line"),
+        ("10,10 20,20 30,30", "on a line"),
+        ("10,10 200,10 200,10.001", "on a line"),
+        ("0,0 100,100 100,0 0,100", "edges cross"),
+        ("50,0 80,100 0,40 100,40 20,100", "edges cross"),
+        ("2000,900 2100,900 2100,1000", "outside the frame of 320x240"),
+        ("-90,-90 -10,-90 -10,-10", "outside the frame"),
+        ("310,-500 900,-500 900,90", "outside the frame"),  # the box around it is not outside
+        ("1e12,1e12 2e12,1e12 2e12,2e12", "outside the frame"),
+        ("1,2 3,4 5,nan", "finite"),
+        ("1,2 inf,4 5,6", "finite"),
+    ],
+)
+def test_a_zone_that_nothing_can_enter_is_an_error(corners, words):
+    points = tuple(tuple(map(float, corner.split(","))) for corner in corners.split())
+    with pytest.raises(SettingsError, match=f"zone door: .*{words}"):
+        check_zones({"door": points}, FRAME)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        "0,0 320,0 320,240 0,240",
+        "-50,-50 400,-50 400,300 -50,300",
+        "300,200 900,200 900,900",
+        "10,10 10,10 60,10 60,60",  # a corner twice
+        "10,10 100,10 100,100 55,100 55,50 50,50 50,100 10,100",  # not convex
+        "5,5 7,5 7,7",
+    ],
+)
+def test_a_zone_that_is_partly_in_the_frame_is_valid(corners):
+    check_zones({"door": tuple(tuple(map(float, corner.split(","))) for corner in corners.split())}, FRAME)

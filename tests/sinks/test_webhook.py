@@ -8,6 +8,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Event, Thread
+from time import sleep
 
 import pytest
 
@@ -15,7 +16,8 @@ from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
-from catstream.sinks import webhook
+from catstream.pipeline import Pipeline
+from catstream.sinks import remote, webhook
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.newest import Publisher
@@ -37,7 +39,10 @@ class Receiver:
                 body = self.rfile.read(int(self.headers["Content-Length"]))
                 receiver.holds.wait(60)
                 receiver.requests.append((self.path, self.headers, body))
-                self.send_response(receiver.answers.pop(0) if receiver.answers else 204)
+                status, *retry_after = receiver.answers.pop(0) if receiver.answers else (204,)
+                self.send_response(status)
+                for text in retry_after:
+                    self.send_header("Retry-After", text)
                 self.end_headers()
 
             def log_message(self, *_):
@@ -118,12 +123,54 @@ def test_an_event_has_the_newest_picture_if_that_is_wanted(receiver, endpoint, u
             sink.write(TrackedFrame([FOUND]))
             until(lambda: previews.has_subscribers, previews.serve_late_joiners)
             previews.send(Preview(7, 0.28, 640, 480, {}, JPEG))
-            until(lambda: sink.write(TrackedFrame([FOUND])) or sink._reports._picture)
-    pictures = [body["picture"] for body in receiver.bodies]
-    assert pictures == [None, {"frame": 7, "width": 640, "height": 480, "jpeg": b64encode(JPEG).decode()}]
+            until(lambda: receiver.requests, lambda: sink.write(TrackedFrame([FOUND])))
+    picture = {"frame": 7, "width": 640, "height": 480, "jpeg": b64encode(JPEG).decode()}
+    assert [body["picture"] for body in receiver.bodies] == [picture, picture]
 
 
-def test_a_receiver_that_was_away_gets_all_events_in_order(caplog, until):
+def test_events_wait_for_the_first_picture_for_some_seconds_only(receiver, endpoint, monkeypatch, until):
+    monkeypatch.setattr(remote, "_PICTURE_SECONDS", 0.1)
+    url = f"http://127.0.0.1:{receiver.port}"
+    with closing(open_sink(url, Origin(endpoint=str(endpoint), options=SinkOptions(picture=True)))) as sink:
+        until(lambda: receiver.requests, lambda: sink.write(TrackedFrame([FOUND])))
+    assert [body["picture"] for body in receiver.bodies] == [None, None]
+
+
+def test_a_receiver_is_not_asked_again_before_the_time_that_it_states(receiver, monkeypatch, until):
+    pauses = []
+
+    class Pause(Event):
+        def wait(self, timeout):
+            pauses.append(timeout)
+            return False
+
+    monkeypatch.setattr(webhook, "Event", Pause)
+    receiver.answers += [(503, "120"), (429, "1e9"), (503, "soon"), (503, "Fri, 31 Dec 9999 23:59:59 GMT"), (500,)]
+    with sending(receiver.port):
+        until(lambda: len(receiver.requests) == 6)
+    assert pauses[0] == 120
+    assert max(pauses[1:3]) < 1
+    assert pauses[3] == 600
+    assert pauses[4] < 1
+
+
+def test_each_problem_of_a_destination_is_logged_once_until_it_has_recovered(monkeypatch, caplog):
+    warnings = remote.Warnings("mqtt://me:secret@host/yard")
+    for _ in range(9):
+        for problem in ("refused", "connection lost"):
+            warnings.failed(problem)
+        warnings.working()
+    monkeypatch.setattr(remote, "_STABLE_SECONDS", 0.0)
+    for _ in range(2):
+        warnings.working()
+    warnings.failed("refused")
+    assert [record.getMessage() for record in caplog.records] == [
+        f"mqtt://host/yard: {line}" for line in ("refused", "connection lost", "reconnected", "refused")
+    ]
+
+
+def test_a_receiver_that_was_away_gets_all_events_in_order(caplog, until, monkeypatch):
+    monkeypatch.setattr(remote, "_STABLE_SECONDS", 0.0)
     with closing(Receiver()) as gone:
         port = gone.port
     with sending(port, "T0/secret") as sink:
@@ -131,12 +178,13 @@ def test_a_receiver_that_was_away_gets_all_events_in_order(caplog, until):
         lose(sink, 1)
         back = Receiver(port)
         until(lambda: len(back.requests) == 3)
+        until(lambda: "reconnected" in caplog.text, lambda: sink.write(TrackedFrame([])))
     back.close()
     assert told(back) == ALL
     assert sink.missed == 0
     warned = [record.getMessage() for record in caplog.records]
     assert [line.partition(" (")[0] for line in warned] == [
-        f"http://127.0.0.1:{port}/...: no answer", f"http://127.0.0.1:{port}/...: is back",
+        f"http://127.0.0.1:{port}/...: no answer", f"http://127.0.0.1:{port}/...: reconnected",
     ]  # fmt: skip
 
 
@@ -149,7 +197,7 @@ def test_a_receiver_that_was_away_gets_all_events_in_order(caplog, until):
     ],
 )
 def test_an_event_is_sent_again_after_some_answers_and_not_after_others(receiver, caplog, answers, expected, missed):
-    receiver.answers += answers
+    receiver.answers += [(status,) for status in answers]
     with sending(receiver.port) as sink:
         lose(sink, 1)
     assert told(receiver) == expected
@@ -193,8 +241,8 @@ def test_events_for_a_receiver_that_stays_away_are_counted_at_the_end(monkeypatc
         ("https://me:secret@/hook", "expected https://"),
         ("https://me:secret@host:port/hook", "expected https://"),
         ("http://host:0/secret", "expected https://"),
-        ("http://host/secret hook", "escaped as in %20"),
-        ("http://hóst/secret", "escaped as in %20"),
+        ("http://host/secret hook", "a space is %20"),
+        ("http://hóst/secret", "a space is %20"),
         ("ftp://me:secret@host/one", "is no destination"),
     ],
 )
@@ -229,15 +277,16 @@ def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (["--zone", "door=1,2 3,4"], "three corners or more"),
-        (["--zone", "1,2 3,4 5,6"], "three corners or more"),
-        (["--zone", "door=1,2 3,4 5,nan"], "three corners or more"),
-        (["--zone", "a=1,2 3,4 5,6", "--zone", "a=1,2 3,4 5,6"], "expected a new NAME="),
+        (["--zone", "door=1,2 3,4"], "at least 3 corners"),
+        (["--zone", "door=1,2 3,four 5,6"], "expected NAME="),
+        (["--zone", "1,2 3,4 5,6"], "expected NAME="),
+        (["--zone", "a=1,2 9,4 5,9", "--zone", "a=1,2 9,4 5,9"], "with a new name"),
         (["--when", "gone"], "expected some of found, lost, returned"),
         (["--when", "found=3"], "expected some of found, lost, returned"),
         (["--when", ""], "expected some of found, lost, returned"),
         (["--when", "lost=soon"], "'soon' is not a valid float"),
-        (["--rate", "0"], "is not in the range x>0"),
+        (["--when", "lost=inf"], "is not in the range 0<=x<=86400"),
+        (["--rate", "0"], "is not in the range 0<x<=1000"),
         (["--write", "mqtt://me:secret@host/#"], "has no valid topic"),
         (["--write", "ftp://me:secret@host/a"], "ftp://host/a is no destination"),
     ],
@@ -249,10 +298,41 @@ def test_an_option_that_is_not_valid_is_an_error_of_one_line_before_the_run(demo
     assert "secret" not in said
 
 
-def test_options_that_no_destination_has_are_an_error(demo_video, fail, tmp_path):
+YARD, HOOK, DOOR = "mqtt://127.0.0.1:9/yard", "http://127.0.0.1:9/hook", "door=10,10 90,10 90,90"
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["t.csv", "--when", "lost=10"], "--when has no effect on these destinations: add one with mqtt://"),
+        (["rtsp://127.0.0.1:9/yard", "--picture"], "--picture has no effect"),
+        ([HOOK, "--rate", 5], "--rate has no effect on these destinations: add one with mqtt:// or mqtts://"),
+        ([YARD, "--secret-file", "key"], "--secret-file has no effect .* http:// or https://"),
+        ([HOOK, "--when", "entered"], "--when entered has no effect without a zone: add --zone"),
+        ([YARD, "--when", "lost,left"], "--when left has no effect without a zone"),
+        ([HOOK, "--zone-margin", 5], "--zone-margin has no effect without a zone"),
+        ([HOOK, "--zone", DOOR, "--when", "lost"], "--zone has no effect: add entered or left to --when"),
+        (["t.csv", "--zone", DOOR], "--zone has no effect on these destinations"),
+    ],
+)
+def test_an_option_without_effect_is_an_error_before_the_run(fail, words, error):
+    assert re.search(error, fail("sink", *words))
+
+
+def test_a_zone_outside_the_frame_is_an_error_before_the_run(demo_video, fail):
     video, boxes = demo_video(32)
-    assert "are for mqtt:// and http://: add one" in fail(
-        "track", video, "--box", boxes[0], "--output", tmp_path / "out", "--when", "lost=10"
-    )
-    for place in (tmp_path / "t.csv", "rtsp://127.0.0.1:9/yard"):
-        assert "are for mqtt:// and http://: add one" in fail("sink", place, "--picture")
+    words = ["track", video, "--box", boxes[0], "--write", HOOK, "--zone"]
+    assert "zone door: it is outside the frame of 320x240 pixels" in fail(*words, "door=400,10 490,10 490,90")
+    assert "--zone-margin 999 is larger than the frame" in fail(*words, DOOR, "--zone-margin", 999)
+
+
+def test_a_zone_outside_the_frame_of_a_running_pipeline_ends_the_sink(demo_video, catstream):
+    video, boxes = demo_video(150)
+    with Pipeline(video, boxes[0], {"run.unstored_frames": 1}) as pipeline:
+        sink = catstream("sink", HOOK, "--endpoint", pipeline.endpoint, "--zone", "door=4000,10 4900,10 4900,90")
+        for _ in pipeline:
+            if sink.poll() is not None:
+                break
+            sleep(0.3)
+        errors = sink.communicate(timeout=60)[1]
+    assert "zone door: it is outside the frame of 320x240 pixels" in errors

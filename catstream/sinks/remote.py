@@ -1,0 +1,138 @@
+"""What destinations on the network share: events as JSON, warnings, and the check of an address."""
+
+from __future__ import annotations
+
+import json
+import logging
+import ssl
+import time
+from base64 import b64encode
+from collections.abc import Sequence
+from contextlib import suppress
+from urllib.parse import SplitResult, urlsplit
+from uuid import uuid4
+
+from catstream.client.subscription import Subscription
+from catstream.errors import SilenceError, VideoError
+from catstream.messages.kinds import Preview, Track
+from catstream.sinks.destinations import Origin, redacted
+from catstream.sinks.events import Event, Events
+
+#: Messages that wait for a destination that is away or slow; further ones are dropped.
+QUEUED = 256
+
+#: Seconds at the end of a run in which the backlog is sent.
+CLOSE_SECONDS = 5.0
+
+_STABLE_SECONDS = 10.0  # without a failure, after which a destination has recovered
+_PICTURE_SECONDS = 2.0  # that events wait for the first picture
+
+_log = logging.getLogger(__name__)
+
+
+class Warnings:
+    """Warns about a destination, whose address is logged without its password.
+
+    Hysteresis: each problem is logged once, until the destination has worked for `_STABLE_SECONDS` without a failure.
+    So one that fails in turns for two reasons, or that accepts and closes each connection, does not fill the log.
+    """
+
+    def __init__(self, place: str) -> None:
+        self._address = redacted(place)
+        self._problems: set[str] = set()
+        self._working_since: float | None = None
+
+    def failed(self, problem: str) -> None:
+        """Log a problem of the destination; its text has no part that changes from one attempt to the next."""
+        self._working_since = None
+        if problem not in self._problems:
+            self._problems.add(problem)
+            self.log(problem)
+
+    def working(self) -> None:
+        """Note that the destination works; is called again and again while it does."""
+        now = time.monotonic()
+        since = self._working_since = self._working_since or now
+        if self._problems and now - since >= _STABLE_SECONDS:
+            self._problems.clear()
+            self.log("reconnected")
+
+    def log(self, text: str) -> None:
+        _log.warning("%s: %s", self._address, text)
+
+
+class EventMessages:
+    """Makes a JSON object of each event: `Event.to_dict`, `id`, `sent` in seconds since 1970, and optionally `picture`.
+
+    The picture is the newest that the pipeline has sent: the JPEG file in Base64, the number of its frame, and the
+    width and height of a frame, which may be larger. Before the first one, events wait for `_PICTURE_SECONDS`; then it
+    is null.
+    """
+
+    def __init__(self, origin: Origin) -> None:
+        self.events = Events(origin.options)
+        self._waiting: list[Event] = []
+        self._picture: dict[str, object] | None = None
+        self._picture_due = time.monotonic() + _PICTURE_SECONDS
+        self._previews: Subscription[Preview] | None = None
+        if origin.options.picture:
+            self._previews = Subscription(origin.endpoint, "previews", timeout=0, keys=origin.keys)
+
+    def update(self, tracks: Sequence[Track]) -> list[bytes]:
+        """Return the messages of the events of further tracks, and of those that waited for a picture."""
+        self._waiting += self.events.update(tracks)
+        if self._previews is not None:
+            with suppress(SilenceError):  # no further picture has arrived
+                for preview in self._previews:
+                    size = {"width": preview.width, "height": preview.height}
+                    self._picture = {"frame": preview.frame, **size, "jpeg": b64encode(preview.jpeg).decode()}
+            if self._picture is None and time.monotonic() < self._picture_due:
+                return []
+        return self._messages()
+
+    def close(self) -> list[bytes]:
+        """Return the messages of the last events."""
+        self._waiting += self.events.close()
+        messages = self._messages()
+        if self._previews is not None:
+            self._previews.close()
+        return messages
+
+    def _messages(self) -> list[bytes]:
+        events, self._waiting = self._waiting, []
+        picture = {} if self._previews is None else {"picture": self._picture}
+        return [
+            json.dumps({"id": uuid4().hex, "sent": time.time(), **event.to_dict(), **picture}).encode()
+            for event in events
+        ]
+
+
+def split(place: str, form: str) -> SplitResult:
+    """Return the parts of an address; VideoError with its `form` and what is wrong, without its password."""
+    host = place.partition("://")[2].partition("/")[0]
+    wrong = ""
+    if not all("!" <= letter <= "~" for letter in place):
+        wrong = "percent-encode spaces and letters outside ASCII, a space is %20"
+    elif "@" not in host and "@" in place:
+        wrong = "percent-encode a / in the user name or password, it is %2F"
+    else:
+        try:
+            url = urlsplit(place)
+            if url.port != 0 and url.hostname and url.hostname.encode("idna"):
+                return url
+            wrong = "the port has to be 1 to 65535" if url.port == 0 else "the host is missing"
+        except UnicodeError:
+            wrong = "the name of the host is not valid"
+        except ValueError:
+            wrong = "the port has to be 1 to 65535, an IPv6 address is in brackets"
+    raise VideoError(f"invalid address {redacted(place)} ({wrong}): expected {form}")
+
+
+def reason_of(error: BaseException | None) -> str:
+    """Return why a connection failed, with what to do if the server and the address disagree about TLS."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"certificate verify failed: {error.verify_message}; for a CA of your own, set SSL_CERT_FILE"
+    if isinstance(error, ssl.SSLError):
+        reason = (error.reason or "no reply").lower().replace("_", " ")
+        return f"TLS handshake failed, the port may be one without TLS: {reason}"
+    return str(getattr(error, "strerror", None) or error or type(error).__name__)
