@@ -17,7 +17,7 @@ from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
 from catstream.sinks.destinations import About, Head, Origin, TrackedFrame
-from catstream.sinks.reports import Warnings
+from catstream.sinks.remote import Warnings
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
 #: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.

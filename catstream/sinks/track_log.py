@@ -44,7 +44,7 @@ from catstream.sinks.destinations import (
     open_sink,
     sink_of,
 )
-from catstream.sinks.reports import Warnings
+from catstream.sinks.remote import Warnings
 from catstream.video.source import is_live
 from catstream.wire.codec import decode_json
 
