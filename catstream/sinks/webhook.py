@@ -105,8 +105,10 @@ class Webhook:
             status, self._retry_after = answer.status, _seconds(answer.getheader("Retry-After", ""))
             if status // 100 != 2:
                 problem = f"answered {status} {responses.get(status, '')}"
-        except (OSError, HTTPException) as error:
+        except OSError as error:
             self._retry_after, problem = 0.0, f"no answer ({reason_of(error)})"
+        except HTTPException:
+            self._retry_after, problem = 0.0, "the answer is not HTTP"
         finally:
             connection.close()
         self._is_working = not problem
