@@ -149,10 +149,14 @@ class Job:
         if source is None:
             raise SettingsError("missing source: a new run needs a video, a folder of images, a camera or a stream")
         return cls(
+            source=source_text(source),
             boxes={} if boxes is None else boxes_by_name(boxes),
             models={name: file.absolute() for name, file in files_by_name(models).items()},
+            part=part,
+            settings=settings if isinstance(settings, Settings) else Settings().replace(settings or {}),
             results=results or Results(),
-        ).resumed(source, settings, part=part, paused=paused)
+            paused=paused,
+        )
 
     def resumed(
         self,

@@ -67,7 +67,7 @@ class _Execution:
     def forget(self) -> Outcome:
         name = _tracked(self.command, self.desired)
         desired = self.desired.without(name)
-        waits = "" if desired.objects else ": no object remains, so the run waits for a box"
+        waits = "" if desired.objects else ": no object is left, so the run waits for a box"
         effect = f"{listed([name])} is no longer tracked {self._moment}{waits}"
         _, answered = self._done(desired, effect, name)
         return desired, replace(answered, box=None, version=0)
