@@ -40,7 +40,7 @@ def decisions() -> str:
 def settings() -> str:
     """Return the tables of settings and of presets in Markdown."""
     lines = []
-    for heading, expert in (("", False), ("### Expert settings: the ablation and the paper", True)):
+    for heading, expert in (("", False), ("### Expert settings", True)):
         lines += [heading, "", "| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
         for setting in describe().values():
             if setting.expert == expert:

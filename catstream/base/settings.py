@@ -40,7 +40,7 @@ class Setting:
     default    value
     about      meaning, and when to change it; the latter is missing if `expert`
     bounds     ge, gt, le and lt of the value
-    expert     whether it is for the ablation and the paper
+    expert     whether it is for experiments and the presets of the paper
     resumable  whether a resumed run may change it, because it does not affect the training
     local      whether its value has a meaning on this machine only
     """

@@ -111,8 +111,8 @@ def settings(words: tuple[str, ...], as_json: bool) -> None:
 
     With words, only those whose name or description has all of them. Set them
     with --set GROUP.NAME=VALUE, in a TOML file with a table for each group
-    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME). Those of
-    the ablation and of the paper come last.
+    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME). Expert
+    settings, for experiments and the presets of the paper, come last.
 
     \b
     EXAMPLES

@@ -230,7 +230,7 @@ class Job:
 
 
 def changed_setting(before: Settings, after: Settings) -> str:
-    """The first setting that differs and may not while a run continues, with its values; empty if there is none.
+    """The first setting that differs and is not `resumable`, with its values; empty if there is none.
 
     >>> changed_setting(Settings(), Settings(coreset={"size": 32}, run={"lag_frames": 25}))
     'coreset.size=64, not 32'
