@@ -97,7 +97,7 @@ def decoders(folder: Path) -> dict[str, Decoder]:
             folder / "d.toml",
             lambda path: Settings.load(file=path, environment={}),
             SettingsError,
-            b"[coreset]\nsize = 128\n[teaching]\nclassifier = 'joint'\n",
+            b"[coreset]\nsize = 128\n[training]\nclassifier = 'joint'\n",
         ),
         "keys": filed(
             folder / "keys" / "client.key",

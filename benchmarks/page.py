@@ -272,7 +272,7 @@ def _choice(found: Mapping[str, Record]) -> str:
 _HEAD = """
     Written by `make results` from the records in `benchmarks/results`. The comment after a command is the date, the
     commit and the machine of the table below it, and the settings that differ from today's defaults: until 26 November,
-    `belief.weak_score` was 0.3, and until 27 November, `teaching.interval` was 1. The next line is the measure and the
+    `belief.weak_score` was 0.3, and until 27 November, `training.interval` was 1. The next line is the measure and the
     number of runs. [Evaluate on your own video](how-to/evaluate.md) defines the measures. The folder `benchmarks` has
     more tables, and describes each measurement in its `README.md`."""
 _DETAILS_HEAD = """

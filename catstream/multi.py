@@ -104,7 +104,7 @@ class MultiTracker:
         image, boxes, time = as_bgr(frame), boxes_by_name(boxes), _seconds(time)
         if not boxes:
             raise ObjectError("there is no object to follow: give a box for at least one name")
-        check_count(len(boxes), self.settings.run.objects_most)
+        check_count(len(boxes), self.settings.run.max_objects)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
         with one_thread():
             pyramid = detectors.pyramid(image)
@@ -177,7 +177,7 @@ class MultiTracker:
         """The compressors of the objects of saved models; an error if one of the objects cannot begin."""
         if both := models.keys() & boxes.keys():
             raise ObjectError(f"{listed(sorted(both))}: a box and a saved model for one object: give one of them")
-        check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.objects_most)
+        check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.max_objects)
         network = self.detectors.network
         return {name: learned.compressor(self.settings, network, name) for name, learned in models.items()}
 

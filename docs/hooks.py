@@ -39,12 +39,16 @@ def decisions() -> str:
 
 def settings() -> str:
     """Return the tables of settings and of presets in Markdown."""
-    lines = ["| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
-    for name, takes, default, meaning in describe():
-        shown = "empty" if default == "" else str(default).lower() if isinstance(default, bool) else default
-        takes, meaning = takes.replace("|", "&#124;"), meaning.replace("|", "&#124;")
-        lines.append(f"| `{name}` | {takes} | {shown} | {meaning} |")
-    lines += ["", "| preset | sets |", "| --- | --- |"]
+    lines = []
+    for heading, expert in (("", False), ("### Expert settings", True)):
+        lines += [heading, "", "| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
+        for setting in describe().values():
+            if setting.expert == expert:
+                default = "empty" if setting.default == "" else json.dumps(setting.default).strip('"')
+                takes = setting.takes.replace("|", "&#124;")
+                about = f"{setting.about} May change at a resume." if setting.resumable else setting.about
+                lines.append(f"| `{setting.name}` | {takes} | {default} | {about} |")
+    lines += ["", "### Presets", "", "| preset | sets |", "| --- | --- |"]
     for preset, values in PRESETS.items():
         pairs = ", ".join(f"`{name} = {json.dumps(value)}`" for name, value in values.items())
         lines.append(f"| `{preset}` | {pairs} |")

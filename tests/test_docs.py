@@ -86,9 +86,10 @@ def built(name: str) -> str:
 
 def test_every_setting_and_preset_has_its_row_on_the_page_of_settings():
     rows = built("settings.md")
-    for name, _, _, meaning in describe():
+    for name, setting in describe().items():
         assert f"| `{name}` |" in rows
-        assert meaning, f"{name}: write what it means"
+        assert setting.about, f"{name}: write what it means, in the docstring of its group"
+        assert setting.expert or setting.about.count(". ") >= 1, f"{name}: write when to change it"
     assert all(f"| `{preset}` |" in rows for preset in PRESETS)
     assert not built("api.md").strip()
 

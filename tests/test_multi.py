@@ -121,7 +121,7 @@ def test_objects_that_come_and_go_do_not_affect_one_another(frames, lives):
     ids=["outside", "an old one and an empty one", "a bad name", "too many"],
 )
 def test_if_one_box_of_several_is_refused_it_is_named_and_nothing_changes(frames, begin, error, why):
-    tracker, other = started(frames, settings={"run.objects_most": 4}), started(frames)
+    tracker, other = started(frames, settings={"run.max_objects": 4}), started(frames)
     with pytest.raises(error, match=why):
         tracker.update(frames[1], begin=begin)
     with pytest.raises(TypeError):
@@ -181,7 +181,7 @@ def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not
 
 
 def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
-    tracker, other = (started(frames, settings={"run.objects_most": most, "coreset.size": 8}) for most in (2, 8))
+    tracker, other = (started(frames, settings={"run.max_objects": most, "coreset.size": 8}) for most in (2, 8))
     for search, error, why in [
         ({"ben": cleo, "cleo": cleo}, ObjectError, "3 objects are more than 2"),
         ({"no name": cleo}, ObjectError, "is not a name"),

@@ -14,7 +14,7 @@ from catstream.compression.forest import Forest
 from catstream.errors import BoxError, FrameError, SettingsError
 from catstream.tracker import Tracker
 
-_SCM = {"teaching.bootstrap": "scm", "coreset.size": 36, "teaching.copies": 5}
+_SCM = {"training.bootstrap": "scm", "coreset.size": 36, "training.copies": 5}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_a_patch_is_followed(video, preset):
 def test_a_share_of_an_unknown_length_is_rejected(video):
     with pytest.raises(SettingsError, match="for_length"):
         follow(video, Settings(coreset={"share": 0.1}))
-    with pytest.raises(SettingsError, match="is not known"):
+    with pytest.raises(SettingsError, match="is unknown"):
         Settings(coreset={"share": 0.1}).for_length(None)
 
 

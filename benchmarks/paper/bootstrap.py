@@ -20,7 +20,7 @@ from catstream.base.settings import Settings
 from catstream.evaluation.datasets import Sequence, Start
 
 #: Bootstrap -> its settings. SCM follows all n frames where each gives one row: no copies.
-BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"teaching.bootstrap": "scm", "teaching.copies": 0}}
+BOOTSTRAPS: dict[str, dict[str, Any]] = {"copies": {}, "scm": {"training.bootstrap": "scm", "training.copies": 0}}
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:

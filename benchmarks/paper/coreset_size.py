@@ -26,7 +26,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     recipes, sizes = {}, list(PAPER)[-1:] if options.quick else list(PAPER)
     for percent in sizes:
         share = {"coreset.share": percent / 100}
-        copies = {"teaching.copies": int(25 // percent) - 1}
+        copies = {"training.copies": int(25 // percent) - 1}
         recipes[f"paper's, {percent} %"] = Recipe(Settings.from_values(PRESETS["one-class-paper"] | share | copies))
         recipes[f"ours, {percent} %"] = Recipe(Settings.from_values(share))
     runs = follow_all(options, found, recipes)

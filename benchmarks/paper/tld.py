@@ -43,7 +43,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     for name, runs in compared(options, found, variants).items():
         success = [row.success for row in rows_of(runs)]
         rows.append((name, fmean(success), *success, *PAPER.get(name, (None, None))))
-        if variants[name].teaching.bootstrap == "scm":
+        if variants[name].training.bootstrap == "scm":
             parts += by_part(name, [run for run in runs if run.start.frame == 0], variants[name])
     nothing = (None,) * (1 + len(found))
     rows += [(name, *nothing, *printed) for name, printed in PAPER.items() if name not in variants]
@@ -58,7 +58,7 @@ def by_part(tracker: str, runs: list[EvaluationRun], settings: Settings) -> Iter
 
     def success(run: EvaluationRun, *, scm: bool) -> float:
         of_video = settings.for_length(len(run.boxes))
-        first = math.ceil(of_video.coreset.size / (1 + of_video.teaching.copies))
+        first = math.ceil(of_video.coreset.size / (1 + of_video.training.copies))
         part = slice(first) if scm else slice(first, None)
         return score(run.boxes[part], run.truth[part]).success
 

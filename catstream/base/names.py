@@ -108,5 +108,5 @@ def check_count(count: int, most: int) -> None:
     if count > most:
         raise ObjectError(
             f"{count} objects are more than {most}: follow fewer, or raise the limit "
-            f"(--set run.objects_most={count}, up to 64)"
+            f"(--set run.max_objects={count}, up to 64)"
         )

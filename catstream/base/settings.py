@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import inspect
 import json
 import math
 import os
@@ -19,7 +20,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -30,239 +31,287 @@ from catstream.errors import CatstreamError, SettingsError
 Value = str | int | float | bool
 
 
-def _about(description: str, **bounds: float) -> Meta:
-    meta: Meta = Meta(description=description, **bounds)  # type: ignore[call-overload]  # its overloads name the bounds
-    return meta
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """A row of the list of settings.
+
+    name       full name
+    type       of the value: a type of Python, or a Literal
+    default    value
+    about      meaning, and when to change it; the latter is missing if `expert`
+    bounds     ge, gt, le and lt of the value
+    expert     whether it is for experiments and the presets of the paper
+    resumable  whether a resumed run may change it, because it does not affect the training
+    local      whether its value has a meaning on this machine only
+    """
+
+    name: str = ""
+    type: Any = str
+    default: Value
+    about: str = ""
+    bounds: Mapping[str, float]
+    expert: bool = False
+    resumable: bool = False
+    local: bool = False
+
+    @property
+    def takes(self) -> str:
+        """The valid values: the type or the options, and the bounds.
+
+        >>> describe()["coreset.size"].takes
+        'int >= 2, <= 4096'
+        """
+        signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+        bounds = ", ".join(f"{signs[bound]} {value:g}" for bound, value in self.bounds.items())
+        return " ".join([" | ".join(get_args(self.type)) or self.type.__name__, bounds]).strip()
+
+    def check(self, value: object) -> Value:
+        """Return a value in the type of the setting; SettingsError if it is not valid. A numpy scalar is converted."""
+        if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
+            value = value.item()
+        try:
+            checked: Value = msgspec.convert(value, Annotated[self.type, Meta(**self.bounds)])  # type: ignore[call-overload]
+        except (UnicodeEncodeError, msgspec.ValidationError):  # a byte of the command line that is not UTF-8
+            raise self._invalid(value) from None
+        if isinstance(checked, float) and not math.isfinite(checked):
+            raise self._invalid(value)
+        return checked
+
+    def parse(self, text: str) -> object:
+        """Return the value of a text, in which numbers are written as in Python."""
+        try:
+            if self.type is bool:
+                return msgspec.convert(text, bool, strict=False)
+            return self.type(text) if self.type in (int, float) else text
+        except (ValueError, msgspec.ValidationError):
+            raise self._invalid(text) from None
+
+    def _invalid(self, value: object) -> SettingsError:
+        return SettingsError(f"setting {self.name} cannot be {reprlib.repr(value)}: it takes {self.takes}")
+
+
+def _setting(
+    default: Value, *, expert: bool = False, resumable: bool = False, local: bool = False, **bounds: float
+) -> Any:
+    """Declare a setting of a group: see `Setting`. The docstring of the group describes it."""
+    setting = Setting(default=default, bounds=bounds, expert=expert, resumable=resumable, local=local)
+    return field(default=default, metadata={"setting": setting})
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Group:
-    """A group of settings: it checks the names and the values that it is made of."""
+    """A group of settings, which checks names and values. Its docstring has a row for each of them."""
 
     group: ClassVar[str]
 
     def __new__(cls, **values: object) -> Self:
         for name in values:
-            _check_name(f"{cls.group}.{name}")
+            _find(f"{cls.group}.{name}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        for each in dataclasses.fields(self):
-            object.__setattr__(self, each.name, _checked(f"{self.group}.{each.name}", getattr(self, each.name)))
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, _find(f"{self.group}.{name}").check(value))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(_Group):
-    """How a pipeline runs: its endpoint, its pace, its seed, and how it reads the source."""
+    """How a pipeline runs: its endpoint, its pace, its seed, and how it reads the source.
+
+    endpoint              Address of the processes: a folder for ipc:// sockets (empty: a new private one), or
+                          tcp://HOST:PORT. Set it to attach to a run by a fixed address, or from other machines.
+    keys                  Folder of keys from `catstream keys new` (empty: no authentication). Required if other
+                          machines can reach the endpoint.
+    lockstep              The detector waits for each model before it continues. Turn it on for a run that is repeatable
+                          bit for bit.
+    lag_frames            Frames of a file by which the detector may be ahead of training (0: as lockstep). Lower it for
+                          more accuracy, raise it for more speed.
+    seed                  Seed of all random numbers. Change it to measure the variance of a result over several runs.
+    image_rate            Frames per second of a folder of images, and of a live demo. Set it to the rate at which the
+                          images were taken.
+    open_timeout_seconds  Timeout for connecting to a camera or a stream, with its first frame. Raise it for a camera
+                          that starts slowly.
+    read_timeout_seconds  Time without a frame after which a camera or a stream reconnects. Raise it if the camera sends
+                          a frame less often.
+    poll_seconds          Time between two requests of a still picture at an http:// address. Set it to the rate at
+                          which the camera updates its picture.
+    hwaccel               Hardware decoder of video, by FFmpeg's name, for example cuda or qsv (empty: none). Set it if
+                          decoding takes a large part of the processor time.
+    skip_damaged          Skip damaged parts of a video file. Turn it on if a run ends with an error at such a part.
+    resize                Scale images of another size to the size of the first one. Turn it on for a folder of images
+                          of several sizes.
+    unstored_frames       Features messages, up to 256 MiB, that may be sent and not yet stored. Raise it if a slow disk
+                          holds up the detector.
+    max_objects           Maximum number of objects of a stream. Raise it to track more of them at once.
+    checkpoint_seconds    Time between two checkpoints of the coreset trees. Raise it to write less to the disk, lower
+                          it to lose fewer training rows of a live source in a crash.
+    """
 
     group = "run"
 
-    endpoint: Annotated[
-        str,
-        _about("Where the processes meet: a folder for ipc:// sockets (empty: a new private one), or tcp://HOST:PORT."),
-    ] = ""
-    keys: Annotated[
-        str,
-        _about("Folder of keys from `catstream keys new` (empty: none): then each client must be allowed."),
-    ] = ""
-    lockstep: Annotated[
-        bool, _about("Make a run repeatable bit for bit: the detector waits for each model before it continues.")
-    ] = False
-    lag_frames: Annotated[
-        int,
-        _about("Frames of a file by which the detector may be ahead of learning (0: as lockstep).", ge=0, le=65536),
-    ] = 25
-    seed: Annotated[int, _about("Seed of all random numbers.", ge=0)] = 0
-    image_rate: Annotated[
-        float, _about("Frames per second of a folder or a pattern of images, and of a live demo.", ge=1e-9, le=1000)
-    ] = 25.0
-    open_seconds: Annotated[
-        float, _about("Time-out for opening a camera or a stream, with its first frame.", ge=0.1, le=3600)
-    ] = 10.0
-    silent_seconds: Annotated[
-        float, _about("Time without a frame after which a camera or a stream reconnects.", ge=0.1, le=3600)
-    ] = 5.0
-    poll_seconds: Annotated[
-        float, _about("Time from one picture to the next at the http:// address of a still picture.", ge=0.01, le=3600)
-    ] = 1.0
-    hardware: Annotated[
-        str,
-        _about("Device that decodes video, by FFmpeg's name for its kind, as cuda or qsv (empty: the processor)."),
-    ] = ""
-    skip_damaged: Annotated[
-        bool, _about("Continue after a damaged place in a video file. Without it, the run ends there.")
-    ] = False
-    resize: Annotated[
-        bool,
-        _about("Scale images of another size to that of the first one. Without it, the run ends at such an image."),
-    ] = False
-    unstored_frames: Annotated[
-        int, _about("Features messages, up to 256 MiB, that may be sent and not yet stored.", ge=1, le=65536)
-    ] = 256
-    objects_most: Annotated[int, _about("Objects that a stream may have at most.", ge=1, le=64)] = 32
-    checkpoint_seconds: Annotated[
-        float, _about("Time between two checkpoints of the coreset trees, in seconds.", gt=0, le=3600)
-    ] = 2.0
+    endpoint: str = _setting("", resumable=True, local=True)
+    keys: str = _setting("", resumable=True, local=True)
+    lockstep: bool = _setting(False, resumable=True)
+    lag_frames: int = _setting(25, ge=0, le=65536, resumable=True)
+    seed: int = _setting(0, ge=0)
+    image_rate: float = _setting(25.0, ge=1e-9, le=1000)
+    open_timeout_seconds: float = _setting(10.0, ge=0.1, le=3600, resumable=True)
+    read_timeout_seconds: float = _setting(5.0, ge=0.1, le=3600, resumable=True)
+    poll_seconds: float = _setting(1.0, ge=0.01, le=3600, resumable=True)
+    hwaccel: str = _setting("")
+    skip_damaged: bool = _setting(False)
+    resize: bool = _setting(False)
+    unstored_frames: int = _setting(256, ge=1, le=65536, resumable=True)
+    max_objects: int = _setting(32, ge=1, le=64)
+    checkpoint_seconds: float = _setting(2.0, gt=0, le=3600, resumable=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CoresetSettings(_Group):
-    """The coreset trees (paper, section "Coreset Tree")."""
+    """The coreset trees (paper, section "Coreset Tree").
+
+    size             n in the paper: rows of a node of a coreset tree. Raise it for an object with many appearances;
+                     time and memory grow with it.
+    share            n as a share of the video's frames, as in the paper (0: coreset.size is used).
+    reduction        Reduction of rows: the coreset tree of the paper (svd), or one sketch of n rows
+                     (frequent-directions). Change it for constant memory.
+    sample_interval  Frames between two samples on which a model is trained; fewer while the trees are small.
+    """
 
     group = "coreset"
 
-    size: Annotated[int, _about("n in the paper: rows of a node of a coreset tree.", ge=2, le=4096)] = 64
-    share: Annotated[
-        float, _about("n as a share of the video's frames, as in the paper (0: coreset.size is used).", ge=0, le=0.5)
-    ] = 0.0
-    reduction: Annotated[
-        Literal["svd", "frequent-directions"],
-        _about("How rows are reduced: by the tree of the paper (svd), or by one sketch of n rows, of constant size."),
-    ] = "svd"
-    sample_interval: Annotated[
-        int,
-        _about("Frames between two samples from which a model is trained; fewer while the trees are small.", ge=1),
-    ] = 8
+    size: int = _setting(64, ge=2, le=4096)
+    share: float = _setting(0.0, ge=0, le=0.5, expert=True)
+    reduction: Literal["svd", "frequent-directions"] = _setting("svd")
+    sample_interval: int = _setting(8, ge=1, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchSettings(_Group):
-    """The search for the object in a frame."""
+    """The search for the object in a frame.
+
+    mode           Search near the predicted position, and in the whole frame if the score is low (local); or always in
+                   the whole frame, as in the paper (full).
+    context        Size of the window as a multiple of the object's box.
+    area           Side of the local search area as a multiple of the window's. Raise it for fast objects; time grows
+                   with its square.
+    full_interval  Frames between two searches of the whole frame while the local score is between belief.weak_score and
+                   belief.confident_score, or the object is not trusted. Lower it for objects that jump, raise it to
+                   save time.
+    motion_frames  Frames in a block of centres from which EM learns the parameters of the Kalman filter.
+    """
 
     group = "search"
 
-    mode: Annotated[
-        Literal["local", "full"],
-        _about(
-            "Search around the predicted place, and the whole frame if the score is low (local); or each whole frame."
-        ),
-    ] = "local"
-    context: Annotated[float, _about("Size of the window as a multiple of the object's box.", ge=1, le=4)] = 1.25
-    area: Annotated[float, _about("Side of the local search area as a multiple of the window's.", ge=1.5, le=6)] = 2.5
-    whole_interval: Annotated[
-        int,
-        _about(
-            "Frames between two searches of the whole frame while the local score is between belief.weak_score and "
-            "belief.confident_score, or the object is not trusted.",
-            ge=1,
-        ),
-    ] = 10
-    motion_frames: Annotated[
-        int, _about("Frames in a block of centres from which EM learns the parameters of the Kalman filter.", ge=8)
-    ] = 64
+    mode: Literal["local", "full"] = _setting("local", expert=True)
+    context: float = _setting(1.25, ge=1, le=4, expert=True)
+    area: float = _setting(2.5, ge=1.5, le=6)
+    full_interval: int = _setting(10, ge=1)
+    motion_frames: int = _setting(64, ge=8, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BeliefSettings(_Group):
-    """The thresholds of the score, which is about 0 on background and about 1 on the object."""
+    """The thresholds of the score, which is about 0 on background and about 1 on the object.
+
+    weak_score          Score below which the object is absent, and the whole frame is searched. Raise it if absence is
+                        reported too rarely, lower it if too often.
+    confident_score     Score at which a lost object returns, and a trusted object is used for training and changes its
+                        size. Raise it if a lost object returns at the wrong position.
+    trusted_score       Score from which an object that was redetected elsewhere is used for training again. Raise it if
+                        the model learns similar objects.
+    redetection_margin  Difference of score by which a window elsewhere in the frame must exceed the local one.
+    min_similarity      Minimum similarity to the object of a saved model of its first detection.
+    """
 
     group = "belief"
 
-    weak_score: Annotated[
-        float, _about("Score below which the object is lost: it is absent, and the whole frame is searched.")
-    ] = 0.4
-    confident_score: Annotated[
-        float,
-        _about(
-            "Score from which a trusted object is learned from, and its size adapted. A lost object returns at this "
-            "score."
-        ),
-    ] = 0.45
-    trusted_score: Annotated[
-        float, _about("Score from which an object that was found elsewhere in the frame is learned from again.")
-    ] = 0.75
-    jump_margin: Annotated[
-        float, _about("Difference of score by which a window elsewhere in the frame must exceed the local one.")
-    ] = 0.4
-    sighting_similarity: Annotated[
-        float,
-        _about("Similarity to the object of a saved model that a window needs to be its first detection."),
-    ] = 0.5
+    weak_score: float = _setting(0.4)
+    confident_score: float = _setting(0.45)
+    trusted_score: float = _setting(0.75)
+    redetection_margin: float = _setting(0.4, expert=True)
+    min_similarity: float = _setting(0.5, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSettings(_Group):
-    """What a feature row holds beside HOG and colours."""
+    """Features beside HOG and colours.
+
+    network  ONNX file of a network from `catstream network prepare` (empty: none). Set it if objects are lost because
+             they rotate, deform or are blurred.
+    """
 
     group = "features"
 
-    network: Annotated[
-        str,
-        _about("ONNX file of a network whose features are used, too (empty: none): see `catstream network prepare`."),
-    ] = ""
+    network: str = _setting("", local=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeachingSettings(_Group):
-    """Which training rows are cut from a frame, and how a model is learned from them."""
+class TrainingSettings(_Group):
+    """The training rows of a frame, and how a model is trained on them.
 
-    group = "teaching"
+    bootstrap          Source of the first model: n affine copies of the initial box (copies), or n boxes of the sparse
+                       collaborative model, as in the paper (scm).
+    classifier         Classifier: the linear discriminant of object and background plus the regression of the loss tree
+                       (joint); the former alone (least-squares); or the paper's one-class SVM (one-class).
+    colours            Use the histogram of the window's colours as a feature. Turn it off if the light changes its
+                       colour.
+    copies             Affine copies of the object in each frame (paper: 4 for n = 5 % of the video). Raise it for an
+                       object that rotates or is seen in few frames.
+    mirrored_copies    Number of these copies that are flipped left to right.
+    other_backgrounds  Share of the first frame's affine copies that are put on another background.
+    near_misses        Windows beside the object in each frame, with a label between 0 and 1.
+    hard_negatives     Background windows with the highest scores, from a search of the whole frame. Raise it if the
+                       tracker switches to similar objects.
+    interval           Train on one of this number of frames whose score is high (1: on all). Raise it for speed, lower
+                       it for an object that changes quickly.
+    """
 
-    bootstrap: Annotated[
-        Literal["copies", "scm"],
-        _about(
-            "Source of the first model: n affine copies of the first box (copies), or n boxes of the sparse "
-            "collaborative model, as in the paper (scm)."
-        ),
-    ] = "copies"
-    classifier: Annotated[
-        Literal["joint", "least-squares", "one-class"],
-        _about(
-            "How a model is learned: least squares of the object's mean against the background, plus the regression of "
-            "the loss tree (joint); the former alone (least-squares); or the paper's one-class SVM (one-class)."
-        ),
-    ] = "joint"
-    colours: Annotated[bool, _about("Use the histogram of the window's colours as a feature.")] = True
-    copies: Annotated[
-        int, _about("Affine copies of the object in each frame (paper: 4 for n = 5 % of the video).", ge=0, le=64)
-    ] = 3
-    mirrored: Annotated[int, _about("How many of these copies are mirrored left to right.", ge=0)] = 1
-    other_backgrounds: Annotated[
-        float, _about("Share of the first frame's affine copies that are put on another background.", ge=0, le=1)
-    ] = 0.9
-    near_misses: Annotated[
-        int, _about("Windows beside the object in each frame, with a label between 0 and 1.", ge=0, le=256)
-    ] = 6
-    hard_negatives: Annotated[
-        int, _about("Background windows with the highest scores, from a search of the whole frame.", ge=0)
-    ] = 10
-    interval: Annotated[
-        int, _about("Of so many frames that the model explains, one is taught (1: all).", ge=1, le=1024)
-    ] = 2
+    group = "training"
+
+    bootstrap: Literal["copies", "scm"] = _setting("copies", expert=True)
+    classifier: Literal["joint", "least-squares", "one-class"] = _setting("joint", expert=True)
+    colours: bool = _setting(True)
+    copies: int = _setting(3, ge=0, le=64)
+    mirrored_copies: int = _setting(1, ge=0, expert=True)
+    other_backgrounds: float = _setting(0.9, ge=0, le=1, expert=True)
+    near_misses: int = _setting(6, ge=0, le=256, expert=True)
+    hard_negatives: int = _setting(10, ge=0)
+    interval: int = _setting(2, ge=1, le=1024)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExtentSettings(_Group):
-    """Size and aspect ratio of the object."""
+    """Size and aspect ratio of the object.
+
+    size_count    Sizes that a search may try, an odd number. Raise it for an object that changes its size quickly; 1
+                  keeps the size.
+    aspect_count  Aspect ratios that a search may try, an odd number (1: it never changes).
+    prior         Weight of (log f)^2, for a size or aspect ratio of f times that of the initial box.
+    weight        Weight of the extent head beside the appearance score (0: size and aspect heads are off, too).
+    """
 
     group = "extent"
 
-    size_count: Annotated[int, _about("Sizes that a search may try, an odd number.", ge=1, le=15)] = 7
-    aspect_count: Annotated[
-        int, _about("Aspect ratios that a search may try, an odd number (1: it never changes).", ge=1, le=15)
-    ] = 5
-    prior: Annotated[
-        float, _about("Weight of (log f)^2, for a size or aspect ratio of f times that of the first box.", ge=0)
-    ] = 0.5
-    weight: Annotated[
-        float,
-        _about("Weight of the extent head beside the appearance score (0: size and aspect heads are off, too).", ge=0),
-    ] = 1.0
+    size_count: int = _setting(7, ge=1, le=15)
+    aspect_count: int = _setting(5, ge=1, le=15, expert=True)
+    prior: float = _setting(0.5, ge=0, expert=True)
+    weight: float = _setting(1.0, ge=0, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """All settings of a run, in groups, checked. Frozen: `but` makes a changed copy.
+    """All settings of a run, in groups, checked. Frozen: `replace` returns a changed copy.
 
     Parameters
     ----------
-    run, coreset, search, belief, features, teaching, extent : the group, or a mapping of its names to values
-        What is left out has its default.
+    run, coreset, search, belief, features, training, extent : the group, or a mapping of its names to values
+        Defaults apply to the rest.
 
     Raises
     ------
     SettingsError
-        For a name that does not exist (names the nearest), or a value that does not fit.
+        For an unknown name (with the nearest ones), or an invalid value.
 
     Examples
     --------
@@ -275,10 +324,10 @@ class Settings:
     search: SearchSettings = field(default_factory=SearchSettings)
     belief: BeliefSettings = field(default_factory=BeliefSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    teaching: TeachingSettings = field(default_factory=TeachingSettings)
+    training: TrainingSettings = field(default_factory=TrainingSettings)
     extent: ExtentSettings = field(default_factory=ExtentSettings)
 
-    if TYPE_CHECKING:  # a group may be given as a mapping, and is read as a group
+    if TYPE_CHECKING:  # a mapping is converted to its group
 
         def __init__(
             self,
@@ -288,14 +337,14 @@ class Settings:
             search: SearchSettings | Mapping[str, object] = ...,
             belief: BeliefSettings | Mapping[str, object] = ...,
             features: FeatureSettings | Mapping[str, object] = ...,
-            teaching: TeachingSettings | Mapping[str, object] = ...,
+            training: TrainingSettings | Mapping[str, object] = ...,
             extent: ExtentSettings | Mapping[str, object] = ...,
         ) -> None: ...
 
     def __new__(cls, **groups: object) -> Self:
         for name in groups:
             if name not in _groups():
-                _check_name(name)
+                _find(name)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -305,8 +354,8 @@ class Settings:
                 object.__setattr__(self, name, group(**value))
             elif not isinstance(value, group):
                 raise SettingsError(
-                    f"the group of settings {name} cannot be {reprlib.repr(value)}: give a {group.__name__}, or names "
-                    f"and values, for example Settings({name}={{...}})"
+                    f"the group of settings {name} cannot be {reprlib.repr(value)}: pass a {group.__name__} or a "
+                    f"mapping of names to values, Settings({name}={{...}})"
                 )
 
     @classmethod
@@ -318,7 +367,7 @@ class Settings:
         overrides: Mapping[str, object] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> Settings:
-        """Collect settings from all their sources: those that `given` finds, the others by default."""
+        """Load settings from all their sources: see `collect`; defaults apply to the rest."""
         return cls.from_values(cls.collect(preset=preset, file=file, overrides=overrides, environment=environment))
 
     @staticmethod
@@ -329,7 +378,7 @@ class Settings:
         overrides: Mapping[str, object] | Iterable[str] = (),
         environment: Mapping[str, str] | None = None,
     ) -> dict[str, object]:
-        """Names and values that are set in some source, as `from_values` and `but` check them.
+        """Collect the names and values that are set in some source, unchecked, for `from_values` or `replace`.
 
         Parameters
         ----------
@@ -340,32 +389,32 @@ class Settings:
         overrides : mapping of str, or iterable of str
             Names and values, or texts `group.name=value` as `--set` takes them.
         environment : mapping of str, or None
-            Variables, `CATSTREAM_GROUP_NAME=value`; None for the process's own. Others with this prefix are left alone.
+            Variables, `CATSTREAM_GROUP_NAME=value`; None for `os.environ`. Others with this prefix are ignored.
 
         Raises
         ------
         SettingsError
-            For a preset that does not exist, a file that cannot be read, or a variable that is empty or of no setting.
+            For an unknown preset, a file that cannot be read, or a variable that is empty or of no setting.
         """
         values: dict[str, object] = {}
         if preset is not None:
             if preset not in PRESETS:
-                raise SettingsError(f"there is no preset {preset!r}: there are {', '.join(PRESETS)}")
+                raise SettingsError(f"there is no preset {preset!r}: choose one of {', '.join(PRESETS)}")
             values.update(PRESETS[preset])
         if file is not None:
             values.update(flat(read_toml(Path(file), SettingsError)))
         for variable, text in (os.environ if environment is None else environment).items():
             name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
             if variable.startswith("CATSTREAM_") and not _is_foreign(name):
-                _check_name(name, variable)
+                _find(name, variable)
                 if not text:
-                    raise SettingsError(f"the environment variable {variable} is empty: give it a value, or unset it")
+                    raise SettingsError(f"the environment variable {variable} is empty: set a value, or unset it")
                 values[name] = text
         return values | _named(overrides)
 
     @classmethod
     def from_values(cls, values: Mapping[str, object]) -> Settings:
-        """Check names and values, flat (`coreset.size`) or in groups; texts are read as their setting's type.
+        """Check names and values, by full name (`coreset.size`) or in groups; texts are parsed.
 
         Examples
         --------
@@ -374,15 +423,15 @@ class Settings:
         """
         groups: dict[str, dict[str, object]] = {}
         for name, value in flat(values).items():
-            _check_name(name)
+            setting = _find(name)
             group, _, short = name.partition(".")
-            groups.setdefault(group, {})[short] = _read_text(name, value) if isinstance(value, str) else value
+            groups.setdefault(group, {})[short] = setting.parse(value) if isinstance(value, str) else value
         return cls(**groups)
 
     def for_length(self, frames: int | None) -> Settings:
-        """These settings for a video of so many frames: `coreset.share` becomes a `coreset.size`.
+        """Compute `coreset.size` from `coreset.share`, for a video with this number of frames.
 
-        SettingsError if there is a share and the length is not known.
+        SettingsError if there is a share and the length is unknown.
 
         Examples
         --------
@@ -394,12 +443,12 @@ class Settings:
         if frames is None:
             raise SettingsError(
                 f"coreset.share={self.coreset.share:g} is a share of the video's length, and the length of this source "
-                "is not known: set coreset.size instead"
+                "is unknown: set coreset.size instead"
             )
         return self.replace({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
     def replace(self, others: Mapping[str, object] | Iterable[str]) -> Settings:
-        """A copy with some of them changed: names and values, or texts `group.name=value` as `--set` takes them.
+        """Return a copy with other values, by name, or as texts `group.name=value` in the form of `--set`.
 
         Examples
         --------
@@ -414,55 +463,67 @@ class Settings:
         return {f"{group}.{name}": value for group, values in groups for name, value in values.items()}
 
     def changed(self) -> list[str]:
-        """Those that differ from their default, as `load` takes them.
+        """Texts `group.name=value` of the settings that differ from their default.
 
         Examples
         --------
         >>> Settings(run={"lockstep": True}, coreset={"size": 32}).changed()
         ['run.lockstep=true', 'coreset.size=32']
         """
-        default, texts = _defaults(), self.texts()
-        return [f"{name}={texts[name]}" for name, value in self.values().items() if value != default[name]]
+        texts, settings = self.texts(), describe()
+        return [f"{name}={texts[name]}" for name, value in self.values().items() if value != settings[name].default]
 
     def texts(self) -> dict[str, str]:
-        """All values as texts, by full name; `from_values` reads them."""
+        """All values as texts, by full name, for `from_values`."""
         values = self.values().items()
         return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values}
 
     def portable(self) -> dict[str, str]:
-        """The texts of all settings but those that have a meaning on this machine only."""
-        return {name: text for name, text in self.texts().items() if name not in _LOCAL}
+        """The texts of all settings except those with a meaning on this machine only."""
+        settings = describe()
+        return {name: text for name, text in self.texts().items() if not settings[name].local}
 
 
-_LOCAL = ("run.endpoint", "run.keys", "features.network")
 _SERVICE = re.compile(r"(^|[._])(service[._](host|port)|port(_[0-9]+_(tcp|udp).*)?$|port\.[0-9]+_(tcp|udp))")
 
 _PAPER: dict[str, Value] = {
-    "teaching.classifier": "one-class",
+    "training.classifier": "one-class",
     "search.mode": "full",
-    "teaching.bootstrap": "scm",
+    "training.bootstrap": "scm",
     "extent.weight": 0.0,
     "extent.prior": 0.0,
-    "teaching.colours": False,
-    "teaching.other_backgrounds": 0.0,
-    "teaching.mirrored": 0,
-    "teaching.interval": 1,
+    "training.colours": False,
+    "training.other_backgrounds": 0.0,
+    "training.mirrored_copies": 0,
+    "training.interval": 1,
     "belief.weak_score": 0.3,
     "belief.trusted_score": 0.0,
 }
 
-#: Settings of the paper, by name. Frames and copies together make 25 % of a video: 1.5 copies a frame at 10 %.
+#: Settings of the paper, by name of the preset. Frames and copies make 25 % of a video: 1.5 copies a frame at 10 %.
 PRESETS: dict[str, dict[str, Value]] = {
-    "one-class-paper": _PAPER | {"teaching.copies": 4},
-    "cat10": _PAPER | {"coreset.share": 0.10, "teaching.copies": 1},
-    "cat25": _PAPER | {"coreset.share": 0.25, "teaching.copies": 0},
+    "one-class-paper": _PAPER | {"training.copies": 4},
+    "cat10": _PAPER | {"coreset.share": 0.10, "training.copies": 1},
+    "cat25": _PAPER | {"coreset.share": 0.25, "training.copies": 0},
 }
 
 
-def describe() -> list[tuple[str, str, Value, str]]:
-    """Full name, type, default and meaning of every setting: for `--help` and the docs."""
-    default = _defaults()
-    return [(name, _takes(name), default[name], kind.__metadata__[0].description) for name, kind in _kinds().items()]
+@cache
+def describe() -> dict[str, Setting]:
+    """All settings by full name: for `--help` and the docs."""
+    settings: dict[str, Setting] = {}
+    for group, kind in _groups().items():
+        types = get_type_hints(kind)
+        rows = re.findall(r"^(\w+) {2,}(.+(?:\n {2,}.+)*)", inspect.cleandoc(kind.__doc__ or ""), re.MULTILINE)
+        texts = {name: " ".join(text.split()) for name, text in rows}
+        for entry in dataclasses.fields(kind):
+            settings[f"{group}.{entry.name}"] = dataclasses.replace(
+                entry.metadata["setting"],
+                name=f"{group}.{entry.name}",
+                type=types[entry.name],
+                about=texts.get(entry.name, ""),
+            )
+    return settings
 
 
 @cache
@@ -471,58 +532,36 @@ def _groups() -> dict[str, type[_Group]]:
     return get_type_hints(Settings)
 
 
-@cache
-def _kinds() -> dict[str, Any]:
-    """Type and bounds of each setting, by its full name."""
-    hints = {name: get_type_hints(group, include_extras=True) for name, group in _groups().items()}
-    return {f"{name}.{each}": kind for name, kinds in hints.items() for each, kind in kinds.items() if each != "group"}
-
-
-@cache
-def _defaults() -> dict[str, Value]:
-    """Default of each setting, by its full name."""
-    return Settings().values()
-
-
 def flat(values: Mapping[str, object]) -> dict[str, object]:
     """Values by full name, from values by full name or in groups."""
-    found: dict[str, object] = {}
+    flattened: dict[str, object] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
-            found |= {f"{name}.{short}": each for short, each in value.items()}
+            flattened |= {f"{name}.{short}": entry for short, entry in value.items()}
         else:
-            found[name] = value
-    return found
+            flattened[name] = value
+    return flattened
 
 
-def _takes(name: str) -> str:
-    """The valid values of a setting: its type or options, and its bounds."""
-    kind, meta = _kinds()[name].__origin__, _kinds()[name].__metadata__[0]
-    bounds = [
-        f"{sign} {value:g}"
-        for sign, value in ((">=", meta.ge), (">", meta.gt), ("<=", meta.le), ("<", meta.lt))
-        if value is not None
-    ]
-    options = getattr(kind, "__args__", None)
-    text = " | ".join(map(str, options)) if options else kind.__name__
-    return " ".join([text, ", ".join(bounds)]).strip()
+def _find(name: str, variable: str = "") -> Setting:
+    """Return the setting of a name, which came from an environment variable if one is named.
 
-
-def _check_name(name: str, variable: str = "") -> None:
-    """Raise SettingsError for the name of no setting; `variable` is that of the environment which gives it, if any."""
-    if name not in _kinds():
-        near = [repr(other) for other in _nearest(name)]
-        meant = f", did you mean {' or '.join(near)}?" if near else ":"
-        origin = f" for the environment variable {variable}" if variable else ""
-        raise SettingsError(
-            f"there is no setting {name!r}{origin}{meant} `catstream settings` lists all {len(_kinds())}"
-        )
+    SettingsError, with the nearest names, if there is none.
+    """
+    if name in describe():
+        return describe()[name]
+    near = [repr(other) for other in _nearest(name)]
+    suggestion = f", did you mean {' or '.join(near)}?" if near else ":"
+    origin = f" for the environment variable {variable}" if variable else ""
+    raise SettingsError(
+        f"there is no setting {name!r}{origin}{suggestion} `catstream settings` lists all {len(describe())}"
+    )
 
 
 def _is_foreign(name: str) -> bool:
-    """Whether a variable with our prefix, as the name of a setting, is for something else.
+    """Whether a variable with our prefix is no setting: its name is similar to none, or that of an orchestrator.
 
-    It is of no group and like no setting; or an orchestrator has made it for a service that is called catstream.
+    Kubernetes sets CATSTREAM_SERVICE_HOST and others for a service named catstream.
     """
     if _SERVICE.search(name):
         return True
@@ -530,52 +569,24 @@ def _is_foreign(name: str) -> bool:
 
 
 def _nearest(name: str) -> list[str]:
-    """Full names that are similar, or that end as the name does."""
-    similar = difflib.get_close_matches(name.replace("_", "."), _kinds(), n=3)
-    return similar or [full for full in _kinds() if full.partition(".")[2] == name]
+    """Full names that are similar, or that have this name in their group."""
+    similar = difflib.get_close_matches(name.replace("_", "."), describe(), n=3)
+    return similar or [full for full in describe() if full.partition(".")[2] == name]
 
 
-def _checked(name: str, value: object) -> object:
-    """The value of a setting, of its type; a scalar of numpy is a value of Python."""
-    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
-        value = value.item()
-    try:
-        checked = msgspec.convert(value, _kinds()[name])
-    except (UnicodeEncodeError, msgspec.ValidationError):  # a byte of the command line that is not UTF-8
-        raise _misfit(name, value) from None
-    if isinstance(checked, float) and not math.isfinite(checked):
-        raise _misfit(name, value)
-    return checked
-
-
-def _read_text(name: str, text: str) -> object:
-    """The value that a text means, of the type of its setting."""
-    kind = _kinds()[name].__origin__
-    try:
-        if kind is bool:
-            return msgspec.convert(text, bool, strict=False)
-        return kind(text) if kind in (int, float) else text
-    except (ValueError, msgspec.ValidationError):
-        raise _misfit(name, text) from None
-
-
-def _misfit(name: str, value: object) -> SettingsError:
-    return SettingsError(f"setting {name} cannot be {reprlib.repr(value)}: it takes {_takes(name)}")
-
-
-def _named(given: Mapping[str, object] | Iterable[str]) -> dict[str, object]:
-    return dict(given if isinstance(given, Mapping) else map(_pair, given))
+def _named(values: Mapping[str, object] | Iterable[str]) -> dict[str, object]:
+    return dict(values if isinstance(values, Mapping) else map(_pair, values))
 
 
 def _pair(text: str) -> tuple[str, str]:
     name, sign, value = text.partition("=")
     if not (sign and value.strip()):
-        raise SettingsError(f"a setting is given as group.name=value, got {text!r}")
+        raise SettingsError(f"{text!r} is not a setting: expected group.name=value")
     return name.strip(), value.strip()
 
 
 def read_toml(path: Path, kind: type[CatstreamError]) -> dict[str, object]:
-    """The tables of a TOML file; raises an error of this kind if it cannot be read, or is none."""
+    """Read the tables of a TOML file; raises an error of this kind if it cannot be read or parsed."""
     try:
         with path.open("rb") as file:
             return tomllib.load(file)

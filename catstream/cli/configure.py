@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from itertools import groupby
 from pathlib import Path
 
 import click
@@ -110,7 +111,8 @@ def settings(words: tuple[str, ...], as_json: bool) -> None:
 
     With words, only those whose name or description has all of them. Set them
     with --set GROUP.NAME=VALUE, in a TOML file with a table for each group
-    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME).
+    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME). Expert
+    settings, for experiments and the presets of the paper, come last.
 
     \b
     EXAMPLES
@@ -118,18 +120,24 @@ def settings(words: tuple[str, ...], as_json: bool) -> None:
       catstream settings coreset
       catstream settings --json | jq -r '.[].name'
     """
-    rows = [row for row in describe() if all(word.lower() in f"{row[0]} {row[3]}".lower() for word in words)]
-    if not rows:
+    matches = [
+        setting
+        for setting in describe().values()
+        if all(word.lower() in f"{setting.name} {setting.about}".lower() for word in words)
+    ]
+    if not matches:
         raise SettingsError(f"no setting has {' and '.join(map(repr, words))} in its name or description")
+    matches.sort(key=lambda setting: setting.expert)
     if as_json:
-        keys = ("name", "takes", "default", "meaning")
-        click.echo(json.dumps([dict(zip(keys, row, strict=True)) for row in rows], indent=2))
+        keys = ("name", "takes", "default", "about", "expert", "resumable")
+        click.echo(json.dumps([{key: getattr(setting, key) for key in keys} for setting in matches], indent=2))
         return
     if not sys.stdout.isatty():
-        for name, takes, default, meaning in rows:
-            click.echo(f"{name}\t{default}\t{takes}\t{meaning}")
+        for setting in matches:
+            click.echo(f"{setting.name}\t{setting.default}\t{setting.takes}\t{setting.about}")
         return
-    shown = table("setting", "default", "takes", "meaning")
-    for name, takes, default, meaning in rows:
-        shown.add_row(name, str(default), takes, meaning)
-    screen().print(shown)
+    for expert, group in groupby(matches, key=lambda setting: setting.expert):
+        rows = table("expert setting" if expert else "setting", "default", "takes", "meaning")
+        for setting in group:
+            rows.add_row(setting.name, str(setting.default), setting.takes, setting.about)
+        screen().print(rows)

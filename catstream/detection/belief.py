@@ -65,7 +65,7 @@ class Policy:
 
 @lru_cache(maxsize=8)
 def policies(interval: int) -> Mapping[Level, Policy]:
-    """The policy of each level; `interval` is the setting `search.whole_interval`."""
+    """The policy of each level; `interval` is the setting `search.full_interval`."""
     yes, no = True, False
     return MappingProxyType(
         {  #                    report resize teach search_interval
@@ -96,8 +96,8 @@ def update_level(state: DetectorState, score: float, redetected: bool, belief: B
 
 
 def is_redetection(score: float, local_score: float, belief: BeliefSettings) -> bool:
-    """Whether the best window elsewhere replaces the local one: it is confident, and leads by `belief.jump_margin`."""
-    return score > belief.confident_score and score > local_score + belief.jump_margin
+    """Whether the best window elsewhere replaces the local one: it is confident, and leads by the margin."""
+    return score > belief.confident_score and score > local_score + belief.redetection_margin
 
 
 def at_rest(centre: tuple[float, float], motion: Motion) -> np.ndarray:

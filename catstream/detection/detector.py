@@ -74,7 +74,7 @@ class Detector:
         box = Box(*map(float, box)).validated(*frame.size)
         window = Window.around(box, self.settings.search.context)
         seed = (self.settings.run.seed, seq - 1)
-        if self.settings.teaching.bootstrap == "scm":
+        if self.settings.training.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
 
             scm = SparseCollaborativeModel(frame.image, box, np.random.default_rng(seed))
@@ -134,8 +134,8 @@ class Detector:
             return False
         # One frame of each block trains, and in the next block the one after it, because other intervals are even. The
         # checksum of the name distributes several objects over the frames of a block.
-        block, position = divmod(seq + crc32(self.name.encode()), self.settings.teaching.interval)
-        is_due = position == block % self.settings.teaching.interval
+        block, position = divmod(seq + crc32(self.name.encode()), self.settings.training.interval)
+        is_due = position == block % self.settings.training.interval
         return detection.score >= _EXPLAINED and not is_due
 
     def _is_still(self, detection: Detection, seq: int) -> bool:
@@ -238,4 +238,4 @@ def training_rows(context: FrameContext, state: DetectorState, detection: Detect
 
 
 def _policy(state: DetectorState, settings: Settings) -> belief.Policy:
-    return belief.policies(settings.search.whole_interval)[state.level]
+    return belief.policies(settings.search.full_interval)[state.level]

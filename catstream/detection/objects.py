@@ -39,7 +39,7 @@ class Detectors:
     """
 
     def __init__(self, settings: Settings, network: str = "") -> None:
-        if settings.teaching.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
+        if settings.training.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
             import catstream.paper.scm  # noqa: F401
         self.settings, self.descriptor = settings, descriptor_of(settings, network)
         self.seq = 0
@@ -55,7 +55,7 @@ class Detectors:
         return self.detectors[name]
 
     def _new_detector(self, name: str) -> Detector:
-        check_count(len(self.detectors) + 1, self.settings.run.objects_most)
+        check_count(len(self.detectors) + 1, self.settings.run.max_objects)
         return Detector(self.settings, check_name(name), self.descriptor)
 
     @property

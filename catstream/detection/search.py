@@ -69,7 +69,7 @@ def find(context: FrameContext, state: DetectorState) -> Detection:
         return replace(best, redetected=not best.window.overlap(state.window))
     nearby = _search_near(context, state.window, state.first_window)
     level = belief.level_of(nearby.score, state.trusted, settings.belief)
-    interval = belief.policies(settings.search.whole_interval)[level].search_interval
+    interval = belief.policies(settings.search.full_interval)[level].search_interval
     other = _search_elsewhere(context, last_confident, interval) if interval else None
     if other is not None and belief.is_redetection(other.score, nearby.score, settings.belief):
         other = _search_near(context, other.window, state.first_window)
@@ -237,7 +237,7 @@ def _search_all_sizes(
     rival_map = max(others, key=lambda part: float(part.scores.max()))
     rival_score = max(float(rival_map.scores.max()), 0.0)
     lead = best.score - rival_score
-    if best_similarity < context.settings.belief.sighting_similarity or lead < _MIN_LEAD:
+    if best_similarity < context.settings.belief.min_similarity or lead < _MIN_LEAD:
         return best, False
     rival_similarity = similarity(rival_map.cells.row(*rival_map.argmax())) if rival_score else 0.0
     return best, lead >= _LEAD_OVER_SIMILAR or rival_similarity < best_similarity / 2

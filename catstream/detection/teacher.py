@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from catstream.base.box import Box, Window
-from catstream.base.settings import Settings, TeachingSettings
+from catstream.base.settings import Settings, TrainingSettings
 from catstream.detection import extent
 from catstream.detection.context import FrameContext
 from catstream.detection.search import due_part
@@ -67,16 +67,16 @@ def first_training(
     If SCM tracks the object first, the group "appearance" has only the rows of an ordinary frame. BoxError if object
     and background are indistinguishable.
     """
-    teaching = settings.teaching
+    options = settings.training
     count = settings.coreset.size
     around = ScoreMap.around(frame, window, _SIDE, None)
-    if teaching.bootstrap == "scm":
-        rows = _appearance(frame, window, around, rng, teaching, hardest=0)
+    if options.bootstrap == "scm":
+        rows = _appearance(frame, window, around, rng, options, hardest=0)
     else:
-        context, moved = settings.search.context, teaching.other_backgrounds
+        context, moved = settings.search.context, options.other_backgrounds
         copies = affine_copies(frame, window, count, rng, around.vectors, context=context, moved=moved)
-        rows = _rows(copies, 1, _OBJECT_WEIGHT, teaching)
-        rows += _surroundings(around, window, count, 0, rng, teaching)
+        rows = _rows(copies, 1, _OBJECT_WEIGHT, options)
+        rows += _surroundings(around, window, count, 0, rng, options)
     training = _first_extents(frame, window, rng, settings)
     rows += hard_negatives(FrameContext(frame, initial_model(rows), settings), window)
     return initial_model(rows), {APPEARANCE: rows, **training}
@@ -106,7 +106,7 @@ def training_at(
     rng = np.random.default_rng((settings.run.seed, context.seq))  # of this frame alone, so that a restart repeats it
     if around is None or min(around.cells.shape) < _SIDE:
         around = context.scores_around(window, _SIDE)
-    rows = _appearance(context.pyramid, window, around, rng, settings.teaching, hardest=_BACKGROUND // 2)
+    rows = _appearance(context.pyramid, window, around, rng, settings.training, hardest=_BACKGROUND // 2)
     training = {APPEARANCE: rows}
     if extents:
         training |= _extents(context.pyramid, window, around.vectors, rows, settings)
@@ -120,16 +120,16 @@ def training_of_background(context: FrameContext, window: Window, similarity: Si
     """
     settings = context.settings
     scores = context.scores_of_frame(window)
-    rows = _hardest(context, scores, window, settings.teaching.hard_negatives, settings.belief.weak_score)
-    dissimilar = rows[[similarity(row) < settings.belief.sighting_similarity for row in rows]]
-    return {APPEARANCE: _rows(dissimilar, 0, 1, settings.teaching)} if len(dissimilar) else {}
+    rows = _hardest(context, scores, window, settings.training.hard_negatives, settings.belief.weak_score)
+    dissimilar = rows[[similarity(row) < settings.belief.min_similarity for row in rows]]
+    return {APPEARANCE: _rows(dissimilar, 0, 1, settings.training)} if len(dissimilar) else {}
 
 
 def hard_negatives(context: FrameContext, window: Window) -> TrainingRows:
     """The windows of the whole frame with the highest scores, except those that overlap the object's window."""
-    teaching = context.settings.teaching
-    rows = _hardest(context, context.scores_of_frame(window), window, teaching.hard_negatives)
-    return _rows(rows, 0, 1, teaching)
+    options = context.settings.training
+    rows = _hardest(context, context.scores_of_frame(window), window, options.hard_negatives)
+    return _rows(rows, 0, 1, options)
 
 
 def _mine(context: FrameContext, window: Window) -> TrainingRows | None:
@@ -138,19 +138,19 @@ def _mine(context: FrameContext, window: Window) -> TrainingRows | None:
     The parts have equal shares of the rows, so that the number of rows over many frames does not depend on that of the
     parts.
     """
-    teaching = context.settings.teaching
+    options = context.settings.training
     parts = context.pyramid.region_around(window).split(window, _MAX_CELLS)
     number = due_part(context.seq, _MINING_INTERVAL, len(parts))
     if number is None:
         return None
     # A round of all parts has hard_negatives / _MINING_INTERVAL rows for every frame that it takes.
-    rows = teaching.hard_negatives * max(len(parts), _MINING_INTERVAL)
+    rows = options.hard_negatives * max(len(parts), _MINING_INTERVAL)
     shares = len(parts) * _MINING_INTERVAL
     count = (number + 1) * rows // shares - number * rows // shares
     if not count:
         return None
     scores = context.scores_within(parts[number], window, described=True)
-    return _rows(_hardest(context, scores, window, count), 0, 1, teaching)
+    return _rows(_hardest(context, scores, window, count), 0, 1, options)
 
 
 def _hardest(
@@ -299,18 +299,18 @@ def _appearance(
     window: Window,
     around: ScoreMap,
     rng: np.random.Generator,
-    teaching: TeachingSettings,
+    options: TrainingSettings,
     *,
     hardest: int,
 ) -> TrainingRows:
     """Rows of the object, of affine copies of it, of near misses and of background, `hardest` of it by score."""
-    own = affine_copies(frame, window, 1 + teaching.copies, rng, around.vectors, mirrored=teaching.mirrored)
-    rows = _rows(own, 1, _OBJECT_WEIGHT / len(own), teaching)
-    return rows + _surroundings(around, window, _BACKGROUND, hardest, rng, teaching)
+    own = affine_copies(frame, window, 1 + options.copies, rng, around.vectors, mirrored=options.mirrored_copies)
+    rows = _rows(own, 1, _OBJECT_WEIGHT / len(own), options)
+    return rows + _surroundings(around, window, _BACKGROUND, hardest, rng, options)
 
 
 def _surroundings(
-    around: ScoreMap, window: Window, count: int, hardest: int, rng: np.random.Generator, teaching: TeachingSettings
+    around: ScoreMap, window: Window, count: int, hardest: int, rng: np.random.Generator, options: TrainingSettings
 ) -> TrainingRows:
     """Near misses of a window, and `count` background windows: those with the highest scores, and random ones."""
     row, column = around.place(window)
@@ -320,7 +320,7 @@ def _surroundings(
     is_background = np.maximum.outer(down, across) > _NEAR + 0.5
     near, far = np.flatnonzero(~is_background), np.flatnonzero(is_background)  # indices of windows, row by row
     places, labels = [], []
-    for index in near[rng.integers(len(near), size=teaching.near_misses)] if len(near) else ():
+    for index in near[rng.integers(len(near), size=options.near_misses)] if len(near) else ():
         place = divmod(int(index), columns)
         distance = math.hypot(down[place[0]], across[place[1]])
         if distance > _MIN_DISTANCE:
@@ -329,7 +329,7 @@ def _surroundings(
     hard = non_maximum_suppression(np.where(is_background, around.scores, -np.inf), hardest, _NEAR)
     random = rng.choice(far, count - len(hard), replace=count > len(far))
     background = [*hard, *(divmod(int(index), columns) for index in random)]
-    return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, teaching)
+    return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, options)
 
 
 def _extents(
@@ -341,7 +341,7 @@ def _extents(
         return {}
     of_vectors = [] if vectors is None else [vectors.row(trial.window) for trial in trials]
     cuts = window_rows([frame.around(trial.window, WINDOW) for trial in trials], of_vectors)
-    return {EXTENT: _fits([extent.Trial(window), *trials], np.vstack([rows.rows[:1], cuts]), 1, settings.teaching)}
+    return {EXTENT: _fits([extent.Trial(window), *trials], np.vstack([rows.rows[:1], cuts]), 1, settings.training)}
 
 
 def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, settings: Settings) -> Training:
@@ -355,7 +355,7 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
     cuts = [cut for kind in kinds for cut in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings)]
     trials, patches, vectors = zip(*cuts, strict=True)
     rows = window_rows(patches, [row for row in vectors if row is not None])
-    return {EXTENT: _fits(trials, rows, 1 / len(kinds), settings.teaching)}
+    return {EXTENT: _fits(trials, rows, 1 / len(kinds), settings.training)}
 
 
 def _first_cuts(
@@ -368,7 +368,7 @@ def _first_cuts(
     for number in range(math.ceil(settings.coreset.size / len(trials))):
         right, down, turn = rng.normal(size=3) if number else np.zeros(3)
         copy = _shifted(window, right, down)
-        offset = _random_offset(window, rng) if _is_moved(number, settings.teaching.other_backgrounds) else None
+        offset = _random_offset(window, rng) if _is_moved(number, settings.training.other_backgrounds) else None
         vectors = None
         for trial in trials:
             cut = trial.window.centred(*copy.centre)
@@ -378,11 +378,11 @@ def _first_cuts(
             yield trial, patch, None if vectors is None else vectors.row(cut)
 
 
-def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, teaching: TeachingSettings) -> TrainingRows:
+def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, options: TrainingSettings) -> TrainingRows:
     """Rows of group "extent" of trials, from their feature rows."""
     labels = [_gaussian(trial.larger + trial.wider, _EXTENT_SIGMA) for trial in trials]  # one of the two is 0
     offsets = [(extent.offset_label(trial.larger), extent.offset_label(trial.wider)) for trial in trials]
-    return replace(_rows(cuts, labels, weight, teaching), offsets=np.array(offsets, np.float32))
+    return replace(_rows(cuts, labels, weight, options), offsets=np.array(offsets, np.float32))
 
 
 def _gaussian(offset: float, sigma: float) -> float:
@@ -390,9 +390,9 @@ def _gaussian(offset: float, sigma: float) -> float:
     return math.exp(-((offset / sigma) ** 2) / 2)
 
 
-def _rows(rows: np.ndarray, labels: float | list[float], weight: float, teaching: TeachingSettings) -> TrainingRows:
-    """Training rows of one weight. Without `teaching.colours`, the histogram of colours is set to 0."""
-    if not teaching.colours:
+def _rows(rows: np.ndarray, labels: float | list[float], weight: float, options: TrainingSettings) -> TrainingRows:
+    """Training rows of one weight. Without `training.colours`, the histogram of colours is set to 0."""
+    if not options.colours:
         rows = rows.copy()
         rows[:, COLOURS] = 0
     return TrainingRows.labelled(rows, labels, weight)

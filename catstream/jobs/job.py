@@ -19,7 +19,7 @@ import msgspec
 from catstream.base.box import Box
 from catstream.base.files import writing
 from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_count
-from catstream.base.settings import Settings
+from catstream.base.settings import Settings, describe
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
@@ -29,9 +29,6 @@ from catstream.video.source import ALL_FRAMES, source_text
 Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
 _NAME = "job.safetensors"
-
-#: Settings that do not affect the training, beside all times: a run can be resumed with other values.
-_FREE = {"run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +128,7 @@ class Job:
                 f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: "
                 "give one of them"
             )
-        check_count(len(self.boxes) + len(self.models), self.settings.run.objects_most)
+        check_count(len(self.boxes) + len(self.models), self.settings.run.max_objects)
 
     @classmethod
     def new(
@@ -237,13 +234,13 @@ class Job:
 
 
 def changed_setting(before: Settings, after: Settings) -> str:
-    """The first setting that differs and may not while a run continues, with its values; empty if there is none.
+    """The first setting that differs and is not `resumable`, with its values; empty if there is none.
 
     >>> changed_setting(Settings(), Settings(coreset={"size": 32}, run={"lag_frames": 25}))
     'coreset.size=64, not 32'
     """
     ours, theirs = before.values(), after.values()
-    fixed = (name for name in sorted(ours.keys() - _FREE) if not name.endswith("_seconds"))
+    fixed = sorted(name for name, setting in describe().items() if not setting.resumable)
     changed = (name for name in fixed if ours[name] != theirs[name])
     return next((f"{name}={ours[name]}, not {theirs[name]}" for name in changed), "")
 

@@ -34,10 +34,10 @@ from catstream.messages.kinds import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, 
 from catstream.messages.schema import check_message
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
 
-_KIND = "learned 3"  # and the version of what the file holds
+_KIND = "saved model 4"  # kind of file, and the version of its contents
 
 #: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
-_SAME = ("coreset.size", "coreset.reduction", "search.context", "teaching.colours", "teaching.classifier")
+_SAME = ("coreset.size", "coreset.reduction", "search.context", "training.colours", "training.classifier")
 
 #: Similarity of two models, below which a merge is rejected, and below which it gives a warning: see decision 54.
 _UNLIKE, _DOUBTFUL = 0.25, 0.5

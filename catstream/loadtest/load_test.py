@@ -84,7 +84,7 @@ class Plan:
             )
         if self.source == "h264" and any(side % 2 for side in self.size):
             raise SettingsError("a frame of H.264 has an even width and an even height: give another size")
-        check_count(self.objects, self.settings.run.objects_most)
+        check_count(self.objects, self.settings.run.max_objects)
         if self.settings.run.lockstep:
             raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
         if self.settings.run.endpoint:

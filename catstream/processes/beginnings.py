@@ -102,7 +102,7 @@ class Beginnings:
             place += ", as the picture in which it was drawn is not stored any more"
         pyramids = (detectors.pyramid(one.image) for one in frames)
         first = next(pyramids)
-        check_room(name, commands.desired, self._process.settings.run.objects_most)
+        check_room(name, commands.desired, self._process.settings.run.max_objects)
         self._process.watchdog.allow()
         suffix = f" {name}" if name else ""
         if continues(command, name, commands.desired, detectors):

@@ -56,7 +56,7 @@ class _Execution:
 
     def search(self) -> Outcome:
         name, seq = object_of(self.command, self.desired), self.detectors.seq
-        check_room(name, self.desired, self.detectors.settings.run.objects_most)
+        check_room(name, self.desired, self.detectors.settings.run.max_objects)
         if self.model is None:
             raise ObjectError("missing saved model: search needs the file of one")
         desired = self.desired.with_object(name, replace(self.model, begins=seq + 1))

@@ -26,7 +26,7 @@ def main(process: Process) -> None:
                 models.send(trainer.train(message))
                 count = trained.pop(message.object, _NONE)["trained"] + 1
                 trained[message.object] = {"version": float(message.version), "trained": count}
-                if len(trained) > process.settings.run.objects_most:  # the longest ago: it was forgotten
+                if len(trained) > process.settings.run.max_objects:  # the longest ago: it was forgotten
                     del trained[next(iter(trained))]
             models.serve_late_joiners()
             process.beat(lambda: _totals(trained), lambda: trained, now=process.ending.ended)

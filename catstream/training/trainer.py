@@ -1,6 +1,6 @@
 """The trainer: trains a model on a sample of the coreset trees.
 
-The classifiers of `teaching.classifier` compute the weights of the score from these parts of the trees:
+The classifiers of `training.classifier` compute the weights of the score from these parts of the trees:
 
     least-squares  the mean of the object; the mean and the rows of the background
     joint          the same, and the rows of the loss tree
@@ -37,7 +37,7 @@ class Trainer:
         all models are comparable. ProtocolError if object and background have the same mean in the sample.
         """
         self._regressions[sample.object] = self._regressions.pop(sample.object, {})
-        if len(self._regressions) > self.settings.run.objects_most:  # the oldest is that of a forgotten object
+        if len(self._regressions) > self.settings.run.max_objects:  # the oldest is that of a forgotten object
             del self._regressions[next(iter(self._regressions))]
         background_mean = sample.trees["background"].mean
         difference = sample.trees["object"].mean - background_mean
@@ -57,11 +57,11 @@ class Trainer:
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings
-        if settings.teaching.classifier == "one-class":
+        if settings.training.classifier == "one-class":
             from catstream.paper.one_class import one_class  # two seconds, for sklearn
 
             return [one_class(sample.trees["object"].rows, sample.trees["background"].mean)]
-        if settings.teaching.classifier == "least-squares":
+        if settings.training.classifier == "least-squares":
             return [_discriminant(sample)]
         return [
             _discriminant(sample),

@@ -137,15 +137,15 @@ def _displayed(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return image[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1]
 
 
-def open_video(text: str, hardware: str, **options: Any) -> InputContainer:
-    """Open a video or a stream with PyAV, to be decoded by a device of the kind `hardware` if that is not empty.
+def open_video(text: str, hwaccel: str, **options: Any) -> InputContainer:
+    """Open a video or a stream with PyAV, to be decoded by a device of the kind `hwaccel` if that is not empty.
 
     Raises PyAV's errors, and VideoError if there is no such device, or it cannot decode this video.
     """
     import av
     from av.codec.hwaccel import HWAccel, hwdevices_available
 
-    device = HWAccel(hardware, allow_software_fallback=False) if hardware else None
+    device = HWAccel(hwaccel, allow_software_fallback=False) if hwaccel else None
     try:
         # Text in the file, as its title, may be in any encoding.
         opened: InputContainer = av.open(text, hwaccel=device, metadata_errors="replace", **options)
@@ -153,8 +153,8 @@ def open_video(text: str, hardware: str, **options: Any) -> InputContainer:
         if device is None:
             raise
         raise VideoError(
-            f"no device of the kind {hardware!r} can decode this video here ({error}): this FFmpeg knows "
-            f"{', '.join(hwdevices_available())}; without run.hardware, the processor decodes it"
+            f"no device of the kind {hwaccel!r} can decode this video here ({error}): this FFmpeg knows "
+            f"{', '.join(hwdevices_available())}; without run.hwaccel, the processor decodes it"
         ) from None
     return opened
 

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _IDLE_SECONDS = 0.1
 _QUIET_SECONDS = 600.0  # between two log lines with the same reason
 _LONGEST_SEGMENT, _LONGEST_PLAYLIST = 20.0, 60.0  # seconds; of a segment, HLS recommends 6
-_SLOW = "check the camera; if it is slow, raise run.open_seconds or run.silent_seconds"
+_SLOW = "check the camera; if it is slow, raise run.open_timeout_seconds or run.read_timeout_seconds"
 _ENDED, _INVALID = "end of stream", "no readable video"
 _SILENT, _NO_FRAME = f"no data: {_SLOW}", f"data without video frames: {_SLOW}"
 
@@ -92,7 +92,7 @@ class LiveSource(Source):
         reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected."""
         silent = monotonic() - self._last_frame_time
         # FFmpeg has no timeout for a device that hangs, so a long silence counts as a loss, too.
-        limits = self._settings.open_seconds, self._settings.silent_seconds, self._settings.poll_seconds
+        limits = self._settings.open_timeout_seconds, self._settings.read_timeout_seconds, self._settings.poll_seconds
         lost = silent if self._problem or silent > sum(limits) else 0.0
         return {"skipped": self.skipped, "reconnects": self.reconnects, "lost_seconds": lost}
 
@@ -173,7 +173,7 @@ class LiveSource(Source):
                 self._store_newest(monotonic(), decoded)
                 frames += 1
         except av.FFmpegError as error:
-            if monotonic() - max(begin, self._last_frame_time) >= self._settings.silent_seconds:
+            if monotonic() - max(begin, self._last_frame_time) >= self._settings.read_timeout_seconds:
                 return Loss("silent", frames, _SILENT)  # FFmpeg's messages for a timeout are unclear
             if isinstance(error, av.InvalidDataError):
                 return Loss("invalid", frames, _INVALID)
@@ -194,11 +194,12 @@ class LiveSource(Source):
         While it is unknown whether FFmpeg's probing succeeds, a part of the time is reserved for the other demuxer.
         TimeoutError, with the reason, if data arrives without frames, or a packet was cut off because nothing arrives.
         """
-        settings, due = self._settings, begin + self._settings.open_seconds
+        settings, due = self._settings, begin + self._settings.open_timeout_seconds
         if _is_http(self._text) and not attempt.demuxer and not attempt.proven:
-            due -= settings.open_seconds / 5
-        timeouts = max(1.0, due - monotonic()), settings.silent_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
-        with _open_container(self._text, attempt.demuxer, timeouts, settings.hardware) as container:
+            due -= settings.open_timeout_seconds / 5
+        read_timeout = settings.read_timeout_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
+        timeouts = max(1.0, due - monotonic()), read_timeout
+        with _open_container(self._text, attempt.demuxer, timeouts, settings.hwaccel) as container:
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
@@ -208,18 +209,18 @@ class LiveSource(Source):
                 if self._closed:
                     return
                 if now > due:
-                    raise TimeoutError(_SILENT if now - before > 0.9 * settings.silent_seconds else _NO_FRAME)
+                    raise TimeoutError(_SILENT if now - before > 0.9 * settings.read_timeout_seconds else _NO_FRAME)
                 if packet.stream_index != stream.index:  # audio, which may continue without the video
                     continue
                 sent = None if packet.pts is None or is_segmented else float(packet.pts * packet.time_base)
                 if backlog.drops(now, sent, is_key=packet.is_keyframe):
                     self.skipped += 1
-                    due = now + settings.silent_seconds
+                    due = now + settings.read_timeout_seconds
                     continue
                 for frame in _undamaged(stream, packet):
                     if not is_segmented or self._is_next(frame):
                         yield frame
-                    due = monotonic() + settings.silent_seconds + is_segmented * _LONGEST_SEGMENT
+                    due = monotonic() + settings.read_timeout_seconds + is_segmented * _LONGEST_SEGMENT
                 backlog.is_decoded(monotonic())
 
     def _is_next(self, frame: VideoFrame) -> bool:
@@ -312,12 +313,12 @@ def _is_http(text: str) -> bool:
     return text.startswith(("http:", "https:"))
 
 
-def _open_container(text: str, demuxer: str | None, timeouts: tuple[float, float], hardware: str) -> InputContainer:
+def _open_container(text: str, demuxer: str | None, timeouts: tuple[float, float], hwaccel: str) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     is_address = "://" in text
     container = open_video(
         f"/dev/video{text}" if text.isdigit() else text,
-        hardware,
+        hwaccel,
         format=demuxer if is_address else "v4l2",
         options=_JPEG_OPTIONS if demuxer else _OPTIONS,
         timeout=timeouts,

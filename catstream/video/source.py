@@ -140,7 +140,7 @@ def open_source(
     idle      is called ten times a second while a live source gives no frame; if it returns True, iteration ends. With
               it, opening a live source never fails: iteration waits for the first frame for any length of time, and the
               size is known with that frame
-    settings  the settings of a run, of which `image_rate`, `hardware`, `skip_damaged` and `resize` are used
+    settings  the settings of a run, of which `image_rate`, `hwaccel`, `skip_damaged` and `resize` are used
     single    single ones of them by name, in the place of those in `settings`
 
     VideoError if the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the
@@ -288,7 +288,7 @@ class _Video:
 
         self.path, self.settings, self.damaged, self.scaled = path, settings, 0, 0
         try:
-            self.container = open_video(str(path.absolute()), settings.hardware)
+            self.container = open_video(str(path.absolute()), settings.hwaccel)
         except (av.FFmpegError, OSError) as error:
             raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {EXPECTED}") from None
         self.stream = video_stream(self.container)

@@ -57,9 +57,9 @@ WAYS = {
         ("run.checkpoint_seconds", float("nan"), "float > 0, <= 3600"),
         ("belief.trusted_score", float("inf"), "float"),
         ("run.lockstep", 7, "bool"),
-        ("teaching.classifier", "wrong", "joint | least-squares | one-class"),
-        ("teaching.classifier", "\udcff", "joint | least-squares | one-class"),
-        ("teaching.near_misses", 257, "int >= 0, <= 256"),
+        ("training.classifier", "wrong", "joint | least-squares | one-class"),
+        ("training.classifier", "\udcff", "joint | least-squares | one-class"),
+        ("training.near_misses", 257, "int >= 0, <= 256"),
     ],
 )
 def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(way, name, value, takes):
@@ -100,7 +100,7 @@ def test_an_empty_variable_of_a_setting_is_an_error(variable):
         ("lockstep", "there is no setting 'lockstep', did you mean 'run.lockstep'"),
         ("keys", "there is no setting 'keys', did you mean 'run.keys'"),
         ("qqq", r"there is no setting 'qqq': `catstream settings` lists all \d+$"),
-        ("coreset", "the group of settings coreset cannot be 1: give a CoresetSettings"),
+        ("coreset", "the group of settings coreset cannot be 1: pass a CoresetSettings"),
     ],
 )
 def test_a_name_without_its_group_one_like_no_other_and_an_invalid_group_are_rejected(name, why):

@@ -14,7 +14,7 @@ from catstream.detection.belief import at_rest, predict, update
 from catstream.messages.kinds import DetectorState, Motion
 
 SETTINGS = Settings()
-BELIEF, TABLE = SETTINGS.belief, belief.policies(SETTINGS.search.whole_interval)
+BELIEF, TABLE = SETTINGS.belief, belief.policies(SETTINGS.search.full_interval)
 WINDOW = Window(60.0, 50.0, 48.0, 40.0)
 ACTIONS = ("report", "resize", "teach")
 SCORES = st.floats(-1, 2, width=32)

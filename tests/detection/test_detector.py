@@ -56,7 +56,7 @@ def started(scene, settings=()):
 
 @pytest.mark.parametrize("moved", [0.0, 0.9])
 def test_the_first_frame_teaches_a_leaf_of_each_tree(scene, moved):
-    detector = Follower({"teaching.other_backgrounds": moved})
+    detector = Follower({"training.other_backgrounds": moved})
     track, features = detector.start(scene((60, 50)), START, time=2.5)
     assert (track.seq, track.frame, track.state, track.time) == (1, 0, "bootstrapping", 2.5)
     assert track.box == pytest.approx(START)
@@ -95,7 +95,7 @@ def test_of_a_still_scene_every_seventh_frame_teaches_and_of_a_moving_one_every_
 
 @pytest.mark.parametrize("interval", [1, 2, 3])
 def test_of_the_frames_that_the_model_explains_a_part_teaches_once_the_object_is_known(scene, interval):
-    detector = started(scene, {"teaching.interval": interval})
+    detector = started(scene, {"training.interval": interval})
     detector.adopt(dataclasses.replace(detector.model, version=1))
     steps = [detector.step(scene((60 + 2 * (number % 2) + number // 2, 50))) for number in range(80)]
     taught = [bool(features.training) for _, features in steps]
@@ -115,7 +115,7 @@ def test_an_object_that_left_is_absent_and_teaches_nothing(scene):
 
 def test_each_frame_that_scm_follows_is_learned_from_whatever_its_score(scene):
     """Otherwise n rows might never make the first leaf, and SCM would follow the object to the end."""
-    detector = started(scene, {"teaching.bootstrap": "scm"})
+    detector = started(scene, {"training.bootstrap": "scm"})
     track, features = detector.step(scene())
     assert track.score < detector.settings.belief.confident_score
     assert features.training
@@ -287,7 +287,7 @@ def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(two, l
     rows = [rows for each in features for rows in each.training.values()]
     assert rows
     assert all(not each.labels.any() for each in rows)
-    assert all(similarity(row) < Settings().belief.sighting_similarity for each in rows for row in each.rows)
+    assert all(similarity(row) < Settings().belief.min_similarity for each in rows for row in each.rows)
 
 
 def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned, similarity):

@@ -16,7 +16,7 @@ from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import Model
 
 OBJECT = Window(120, 80, 64, 64)
-SETTINGS = Settings(teaching={"near_misses": 200})
+SETTINGS = Settings(training={"near_misses": 200})
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
     around = ScoreMap.around(frame, OBJECT, 20, model)
     edge = around.window(0, 12)
     rows, own, misses, background = cut(frame, model, around, edge)
-    assert own.sum() == 1 + SETTINGS.teaching.copies
+    assert own.sum() == 1 + SETTINGS.training.copies
     assert background.sum() == 12
     assert misses.any()
     assert np.isfinite(rows.rows).all()
@@ -105,7 +105,7 @@ def test_without_a_weight_of_the_extent_head_it_has_no_rows(frame, model):
 def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
     rows = teacher.hard_negatives(FrameContext(frame, model, SETTINGS), OBJECT)
     scores = rows.rows @ model.weights
-    assert 0 < len(rows) <= SETTINGS.teaching.hard_negatives
+    assert 0 < len(rows) <= SETTINGS.training.hard_negatives
     assert list(scores) == sorted(scores, reverse=True)
     assert not rows.labels.any()
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
@@ -114,7 +114,7 @@ def test_hard_negatives_score_highest_and_do_not_show_the_object(frame, model):
 
 def test_colours_that_are_not_used_are_0_in_every_row(frame, model):
     for used in (True, False):
-        settings = SETTINGS.replace({"teaching.colours": used})
+        settings = SETTINGS.replace({"training.colours": used})
         first, training = teacher.first_training(frame, OBJECT, np.random.default_rng(1), settings)
         groups = [*training.values(), *teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT).values()]
         assert all(group.rows[:, COLOURS].any() == used for group in groups)

@@ -176,7 +176,7 @@ def test_a_contradictory_plan_is_an_error(facts, said):
 def test_a_plan_has_at_most_as_many_objects_as_the_settings_allow():
     assert "8 objects" in str(Plan(objects=8))
     with pytest.raises(ObjectError, match="8 objects are more than 4"):
-        Plan(objects=8, settings=Settings(run={"objects_most": 4}))
+        Plan(objects=8, settings=Settings(run={"max_objects": 4}))
 
 
 @given(st.floats(0.5, 1000), st.floats(0.5, 1000))

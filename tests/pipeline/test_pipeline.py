@@ -198,5 +198,5 @@ def test_frames_in_memory_are_rejected_with_the_way_to_go(frames):
 
 def test_a_run_starts_with_more_objects_than_by_default_if_the_setting_allows_them(video):
     boxes = {f"n{number}": video[1][0] for number in range(33)}
-    with Pipeline(video[0], boxes, {"run.objects_most": 33}, part=slice(0, 1)) as pipeline:
+    with Pipeline(video[0], boxes, {"run.max_objects": 33}, part=slice(0, 1)) as pipeline:
         assert {track.object for track in pipeline} == boxes.keys()

@@ -20,7 +20,7 @@ SAVED = DesiredObject(BOX, 1, "digest", 1000, 5)
 @pytest.fixture
 def tracked():
     """Detectors after frame 6, of which anna has model 4, ben none, and carl is searched for."""
-    detectors = Detectors(Settings(run={"objects_most": 4}))
+    detectors = Detectors(Settings(run={"max_objects": 4}))
     for name, version, first in (("anna", 4, PLACE), ("ben", 0, PLACE), ("carl", 5, None)):
         detector = detectors.add(name)
         detector.state = DetectorState(0, "weak", PLACE, PLACE, first)

@@ -52,7 +52,7 @@ def test_a_model_that_is_damaged_or_was_removed_is_missing(learned, tmp_path, ca
 @pytest.mark.parametrize("has_state", [True, False])
 def test_the_model_of_a_search_that_is_rejected_is_not_kept(learned, folder, tmp_path, monkeypatch, has_state):
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of this process stay
-    settings = Settings(coreset={"size": 8}, run={"objects_most": 1})
+    settings = Settings(coreset={"size": 8}, run={"max_objects": 1})
     state = tmp_path if has_state else None
     job = Job("walk.mp4", {"ben": Box(1, 2, 30, 40)}, settings=settings, endpoint=str(folder), state=state)
     with closing(Process("detector", job)) as process, ExitStack() as stack:

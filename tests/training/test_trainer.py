@@ -37,7 +37,7 @@ def cuts(sample, rng):
 
 @pytest.mark.parametrize("classifier", ["joint", "least-squares", "one-class"])
 def test_the_score_is_0_at_the_backgrounds_mean_and_1_at_the_objects(sample, classifier):
-    model = Trainer(Settings(teaching={"classifier": classifier})).train(sample)
+    model = Trainer(Settings(training={"classifier": classifier})).train(sample)
     assert model.weights @ sample.trees["background"].mean + model.bias == pytest.approx(0, abs=1e-4)
     assert model.weights @ sample.trees["object"].mean + model.bias == pytest.approx(1, abs=1e-4)
     assert (model.version, model.frame, model.weights.dtype) == (sample.version, sample.frame, np.float32)
@@ -84,6 +84,6 @@ def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_betwe
     """The rows of a tiny coreset may lie beyond the background, seen from the mean of all they stand for."""
     there, background = sample.trees["object"], sample.trees["background"].mean
     few = with_tree(sample, "object", dataclasses.replace(there, rows=2 * background - there.rows))
-    model = Trainer(Settings(teaching={"classifier": "one-class"})).train(few)
-    between = Trainer(Settings(teaching={"classifier": "least-squares"})).train(few)
+    model = Trainer(Settings(training={"classifier": "one-class"})).train(few)
+    between = Trainer(Settings(training={"classifier": "least-squares"})).train(few)
     np.testing.assert_allclose(model.weights, between.weights, atol=1e-6)  # BLAS need not round the same twice

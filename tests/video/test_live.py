@@ -115,7 +115,7 @@ def test_a_camera_that_disconnects_is_reconnected(camera, until):
 
 def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
     cam = camera(numbered)
-    with open_source(cam.url, silent_seconds=0.5) as source:
+    with open_source(cam.url, read_timeout_seconds=0.5) as source:
         next(source)
         cam.sends.clear()
         until(lambda: source.counters["lost_seconds"] > 0.5)
@@ -147,7 +147,7 @@ def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reconnected(tmp
             request.wfile.write(data[start : start + len(data) // 200])
             time.sleep(0.3 if start > len(data) // 4 else 0)
 
-    with open_source(f"{served(send)}/a.ts", silent_seconds=1) as source:
+    with open_source(f"{served(send)}/a.ts", read_timeout_seconds=1) as source:
         began = time.monotonic()
         until(lambda: source.reconnects)
         assert time.monotonic() - began < 20, "the sound lasts longer"
@@ -225,8 +225,8 @@ def test_a_camera_that_does_not_exist_is_an_error():
 
 
 def test_a_device_that_cannot_decode_a_stream_is_an_error(camera):
-    with pytest.raises(VideoError, match=r"no device of the kind 'abacus' can decode.*without run.hardware"):
-        open_source(camera(numbered).url, hardware="abacus")
+    with pytest.raises(VideoError, match=r"no device of the kind 'abacus' can decode.*without run.hwaccel"):
+        open_source(camera(numbered).url, hwaccel="abacus")
 
 
 def test_with_an_idle_function_the_first_frame_is_waited_for_too(camera):
@@ -302,7 +302,7 @@ def test_mjpeg_is_read_whatever_its_parts_say(served, caplog, part):
             request.wfile.write(part % {b"size": len(jpeg(number)), b"jpeg": jpeg(number)})
             time.sleep(0.02)
 
-    with open_source(f"{served(send)}/video", open_seconds=4, silent_seconds=2) as source:
+    with open_source(f"{served(send)}/video", open_timeout_seconds=4, read_timeout_seconds=2) as source:
         seen = [number_of(next(source).image) for _ in range(20)]
     assert seen == sorted(set(seen))
     assert not caplog.records
@@ -317,7 +317,7 @@ def test_a_text_part_is_no_loss_also_long_after_the_beginning(served, caplog):
             request.wfile.write(part % {b"size": len(jpeg(number)), b"jpeg": jpeg(number)})
             time.sleep(0.02)
 
-    with open_source(f"{served(send)}/video", open_seconds=1) as source:
+    with open_source(f"{served(send)}/video", open_timeout_seconds=1) as source:
         for _ in range(100):
             next(source)
         assert source.reconnects == 0
@@ -355,7 +355,7 @@ def test_hls_is_returned_at_the_pace_of_its_pictures_and_none_twice(tmp_path, se
         container.mux(stream.encode(None))
     monkeypatch.setattr(live, "_LONGEST_SEGMENT", 0.2)
     url, is_over = f"{served(tmp_path)}/live.m3u8", lambda: source.counters["lost_seconds"] > 2
-    with open_source(url, idle=is_over, silent_seconds=0.3) as source:  # it reconnects after its last segment
+    with open_source(url, idle=is_over, read_timeout_seconds=0.3) as source:  # it reconnects after its last segment
         times = [frame.pts for frame in source]
     assert len(times) > 25, "a segment is not skipped"
     assert times == sorted(set(times))

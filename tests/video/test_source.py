@@ -411,7 +411,7 @@ def test_a_video_without_a_frame_that_can_be_decoded_is_an_error_that_says_so(vi
 
 def test_a_device_that_cannot_decode_a_video_is_an_error_that_names_those_there_are(video):
     with pytest.raises(VideoError, match=r"no device of the kind 'abacus' can .*this FFmpeg knows .*the processor"):
-        open_source(video("a.mp4", frames=5), hardware="abacus")
+        open_source(video("a.mp4", frames=5), hwaccel="abacus")
 
 
 def test_a_closed_source_has_no_frames(video):

@@ -3,7 +3,7 @@
 import dataclasses
 import struct
 import tracemalloc
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin
 
 import msgpack
 import numpy as np
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from catstream.base.box import Box, Window
-from catstream.base.settings import RunSettings, Settings
+from catstream.base.settings import Settings, describe
 from catstream.detection.objects import Detectors
 from catstream.errors import ProtocolError
 from catstream.features.pyramid import Pyramid
@@ -169,8 +169,7 @@ def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
     detectors, ((image, box),) = Detectors(Settings()), rendered.render(1, (320, 240))
     pyramid = Pyramid(image)
     _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
-    (limit,) = get_type_hints(RunSettings, include_extras=True)["objects_most"].__metadata__
-    largest = limit.le * len(encode(features)) + LARGEST_GIVEN_MODELS
+    largest = describe()["run.max_objects"].bounds["le"] * len(encode(features)) + LARGEST_GIVEN_MODELS
     assert largest < CHANNELS["features"].limit == CHANNELS["training"].limit
 
 
