@@ -26,7 +26,7 @@ COMMANDS = {
     "watch": ("attach", "Print the messages of a running pipeline."),
     "view": ("view", "Watch and control a running pipeline in a browser."),
     "sink": ("write", "Write the tracks of a running pipeline to files and elsewhere."),
-    "export": ("write", "Make other formats from the log of a run."),
+    "export": ("export", "Convert the log of a run to other formats."),
     "status": ("attach", "Show the state of a running pipeline."),
     "set-box": ("attach", "Set the box of an object in a running pipeline."),
     "search": ("attach", "Search for the object of a saved model in a running pipeline."),

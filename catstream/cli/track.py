@@ -40,7 +40,7 @@ from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.destinations import SINKS, STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
@@ -75,7 +75,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @with_part
 @with_overrides
 @with_reading
-@with_table(sinks=True)
+@with_table(SINKS)
 def track(**options: Any) -> None:
     """Track one or several objects in a video.
 

@@ -1,8 +1,7 @@
-"""`catstream sink` and `export`: write the tracks of a running pipeline, or other formats from the log of a run."""
+"""`catstream sink`: write the tracks of a running pipeline; and the options of destinations, for other commands."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from inspect import cleandoc
@@ -18,23 +17,21 @@ from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endp
 from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
 from catstream.client.subscription import subscribe
-from catstream.errors import SilenceError, VideoError
+from catstream.errors import SilenceError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, SINKS, About, Head, Origin, TrackedFrame
+from catstream.sinks.destinations import SINKS, Origin, Row, TrackedFrame
 from catstream.sinks.events import KINDS, check_zones
-from catstream.sinks.track_log import LOGS, Log, is_log
-from catstream.video.source import open_source
 
 Command = Callable[..., Any]
 
 
-def with_table(*, sinks: bool) -> Callable[[Command], Command]:
-    """Replace {table} in the help of a command by the lines of the sinks, or of the exports."""
+def with_table(rows: Mapping[str, Row]) -> Callable[[Command], Command]:
+    """Replace {table} in the help of a command by the lines of the destinations, or of the formats."""
 
     def changed(command: Command) -> Command:
-        lines = (f"  {key:9} {row.meaning}" for key, row in (SINKS if sinks else EXPORTS).items())
+        lines = (f"  {key:9} {row.meaning}" for key, row in rows.items())
         command.__doc__ = cleandoc(command.__doc__ or "").replace("{table}", "\n".join(["\b", *lines]))
         return command
 
@@ -153,7 +150,7 @@ def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], endpoint
 @with_sink_options
 @with_endpoint
 @with_wait
-@with_table(sinks=True)
+@with_table(SINKS)
 def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoint: str, keys: str, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
@@ -206,63 +203,3 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
             reason = f": {tracks.end.reason}"
         of = f" of {listed(newest)}" if any(newest) else ""
         click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{reason}", err=True)
-
-
-@click.command()
-@click.argument("log", type=PATH)
-@click.argument("dest", type=PATH)
-@click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="The format; needed for a folder.")
-@click.option(
-    "--size",
-    metavar="WIDTHxHEIGHT|SOURCE",
-    help="Size of the frames, or the video or folder of them, for a LOG without a head, as a CSV file.",
-)
-@click.option("--label", default="", help="Class of all objects; by default, the name of each is its class.")
-@click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of LOG.")
-@with_overwrite
-@with_table(sinks=False)
-def export(
-    log: Path, dest: Path, name: str | None, size: str | None, label: str, skip_damaged: bool, overwrite: bool
-) -> None:
-    """Make another format from the log of a run.
-
-    LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream sink`. The
-    extension of DEST selects the format, or --format, which a folder needs. A
-    folder gets the files of each object, NAME-OBJECT.txt for example; NAME is
-    that of LOG. Processing times are in .csv only, marks of doubtful boxes and
-    which object was given a name anew not in .csv.
-
-    {table}
-
-    \b
-    EXAMPLES
-      catstream export out/walk.ndjson walk.sqlite
-      catstream export out/walk.csv results --format otb
-      catstream export out/walk.ndjson walk.xml --label person
-      catstream export out/walk.csv dataset --format yolo --size 640x360
-    """
-    row = destinations.export_of(dest, name)
-    if not is_log(log) or not log.is_file():
-        raise VideoError(f"{log} is no log of a run: give one of its files, {', '.join(LOGS)}")
-    if row.suffix:
-        destinations.check_result(dest, overwrite=overwrite, source=str(log))
-    content = Log(log, skip_damaged=skip_damaged)
-    if next(content.frames(), None) is None:
-        raise VideoError(f"{log} contains no tracks")
-    head = content.head() or Head()
-    if head.size and size is not None and _size(size) != head.size:
-        raise VideoError(
-            f"--size {size} contradicts the head of {log}, whose frames are {head.size[0]}x{head.size[1]}: omit --size"
-        )
-    about = About(log.stem, head.size or (None if size is None else _size(size)), label, head)
-    destinations.export(content.frames(), dest, row, about)
-    if content.damaged:
-        click.echo(f"{counted(content.damaged, 'damaged line')} of {log} skipped", err=True)
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Return the width and height that a text states, or those of the source that it names."""
-    if stated := re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text):
-        return int(stated[1]), int(stated[2])
-    with open_source(text) as source:
-        return source.size

@@ -8,7 +8,8 @@ function in a file of its own, and a line in docs/how-to/sinks.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -130,16 +131,26 @@ class Origin:
 class About:
     """What an export has to know beside the tracks.
 
-    name   that of the log, for the files in a folder
-    size   width and height of a frame in pixels; None if it is not known
-    label  the class of all objects; empty if the name of each is its class
-    head   head of the log; an empty one if the log has none
+    name     that of the log, for the files in a folder
+    size     width and height of a frame in pixels; None if it is not known
+    label    the class of all objects; empty if the name of each is its class
+    head     head of the log; an empty one if the log has none
+    classes  class -> its number, None for its place in this order; empty for all classes, in the order of the log
+    images   files of the images of the source; empty if it is a video
+    frames   number of frames of the source; None if unknown
+    append   whether to add to an existing data set
+    source   path of the source whose images are written, too; empty to write none
     """
 
     name: str
     size: tuple[int, int] | None = None
     label: str = ""
     head: Head = field(default_factory=Head)
+    classes: Mapping[str, int | None] = field(default_factory=dict)
+    images: Sequence[Path] = ()
+    frames: int | None = None
+    append: bool = False
+    source: str = ""
 
 
 class Sink(Protocol):
@@ -160,10 +171,12 @@ class Sink(Protocol):
 class Row:
     """A row of the table.
 
-    home         the class of a sink, or the function `export(frames, path, about)`
+    home         the class of a sink, or the function `export(frames, path, about)`; it may return a note for the user
     meaning      a line of the help
     suffix       of the file of an export; empty for a folder
-    sized        whether an export needs the size of a frame
+    sized        whether an export has classes, and needs the size of a frame
+    images       whether an export refers to the images of the source
+    appends      whether an export can be added to an existing one
     extra        the extra that it needs
     follows_log  whether a file is a log, or is made again from the log when a run is resumed
     options      fields of `SinkOptions` that a sink uses; any of them is an error if no destination does
@@ -173,6 +186,8 @@ class Row:
     meaning: str
     suffix: str = ""
     sized: bool = False
+    images: bool = False
+    appends: bool = False
     extra: str = ""
     follows_log: bool = False
     options: tuple[str, ...] = ()
@@ -216,15 +231,20 @@ SINKS = {
 #: Name of a format -> the export.
 EXPORTS = {
     "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
+    "csv": Row("exports.write_csv", "the CSV file of a run", ".csv"),
     "sqlite": Row("database.write_sqlite", "the table tracks of a database", ".sqlite"),
     "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
-    "coco": Row("annotations.write_coco", "COCO, with the tracks and the video as in TAO", ".json", sized=True),
-    "cvat": Row("annotations.write_cvat", "CVAT for video 1.1", ".xml", sized=True),
-    "yolo": Row("annotations.write_yolo", "a folder: a file of labels for each frame, and data.yaml", sized=True),
-    "via": Row("annotations.write_via", "VIA tracks, which movement and napari open", ".via.csv"),
-    "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB"),
-    "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k"),
-    "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment"),
+    "coco": Row(
+        "annotations.write_coco", "COCO, with the tracks and the video as in TAO", ".json", True, True, appends=True
+    ),
+    "cvat": Row("annotations.write_cvat", "CVAT for video 1.1", ".xml", True, True),
+    "yolo": Row(
+        "annotations.write_yolo", "a folder: labels of each frame, and data.yaml", "", True, True, appends=True
+    ),
+    "via": Row("annotations.write_via", "VIA tracks, which movement and napari open", ".via.csv", images=True),
+    "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB", appends=True),
+    "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k", appends=True),
+    "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment", appends=True),
 }
 
 
@@ -241,11 +261,11 @@ def sink_of(place: str) -> Row:
 
 
 def export_of(path: Path, name: str | None) -> Row:
-    """Return the row of an export, by its name, or else by the suffix; raises VideoError if that selects not one."""
+    """Return the row of an export, by its name, or else by the longest suffix; raises VideoError if there is none."""
     rows = [row for row in EXPORTS.values() if row.suffix and path.name.endswith(row.suffix)]
-    if name is None and len(rows) != 1:
-        raise VideoError(f"the format of {path} is not known: give --format, one of {', '.join(EXPORTS)}")
-    return rows[0] if name is None else EXPORTS[name]
+    if name is None and not rows:
+        raise VideoError(f"unknown format of {path}: pass --format, one of {', '.join(EXPORTS)}")
+    return max(rows, key=lambda row: len(row.suffix)) if name is None else EXPORTS[name]
 
 
 def is_file(place: str) -> bool:
@@ -288,22 +308,47 @@ def open_sink(place: str, origin: Origin) -> Sink:
     return cast(Sink, sink_of(place).load()(place, origin))
 
 
-def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -> None:
+def check_export(path: Path, row: Row, *, overwrite: bool, append: bool, log: Path) -> None:
+    """Raise VideoError if an export would replace or extend something, unless `overwrite` or `append` allow that."""
+    if append and not row.appends:
+        raise VideoError(f"{path} can hold one video only: give another name, or pass --overwrite instead of --append")
+    if row.suffix:
+        check_result(path, overwrite=overwrite or append, source=str(log))
+    elif not (overwrite or append or _is_empty(path)):
+        raise VideoError(
+            f"the folder {path} is not empty: add to its data set with --append, replace it with --overwrite, or give "
+            "another folder"
+        )
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether a folder has no files but the images of a data set, which may be there before its labels."""
+    entries = folder.iterdir() if folder.is_dir() else ()
+    return all(entry.name == "images" or entry.name.startswith(".") for entry in entries)
+
+
+def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -> str:
     """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
 
-    Raises VideoError if they cannot be written, or if the size of a frame is needed and not known.
+    frames : read more than once by some formats
+
+    Returns what the user should know, mostly nothing. Raises VideoError if the files cannot be written, or if the size
+    of a frame is needed and unknown.
     """
-    make: Callable[[Iterable[TrackedFrame], Path, About], None] = row.load()
+    make: Callable[[Iterable[TrackedFrame], Path, About], str | None] = row.load()
     if row.sized and about.size is None:
         raise VideoError(
-            f"the log has no head with the size of a frame, which {path} needs: pass --size WIDTHxHEIGHT, or --size "
-            "SOURCE with the video or folder that was tracked"
+            f"unknown size of the frames, required for {path}: pass --size WIDTHxHEIGHT, or --size SOURCE with the "
+            "video or folder that was tracked"
         )
     part = path.with_name(f"{path.name}.part")
     with writing(path, VideoError):
         try:
-            make(frames, part if row.suffix else path, about)
+            if row.suffix and about.append and path.exists():
+                shutil.copyfile(path, part)
+            note = make(frames, part if row.suffix else path, about)
             if row.suffix:
                 part.replace(path)
         finally:
             part.unlink(missing_ok=True)
+    return note or ""

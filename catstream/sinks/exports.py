@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -10,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from catstream.base.arrays import Float64
+from catstream.errors import VideoError
 from catstream.sinks.database import COLUMNS, rows
-from catstream.sinks.destinations import About, TrackedFrame
+from catstream.sinks.destinations import About, Origin, TrackedFrame
+from catstream.sinks.track_log import CsvSink
 
 #: Layout -> the files of boxes, scores and times of an object, in the folder of the results; NAME is that of the log,
 #: or NAME-OBJECT. The toolkits of got10k (which has OTB, too) and VOT read them.
@@ -43,17 +46,25 @@ def write_layout(
 def write_mot(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
     """Write boxes as the tools of MOTChallenge read results: `frame,id,x,y,w,h,conf,-1,-1,-1`.
 
-    Frames, ids and pixels count from 1 there. The first object that appears has the id 1, and a name keeps its id. A
-    frame without any object has no line, so the file does not say how many frames there were.
+    Frames of the source, ids and pixels count from 1 there. The first object that appears has the id 1; another object
+    that was given the same name has another one. A frame without any object has no line, so the file does not say how
+    many frames there were.
     """
-    ids: dict[str, int] = {}
+    ids: dict[tuple[str, int], int] = {}
     with path.open("w", encoding="utf-8") as file:
         for track in (track for frame in frames for track in frame.tracks):
-            number = ids.setdefault(track.object, len(ids) + 1)
+            number = ids.setdefault((track.object, track.began), len(ids) + 1)
             if track.box is not None:
                 x, y, w, h = track.box
                 box = f"{x + 1:.2f},{y + 1:.2f},{w:.2f},{h:.2f}"
-                file.write(f"{track.frame + 1},{number},{box},{track.score:.4f},-1,-1,-1\n")
+                file.write(f"{track.source_frame + 1},{number},{box},{track.score:.4f},-1,-1,-1\n")
+
+
+def write_csv(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
+    """Write the CSV file of a run, which tables and pandas read."""
+    with closing(CsvSink(str(path), Origin())) as sink:
+        for frame in frames:
+            sink.write(frame)
 
 
 def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
@@ -71,20 +82,31 @@ def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
 
 
 def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
-    """Write the files of each object; those of times only if the log has them, as a CSV file has."""
-    rows: dict[str, dict[int, tuple[float, ...]]] = {}
+    """Write the files of each object, with a row for each frame of the source up to the last one of the log.
+
+    Those of times are written only if the log has them, as a CSV file has. Another object that was given the same name
+    has files of its own. If `about.append`, VideoError if a file exists.
+    """
+    rows: dict[tuple[str, int], dict[int, tuple[float, ...]]] = {}
     times: dict[int, float] = {}
     for frame in frames:
-        times[frame.number] = frame.seconds
         for track in frame.tracks:
-            rows.setdefault(track.object, {})[frame.number] = (*(track.box or [np.nan] * 4), track.score)
-    for name, found in rows.items():
+            row = (*(track.box or [np.nan] * 4), track.score)
+            rows.setdefault((track.object, track.began), {})[track.source_frame] = row
+            times[track.source_frame] = frame.seconds
+    names: dict[str, tuple[str, int]] = {}
+    for name, began in rows:
+        whole = f"{about.name}-{name}" if name else about.name
+        names[f"{whole}@{min(rows[name, began])}" if whole in names else whole] = (name, began)
+    files = [folder / pattern.format(name) for name in names for pattern in LAYOUTS[layout]]
+    if about.append and (existing := [file for file in files if file.exists()]):
+        raise VideoError(f"{existing[0]} exists already: replace it with --overwrite, or give another folder")
+    for name, key in names.items():
         table = np.full((max(times) + 1, 6), np.nan)
-        table[list(found), :5] = list(found.values())
+        table[list(rows[key]), :5] = list(rows[key].values())
         table[list(times), 5] = list(times.values())
         seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
-        whole = f"{about.name}-{name}" if name else about.name
-        write_layout(layout, folder, whole, table[:, :4], table[:, 4], seconds)
+        write_layout(layout, folder, name, table[:, :4], table[:, 4], seconds)
 
 
 write_otb = partial(_write_objects, "otb")

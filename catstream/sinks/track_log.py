@@ -207,6 +207,9 @@ class Log:
                 raise VideoError(f"{self.path} has two rows of {listed(sorted(twice))} in frame {number}: remove one")
             yield TrackedFrame([*tracks], seconds[-1])
 
+    def __iter__(self) -> Iterator[TrackedFrame]:
+        return self.frames()
+
     def whole_frames(self) -> Iterator[tuple[TrackedFrame, int]]:
         """Yield each frame, and the byte at which it ends; except for a last one that may be incomplete."""
         if self.path.suffix == ".sqlite":  # a frame is one transaction

@@ -7,10 +7,11 @@ libraries.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import cv2
@@ -56,9 +57,11 @@ class Source(ABC):
     size          (width, height) of the first frame in pixels
     pixel_aspect  width of a pixel divided by its height
     live          whether the source is live: frames that are not read in time are lost
+    images        files of the images of a folder, one for each of its frames; empty for a video
     """
 
     live = False
+    images: Sequence[Path] = ()
     pixel_aspect = Fraction(1)
 
     def __init__(self, name: str, rate: float, size: tuple[int, int]) -> None:

@@ -28,7 +28,7 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -87,7 +87,7 @@ class _FileSource(Source):
             )
         height, width = self._first.image.shape[:2]
         super().__init__(name, reader.rate / (part.step or 1), (width, height))
-        self.pixel_aspect = reader.pixel_aspect
+        self.pixel_aspect, self.images = reader.pixel_aspect, reader.images
 
     @cached_property
     def frames(self) -> int | None:
@@ -235,6 +235,8 @@ class _Images:
     def __init__(self, pages: list[tuple[Path, int]], settings: RunSettings) -> None:
         self.settings, self.rate, self.scaled = settings, settings.image_rate, 0
         self._read_image = ImageReader(pages)
+        files = [file for file, _ in pages]
+        self.images = files if len({file.stem for file in files}) == len(files) else []
 
     def count(self) -> int:
         return len(self._read_image.pages)
@@ -282,6 +284,8 @@ def prepare() -> None:
 class _Video:
     """A video file that is read once. `damaged` is the number of packets that were left out, `scaled` that of frames
     which had another size than the first."""
+
+    images: Sequence[Path] = ()
 
     def __init__(self, path: Path, settings: RunSettings) -> None:
         import av  # imported here because it takes 0.1 s and folders do not need it

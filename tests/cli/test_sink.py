@@ -3,12 +3,9 @@
 import json
 import select
 import signal
-import sqlite3
 import time
-from contextlib import closing
 from dataclasses import replace
 
-import pytest
 from mcap.reader import make_reader
 
 from catstream.base.text import counted
@@ -92,32 +89,3 @@ def test_without_a_pipeline_no_file_is_left(fail, tmp_path):
     error = fail("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
     assert "is a pipeline running there?" in error
     assert not (tmp_path / "tracks.csv").exists()
-
-
-def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, tmp_path):
-    log = whole_run / "out" / "demo.csv"
-    succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
-    with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
-        assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == list(range(32))
-    for _ in range(2):
-        succeed("export", log, tmp_path / "otb", "--format", "otb")
-    for name in ("demo.txt", "demo_confidence.value", "times/demo_time.txt"):
-        assert len((tmp_path / "otb" / name).read_text().splitlines()) == 32
-    for size in ("320x240", whole_run / "out" / "demo.mp4"):  # the second one has a line of text below
-        succeed("export", log, tmp_path / "t.json", "--size", size, "--label", "person", "--overwrite")
-        coco = json.loads((tmp_path / "t.json").read_text())
-        assert [each["name"] for each in coco["categories"]] == ["person"]
-        assert (len(coco["images"]), coco["images"][0]["width"]) == (32, 320)
-    assert "pass --size" in fail("export", log, tmp_path / "t.xml")
-    assert "there is no video or folder" in fail("export", log, tmp_path / "t.xml", "--size", tmp_path / "none.mp4")
-    assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
-
-
-@pytest.mark.parametrize(
-    ("log", "words"), [("none.csv", "is no log"), ("a.txt", "is no log"), ("a.csv", "lacks the column seconds")]
-)
-def test_a_file_that_is_no_log_is_not_exported(fail, tmp_path, log, words):
-    for name in ("a.txt", "a.csv"):
-        (tmp_path / name).write_text("frame\nsomething else\n")
-    assert words in fail("export", tmp_path / log, tmp_path / "t.sqlite")
-    assert not (tmp_path / "t.sqlite").exists()

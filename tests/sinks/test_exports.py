@@ -1,6 +1,7 @@
 """Formats that are made from a log."""
 
 import csv
+import json
 import sqlite3
 from ast import literal_eval
 from contextlib import closing
@@ -16,7 +17,8 @@ from pycocotools.coco import COCO
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import About, Origin, TrackedFrame, export, export_of, open_sink
+from catstream.sinks.destinations import About, Head, Origin, TrackedFrame, export, export_of, open_sink
+from catstream.sinks.track_log import Log
 
 BOX = Box(10.0, 20.0, 30.5, 40.0)
 
@@ -44,11 +46,11 @@ CUT = [0.0, 20.0, 20.0, 40.0]
 
 
 def made(path, name=None, log=LOG, **about):
-    export(iter(log), path, export_of(path, name), About("walk", **about))
+    export(log, path, export_of(path, name), About("walk", **about))
     return path
 
 
-def test_mot_counts_from_one_has_no_line_for_an_absent_object_and_a_name_keeps_its_id(tmp_path):
+def test_mot_counts_from_one_and_has_no_line_for_an_absent_object(tmp_path):
     box = "11.00,21.00,30.50,40.00,0.7500,-1,-1,-1"
     assert made(tmp_path / "t.txt").read_text().splitlines() == [f"1,1,{box}", f"1,2,{box}", f"4,3,{box}", f"4,2,{box}"]
 
@@ -187,10 +189,153 @@ def test_a_file_for_which_the_disk_has_no_room_is_an_error_and_the_one_before_is
     assert (disk / f"t{suffix}").read_text() == "dear to somebody"
 
 
-@pytest.mark.parametrize("name", ["t.xls", "folder", "t.csv"])
+@pytest.mark.parametrize("name", ["t.xls", "folder"])
 def test_a_name_that_does_not_say_the_format_needs_the_option(tmp_path, name):
-    with pytest.raises(VideoError, match="give --format, one of mot, sqlite"):
+    with pytest.raises(VideoError, match="pass --format, one of mot, csv"):
         export_of(tmp_path / name, None)
+
+
+def test_every_format_has_the_numbers_of_the_frames_in_the_source(tmp_path):
+    log = [TrackedFrame([present(frame, "", source_frame=20 + 5 * frame)]) for frame in range(3)]
+    about = {"log": log, "size": (100, 80), "head": Head(start=20, stride=5), "frames": 40}
+    files = {suffix: made(tmp_path / f"t{suffix}", **about) for suffix in (".txt", ".json", ".xml", ".via.csv")}
+    mot = [int(line.split(",")[0]) - 1 for line in files[".txt"].read_text().splitlines()]
+    coco = json.loads(files[".json"].read_text())["images"]
+    boxes = [(int(box.get("frame")), box.get("outside")) for box in ElementTree.parse(files[".xml"]).iter("box")]
+    with files[".via.csv"].open(newline="") as file:
+        via = [literal_eval(row["file_attributes"])["frame"] for row in csv.DictReader(file)]
+    assert mot == [image["frame_index"] for image in coco] == via == [20, 25, 30]
+    assert boxes == [(20, "0"), (25, "0"), (30, "0"), (35, "1")]
+    names = [image["file_name"] for image in coco]
+    labels = made(tmp_path / "set", "yolo", **about) / "labels"
+    assert names == ["walk_000020.jpg", "walk_000025.jpg", "walk_000030.jpg"]
+    assert sorted(file.stem for file in labels.iterdir()) == [Path(name).stem for name in names]
+    for layout, place in (("otb", "walk.txt"), ("got10k", "walk/walk_001.txt"), ("vot", "walk/walk_001.txt")):
+        rows = np.loadtxt(made(tmp_path / layout, layout, **about) / place, delimiter=",")
+        assert np.flatnonzero(~np.isnan(rows[:, 0])).tolist() == [20, 25, 30]
+
+
+@pytest.mark.parametrize(
+    ("frames", "keys"), [(9, [(0, "0"), (1, "1"), (3, "0"), (4, "1")]), (4, [(0, "0"), (1, "1"), (3, "0")])]
+)
+def test_cvat_ends_a_track_after_its_last_box_unless_the_video_ends_there(tmp_path, frames, keys):
+    log = [TrackedFrame([present(0, "")]), TrackedFrame([present(3, "")])]
+    root = ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(100, 80), frames=frames))
+    assert [(int(box.get("frame")), box.get("outside")) for box in root.iter("box")] == keys
+
+
+def test_objects_that_were_given_one_name_are_tracks_of_their_own(tmp_path):
+    log = [TrackedFrame([present(0, "anna")]), TrackedFrame([present(1, "anna", began=1)])]
+    mot = [line.split(",")[:2] for line in made(tmp_path / "t.txt", log=log).read_text().splitlines()]
+    tracks = [
+        track["id"] for track in json.loads(made(tmp_path / "t.json", log=log, size=(9, 9)).read_text())["tracks"]
+    ]
+    cvat = [*ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(99, 99))).iter("track")]
+    otb = {
+        file.name: np.loadtxt(file, delimiter=",")[:, 0] for file in made(tmp_path / "otb", "otb", log).glob("*.txt")
+    }
+    assert mot == [["1", "1"], ["2", "2"]]
+    assert tracks == []  # none of the boxes is in such a frame
+    assert [track.get("label") for track in cvat] == ["anna", "anna"]
+    np.testing.assert_equal(otb, {"walk-anna.txt": [10, nan], "walk-anna@1.txt": [nan, 10]})
+
+
+@pytest.mark.parametrize(("classes", "numbers"), [({}, [0, 1]), ({"ben": None, "anna": None}, [1, 0])])
+def test_classes_have_numbers_also_of_an_object_that_is_never_present(tmp_path, classes, numbers):
+    log = [TrackedFrame([present(0, "anna", None), present(0, "ben", None)])]
+    about = {"log": log, "size": (100, 80), "classes": classes}
+    coco = json.loads(made(tmp_path / "t.json", **about).read_text())["categories"]
+    labels = ElementTree.parse(made(tmp_path / "t.xml", **about)).iterfind("meta/task/labels/label/name")
+    names = dict(zip(numbers, ("anna", "ben"), strict=True))
+    lines = "".join(f'\n  {number}: "{names[number]}"' for number in (0, 1))
+    assert (made(tmp_path / "set", "yolo", **about) / "data.yaml").read_text().endswith(f"names:{lines}\n")
+    assert {entry["id"] - 1: entry["name"] for entry in coco} == names
+    assert [label.text for label in labels] == [names[0], names[1]]
+
+
+def test_each_number_below_the_highest_class_has_a_name_as_ultralytics_requires(tmp_path):
+    log = [TrackedFrame([present(0, "anna")])]
+    folder = made(tmp_path / "set", "yolo", log, size=(100, 80), classes={"anna": 2, "ben": 0})
+    assert (folder / "data.yaml").read_text().endswith('names:\n  0: "ben"\n  1: "class_1"\n  2: "anna"\n')
+    assert (folder / "labels" / "walk_000000.txt").read_text().startswith("2 ")
+
+
+@pytest.mark.parametrize(
+    ("classes", "words"),
+    [
+        ({"anna": None}, "--classes lacks carl"),
+        ({"carl": 1}, "two classes have the number 1, ben and carl"),
+        ({"ben": None, "carl": None}, "--classes numbers ben 0, but in the data set it is class 1"),
+    ],
+)
+def test_classes_that_do_not_agree_are_an_error_before_anything_is_written(tmp_path, classes, words):
+    log = [TrackedFrame([present(0, "anna"), present(0, "ben")])]
+    folder = made(tmp_path / "set", "yolo", log, size=(100, 80))
+    before = {file: file.read_bytes() for file in folder.rglob("*.*")}
+    log.append(TrackedFrame([present(1, "carl")]))
+    with pytest.raises(VideoError, match=words):
+        export(log, folder, export_of(folder, "yolo"), About("b", (100, 80), classes=classes, append=True))
+    assert {file: file.read_bytes() for file in folder.rglob("*.*")} == before
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["names: ['anna', ben]", "names: {0: anna, 1: ben}", "names:\n- anna\n- ben", "names:\n  0: anna\n  1: ben"],
+)
+def test_a_video_that_is_added_continues_the_classes_and_replaces_no_label(tmp_path, names):
+    folder, yaml = tmp_path / "set", tmp_path / "set" / "data.yaml"
+    (folder / "labels").mkdir(parents=True)
+    (folder / "labels" / "walk_000000.txt").write_text("corrected by hand")
+    yaml.write_text(f"path: /data/set\nnc: 2\n{names}\nval: other\n")
+    log = [TrackedFrame([present(frame, "carl"), present(frame, "ben")]) for frame in range(2)]
+    note = export(log, folder, export_of(folder, "yolo"), About("walk", (100, 80), append=True))
+    assert note == "added 1 label file, did not replace 1 that exist (walk_000000.txt ...)"
+    assert (folder / "labels" / "walk_000000.txt").read_text() == "corrected by hand"
+    assert [line[0] for line in (folder / "labels" / "walk_000001.txt").read_text().splitlines()] == ["2", "1"]
+    lines = 'names:\n  0: "anna"\n  1: "ben"\n  2: "carl"'
+    assert yaml.read_text() == f"path: /data/set\nnc: 3\n{lines}\nval: other\n"
+
+
+def test_coco_is_extended_by_a_video_with_ids_of_its_own(tmp_path):
+    first = made(tmp_path / "t.json", log=LOG, size=(100, 80))
+    log = [TrackedFrame([present(0, "ben"), present(0, "dora")])]
+    export(log, first, export_of(first, None), About("yard", (100, 80), append=True))
+    coco = COCO(first)
+    assert [category["name"] for category in coco.loadCats(coco.getCatIds())] == ["anna", "object", "ben", "dora"]
+    assert [video["name"] for video in coco.dataset["videos"]] == ["walk", "yard"]
+    for key in ("images", "annotations", "tracks"):
+        ids = [entry["id"] for entry in coco.dataset[key]]
+        assert len(ids) == len({*ids})
+    boxes = coco.loadAnns(coco.getAnnIds(imgIds=coco.dataset["images"][-1]["id"]))
+    assert [(box["category_id"], box["video_id"]) for box in boxes] == [(3, 2), (4, 2)]
+    before = first.read_bytes()
+    with pytest.raises(VideoError, match=r"contains the image yard_000000.jpg already"):
+        export(log, first, export_of(first, None), About("yard", (100, 80), append=True))
+    assert first.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", ["", "no JSON", "[1]", '{"images": [{"id": "one"}]}'])
+def test_a_file_that_is_not_coco_is_not_extended(tmp_path, content):
+    (tmp_path / "t.json").write_text(content)
+    with pytest.raises(VideoError, match="not in COCO format"):
+        made(tmp_path / "t.json", size=(100, 80), append=True)
+    assert (tmp_path / "t.json").read_text() == content
+
+
+def test_labels_have_the_names_of_the_images_of_a_folder(tmp_path):
+    images = [tmp_path / f"shot_{number}.png" for number in (9, 10, 11)]
+    for number, image in enumerate(images):
+        image.write_bytes(b"%d" % number)
+    log = [TrackedFrame([present(0, "", source_frame=1)])]
+    folder = made(tmp_path / "set", "yolo", log, size=(100, 80), images=images, source=str(tmp_path))
+    assert [file.name for file in (folder / "labels").iterdir()] == ["shot_10.txt"]
+    assert [(file.name, file.read_bytes()) for file in (folder / "images").iterdir()] == [("shot_10.png", b"1")]
+
+
+def test_a_csv_file_is_made_from_other_logs(tmp_path):
+    log = [TrackedFrame([present(frame, "anna"), present(frame, "", None)], 0.5) for frame in range(2)]
+    read = Log(made(tmp_path / "t.csv", log=log))
+    assert [track.box for frame in read for track in frame.tracks] == [BOX, None] * 2
 
 
 def test_an_export_is_no_sink(tmp_path):

@@ -1,0 +1,87 @@
+"""`catstream export`: other formats from the log of a run."""
+
+import json
+import sqlite3
+from contextlib import closing
+
+import cv2
+import pytest
+
+
+def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, tmp_path):
+    log = whole_run / "out" / "demo.csv"
+    succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
+    with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
+        assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == list(range(32))
+    succeed("export", log, tmp_path / "otb", "--format", "otb")
+    for name in ("demo.txt", "demo_confidence.value", "times/demo_time.txt"):
+        assert len((tmp_path / "otb" / name).read_text().splitlines()) == 32
+    for size in ("320x240", whole_run / "out" / "demo.mp4"):  # the second one has a line of text below
+        succeed("export", log, tmp_path / "t.json", "--size", size, "--label", "person", "--overwrite")
+        coco = json.loads((tmp_path / "t.json").read_text())
+        assert [each["name"] for each in coco["categories"]] == ["person"]
+        assert (len(coco["images"]), coco["images"][0]["width"]) == (32, 320)
+    assert "pass --size" in fail("export", log, tmp_path / "t.xml")
+    assert "there is no video or folder" in fail("export", log, tmp_path / "t.xml", "--size", tmp_path / "none.mp4")
+    assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [("none.csv", "does not exist"), ("a.txt", "is not the log of a run"), ("a.csv", "lacks the column seconds")],
+)
+def test_a_file_that_is_no_log_is_not_exported(fail, tmp_path, log, words):
+    for name in ("a.txt", "a.csv"):
+        (tmp_path / name).write_text("frame\nsomething else\n")
+    assert words in fail("export", tmp_path / log, tmp_path / "t.sqlite")
+    assert not (tmp_path / "t.sqlite").exists()
+
+
+FOLDERS = {
+    "yolo": "labels/demo_000000.txt",
+    "otb": "demo.txt",
+    "got10k": "demo/demo_001.txt",
+    "vot": "demo/demo_001.txt",
+}
+
+
+@pytest.mark.parametrize("layout", FOLDERS)
+def test_a_folder_with_results_is_changed_only_if_an_option_says_how(whole_run, succeed, fail, tmp_path, layout):
+    command = ["export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", layout]
+    succeed(*command)
+    label = tmp_path / "set" / FOLDERS[layout]
+    label.write_text("corrected by hand")
+    assert "is not empty: add to its data set with --append, replace it with --overwrite" in fail(*command)
+    if layout == "yolo":
+        succeed(*command, "--append")
+    else:
+        assert f"{label} exists already" in fail(*command, "--append")
+    assert label.read_text() == "corrected by hand"
+    succeed(*command, "--overwrite")
+    assert label.read_text() != "corrected by hand"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--append", "--overwrite"], "--append and --overwrite are mutually exclusive"),
+        (["--append"], "can hold one video only"),
+        (["--classes", "a,a"], "expected a new NAME or NAME=NUMBER"),
+        (["--label", "a\x01b"], "expected printable characters"),
+        (["--classes", "a=x"], "expected a new NAME or NAME=NUMBER"),
+        (["--classes", "a=1,b"], "expected a number for all classes or for none"),
+        (["--format", "mot", "--classes", "a"], "--classes requires a format with classes"),
+        (["--images"], "--images requires --format yolo"),
+        (["--size", "320x200"], "whose frames are 320x240: omit --size"),
+    ],
+)
+def test_options_of_an_export_that_contradict_each_other_are_an_error(whole_run, fail, tmp_path, options, words):
+    assert words in fail("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.xml", *options)
+    assert not (tmp_path / "t.xml").exists()
+
+
+def test_the_images_of_a_data_set_are_those_of_the_tracked_frames(whole_run, succeed, tmp_path):
+    succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", "yolo", "--images")
+    images, labels = (sorted((tmp_path / "set" / name).iterdir()) for name in ("images", "labels"))
+    assert [file.stem for file in images] == [file.stem for file in labels]
+    assert (len(images), cv2.imread(str(images[0])).shape) == (32, (240, 320, 3))

@@ -1,0 +1,196 @@
+"""What the libraries that people use read in the exports of real runs, beside the CSV file of the same run.
+
+They are installed in `build/readers`, an environment of their own, by the first test: 2 GB, most of it PyTorch for
+Ultralytics. CVAT's importer is a part of its server and no package; `cvat` below follows its rules.
+"""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from xml.etree import ElementTree
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from catstream.client.control import control
+from catstream.video.source import open_source
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+LIBRARIES = ["torch", "torchvision", "movement", "pycocotools", "supervision", "datumaro", "trackeval"]
+BARE = ["ultralytics", "ultralytics-thop"]  # without their dependencies: only its data sets are used
+READERS = {
+    **{"ultralytics_yolo": "set", "supervision_yolo": "set", "datumaro_yolo": "set"},
+    **{"pycocotools_coco": "walk.json", "supervision_coco": "walk.json", "datumaro_coco": "walk.json"},
+    **{"datumaro_cvat": "walk.xml", "trackeval_mot": "walk.txt", "movement_via": "walk.via.csv"},
+}
+
+
+@pytest.fixture(scope="session")
+def libraries():
+    """The Python of an environment with the libraries, which is made once."""
+    folder = ROOT / "build" / "readers"
+    if not (folder / "ready").exists():
+        subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+        pip = [folder / "bin" / "pip", "install", "--quiet", "--no-compile"]
+        for packages in (LIBRARIES, ["--no-deps", *BARE]):
+            if subprocess.run([*pip, *packages], check=False).returncode:
+                pytest.skip("pip cannot install the libraries: no connection to PyPI?")
+        (folder / "ready").touch()
+    return folder / "bin" / "python"
+
+
+def images_of(video, folder):
+    """A folder with the frames of a video as images, whose order is the natural one: shot_9.jpg, shot_10.jpg."""
+    folder.mkdir()
+    with open_source(video) as source:
+        for frame in source:
+            cv2.imwrite(str(folder / f"shot_{frame.number}.jpg"), frame.image)
+    return folder
+
+
+def rotated(video, path):
+    """The video with a display matrix of a quarter turn, as telephones write it."""
+    with av.open(str(video)) as old, av.open(str(path), "w") as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        stream.set_display_rotation(90)
+        for packet in old.demux(old.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = stream
+                new.mux(packet)
+    return path
+
+
+def replace(endpoint, box):
+    """Give another object the name anna in a run that is paused before its first frame, some frames later."""
+    with control(str(endpoint), timeout=60) as steering:
+        steering.resume()
+        steering.pause()
+        steering.set_box(box, "anna")
+        steering.resume()
+
+
+@pytest.fixture(scope="session")
+def exported(once, demo_video, succeed):
+    """Gives the folder of a run and its exports: walk.csv, walk.ndjson, walk.txt, .json, .xml, .via.csv, and set."""
+    video, boxes = demo_video(60)
+
+    def track(kind, folder):
+        source = folder / "walk.mp4"
+        if kind == "folder of images":
+            source = images_of(video, folder / "walk")
+        elif kind == "rotated":
+            rotated(video, source)
+        else:
+            source.write_bytes(video.read_bytes())
+        x, y, w, h = boxes[10 if kind == "part" else 0]
+        box = (y, 320 - x - w, h, w) if kind == "rotated" else (x, y, w, h)
+        command = ["track", source, "--box", f"anna={','.join(map(str, box))}", "--output", folder, "--lockstep"]
+        if kind == "part":
+            succeed(*command, "--start", 10, "--end", 50, "--stride", 3)
+        elif kind == "several objects":
+            succeed(*command, "--box", "ben=20,20,40,40")
+        elif kind == "begun anew":
+            with ThreadPoolExecutor() as pool:
+                replaced = pool.submit(replace, folder / "endpoint", boxes[30])
+                succeed(*command, "--paused", "--set", f"run.endpoint={folder / 'endpoint'}")
+                replaced.result()
+        elif kind == "resumed":
+            succeed(*command, "--state", folder / "state")
+            log = folder / "walk.ndjson"
+            log.write_text("".join(log.read_text().splitlines(keepends=True)[:30]))  # as after a power failure
+            succeed("track", "--resume", folder / "state")
+        else:
+            succeed(*command)
+
+    def fill(kind, folder):
+        track(kind, folder)
+        for suffix in (".txt", ".json", ".xml", ".via.csv"):
+            succeed("export", folder / "walk.ndjson", folder / f"walk{suffix}")
+        succeed("export", folder / "walk.ndjson", folder / "set", "--format", "yolo", "--images")
+
+    return lambda kind: once(f"readers-{kind.replace(' ', '-')}", lambda folder: fill(kind, folder))
+
+
+@pytest.fixture(params=["part", "resumed", "several objects", "rotated", "folder of images", "begun anew"])
+def run(request, exported):
+    return exported(request.param)
+
+
+def boxes_in_csv(folder):
+    """The boxes of a run: frame, number of the track, class, x, y, w, h, cut at the edges of the frame."""
+    head, *lines = map(json.loads, (folder / "walk.ndjson").read_text().splitlines())
+    with (folder / "walk.csv").open() as file:
+        rows = [*csv.DictReader(file)]
+    (width, height), numbers = head["size"], {}
+    for row, line in zip(rows, lines, strict=True):  # the beginning of an object is in the NDJSON file only
+        number = numbers.setdefault((line["object"], line["began"]), len(numbers) + 1)
+        if row["x"]:
+            x, y, w, h = (float(row[side]) for side in "xywh")
+            left, top, right, bottom = max(x, 0), max(y, 0), min(x + w, width), min(y + h, height)
+            yield int(row["source_frame"]), number, row["object"], left, top, right - left, bottom - top
+
+
+def cvat(file, frames):
+    """The boxes that CVAT shows after the import of a file into a task of the whole video.
+
+    Its importer refuses frames that the video does not have, and labels that the task does not have. A box holds until
+    the next one of its track, or to the end of the video; between two boxes it moves evenly.
+    """
+    root = ElementTree.parse(file).getroot()
+    labels = {label.text for label in root.iterfind("meta/task/labels/label/name")}
+    for track in root.iterfind("track"):
+        assert track.get("label") in labels
+        keys = {int(box.get("frame")): box for box in track}
+        assert set(keys) <= set(range(frames)), "Unknown frame"
+        sides = {
+            at: np.array([float(box.get(side)) for side in ("xtl", "ytl", "xbr", "ybr")]) for at, box in keys.items()
+        }
+        for frame in range(min(keys), frames):
+            before, after = (
+                max(at for at in keys if at <= frame),
+                min((at for at in keys if at > frame), default=frames),
+            )
+            if keys[before].get("outside") == "0":
+                part = (frame - before) / (after - before) if after in keys else 0
+                left, top, right, bottom = sides[before] + part * (sides.get(after, sides[before]) - sides[before])
+                yield frame, int(track.get("id")) + 1, track.get("label"), left, top, right - left, bottom - top
+
+
+def assert_same(read, expected):
+    """Compare boxes; None stands for what a format or a library does not have."""
+    read, expected = sorted(read, key=_order), sorted(expected, key=_order)
+    assert [row[0] for row in read] == [row[0] for row in expected]
+    for row, wanted in zip(read, expected, strict=True):
+        assert [*row[1:3]] == [
+            None if value is None else other for value, other in zip(row[1:3], wanted[1:3], strict=True)
+        ]
+        np.testing.assert_allclose(row[3:], wanted[3:], atol=0.02)
+
+
+def _order(row):
+    return row[0], *(round(side) for side in row[3:5])
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_library_reads_the_boxes_of_the_csv_file(run, libraries, reader, tmp_path):
+    command = [libraries, Path(__file__).with_name("readers.py"), reader, run / READERS[reader]]
+    options = {"cwd": tmp_path, "env": {**os.environ, "YOLO_OFFLINE": "1", "YOLO_CONFIG_DIR": str(tmp_path)}}
+    output = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, **options).stdout
+    assert_same([json.loads(line) for line in output.splitlines()], boxes_in_csv(run))
+
+
+def test_cvat_shows_the_boxes_of_the_csv_file_and_none_after_the_last(run):
+    with open_source(run / "walk.mp4" if (run / "walk.mp4").exists() else run / "walk") as source:
+        frames = source.frames
+    expected = [*boxes_in_csv(run)]
+    head = json.loads((run / "walk.ndjson").read_text().partition("\n")[0])
+    tracked = range(head["start"], frames, head["stride"])
+    assert_same([row for row in cvat(run / "walk.xml", frames) if row[0] in tracked], expected)
