@@ -203,6 +203,11 @@ class Annotation:
         """Share of frames that are keyframes or checked, over all objects, from 0 to 1."""
         return float(np.mean([probabilities >= _CHECKED for probabilities in self.probabilities.values()]))
 
+    def passes(self, name: str = UNNAMED) -> list[Pass]:
+        """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
+        own = [one for stretch, passes in self._passes.items() if stretch.object == name for one in passes]
+        return sorted(own, key=lambda one: (one.start, one.stop, one.with_memory))
+
     def next_frame(self) -> NextFrame | None:
         """The first of `next_frames`; None if all frames are checked."""
         return next(iter(self.next_frames()), None)

@@ -33,17 +33,17 @@ if TYPE_CHECKING:
     metavar="NAME@FRAME=X,Y,W,H",
     help="A box at a keyframe, in pixels; may be repeated.",
 )
-@click.option("--boxes", "file", type=PATH, help="CSV file of boxes: frame,object,x,y,w,h.")
+@click.option("--boxes", "csv_file", type=PATH, help="CSV file of boxes: frame,object,x,y,w,h.")
 @click.option("--output", type=FOLDER, required=True, help="Folder for the results.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, that of the cores.")
 @with_overwrite
-@with_reading
 @with_given
+@with_reading
 def annotate(
     given: dict[str, object],
     video: str,
     texts: tuple[str, ...],
-    file: Path | None,
+    csv_file: Path | None,
     output: Path,
     jobs: int | None,
     overwrite: bool,
@@ -78,7 +78,7 @@ def annotate(
         from catstream.annotation.annotation import Annotation
         from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes, write_keyframes
 
-    drawn = by_object([*([] if file is None else read_keyframes(file)), *map(parse_keyframe, texts)])
+    drawn = by_object([*([] if csv_file is None else read_keyframes(csv_file)), *map(parse_keyframe, texts)])
     if not drawn:
         raise click.UsageError("missing box: pass --box NAME@FRAME=X,Y,W,H or --boxes FILE.csv")
     # Checked before the work, which takes minutes.
