@@ -88,7 +88,7 @@ def _tracks(
             detectors.seek(UNNAMED, learned.model, learned.box, learned.similarity())
         if number == 0 and learned is not None:
             continued = {UNNAMED: learned.compressor(settings, detectors.network)}
-        tracks, features = detectors.step(pyramid, given=given)
+        tracks, features = detectors.step(pyramid, 0.0, given)
         for sample in forest.take(features, continued):
             detectors.adopt(trainer.train(sample))
         yield tracks.tracks[UNNAMED]
