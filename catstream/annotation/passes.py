@@ -81,14 +81,15 @@ def _tracks(
     """Track from a box in the first image, or search for the object of a saved model without one."""
     detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
     for number, image in enumerate(images):
-        pyramid, given, continued = detectors.pyramid(image), {}, {}
-        if number == 0 and box is not None:
-            given = detectors.begin_all({UNNAMED: box}, pyramid)
-        elif number == 0 and learned is not None:
-            detectors.seek(UNNAMED, learned.model, learned.box, learned.similarity())
-        if number == 0 and learned is not None:
-            continued = {UNNAMED: learned.compressor(settings, detectors.network)}
-        tracks, features = detectors.step(pyramid, 0.0, given)
+        pyramid, begun, continued = detectors.pyramid(image), {}, {}
+        if number == 0:
+            if learned is not None:
+                continued = {UNNAMED: learned.compressor(settings, detectors.network)}
+            if box is not None:
+                begun = detectors.begin_all({UNNAMED: box}, pyramid)
+            elif learned is not None:
+                detectors.seek(UNNAMED, learned.model, learned.box, learned.similarity())
+        tracks, features = detectors.step(pyramid, 0.0, begun)
         for sample in forest.take(features, continued):
             detectors.adopt(trainer.train(sample))
         yield tracks.tracks[UNNAMED]
