@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from catstream.annotation.annotation import Annotation, annotate
     from catstream.base.box import Box
     from catstream.base.settings import Settings
     from catstream.client.control import Control, control
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from catstream.tracker import Tracker
 
 __all__ = [
+    "Annotation",
     "Box",
     "CatstreamError",
     "Control",
@@ -44,6 +46,7 @@ __all__ = [
     "Track",
     "Tracker",
     "__version__",
+    "annotate",
     "control",
     "find",
     "merge",
@@ -53,6 +56,7 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Annotation": "annotation.annotation",
     "Box": "base.box",
     "CatstreamError": "errors",
     "Control": "client.control",
@@ -65,6 +69,7 @@ _HOMES = {
     "Subscription": "client.subscription",
     "Track": "messages.kinds",
     "Tracker": "tracker",
+    "annotate": "annotation.annotation",
     "control": "client.control",
     "find": "finding.find",
     "merge": "jobs.saved_model",

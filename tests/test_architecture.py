@@ -26,7 +26,7 @@ LEVELS = [
     {"multi", "client"},
     {"sinks"},
     {"tracker", "processes", "web"},
-    {"pipeline", "backbone"},
+    {"pipeline", "backbone", "annotation"},
     {"reports"},
     {"evaluation"},
     {"finding", "loadtest", "fleet"},

@@ -19,6 +19,7 @@ from catstream.errors import CatstreamError
 #: long; commands that belong together share one.
 COMMANDS = {
     "track": ("track", "Track objects in a video."),
+    "annotate": ("annotate", "Track objects between boxes at keyframes, and check the tracks."),
     "demo": ("measure", "Track an object in a rendered demo video."),
     "find": ("models", "Find the objects of saved models in videos, folders and images."),
     "evaluate": ("measure", "Measure accuracy on annotated sequences, also of other trackers."),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ from catstream.errors import CatstreamError
 
 if TYPE_CHECKING:
     from catstream.evaluation.accuracy import Row
+    from catstream.evaluation.datasets import Sequence
     from catstream.loadtest.load_test import Limit, Parameter, Result
 
 _FAILED = 1  # exit code if a limit was not met or a stream failed
@@ -49,6 +51,7 @@ _FIND: dict[str | None, tuple[str, ...]] = {
 @click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
 @click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
 @click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")
+@click.option("--keyframes", type=click.IntRange(min=1), help="Annotate with up to N boxes from the ground truth.")
 @click.option("--attributes", type=PATH, help="JSON file {sequence: [attribute]}.")
 @click.option("--peer-models", type=PATH, help="Folder of model files for nano and vit.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
@@ -62,6 +65,7 @@ def evaluate(
     starts: int | None,
     shifts: bool,
     jitter: int | None,
+    keyframes: int | None,
     attributes: Path | None,
     peer_models: Path | None,
     jobs: int,
@@ -99,23 +103,36 @@ def evaluate(
     report.html shows plots. With --attributes, the report and --json also have
     the means over the sequences that share an attribute.
 
+    --keyframes N measures catstream annotate: after a first box, boxes are drawn
+    from the ground truth in the frames that it asks for. Printed for 1, 2 ... N
+    boxes are the share of right frames (overlap above 0.5, or rightly absent),
+    of checked frames, and of right ones among these; the expected share of right
+    frames; sequences that are complete, at least 95 % right and expected to be;
+    and the success of linear interpolation and of tracking forwards only.
+
     \b
     EXAMPLES
       catstream evaluate sequences/
       catstream evaluate sequences/ --tracker catstream,csrt --jobs 4 --output results
       catstream evaluate sequences/walk --jitter 7 --set coreset.size=128
+      catstream evaluate sequences/ --keyframes 8 --jobs 4 --json keyframes.json
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.evaluation import accuracy, datasets, onepass
 
-    if (starts is not None) + shifts + (jitter is not None) > 1:
-        raise click.UsageError("--starts, --shifts and --jitter each choose the runs of a sequence: give one of them")
+    if (starts is not None) + shifts + (jitter is not None) + (keyframes is not None) > 1:
+        raise click.UsageError("--starts, --shifts, --jitter and --keyframes are mutually exclusive")
+    if keyframes is not None and (trackers != "catstream" or output is not None or attributes is not None):
+        raise click.UsageError("--keyframes and --tracker, --output or --attributes are mutually exclusive")
     if attributes is not None and output is None and json_file is None:
         raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     errors: list[CatstreamError] = []
     sequences = datasets.find_sequences(*paths, failed=errors.append)
+    if keyframes is not None:
+        _evaluate_keyframes(sequences, keyframes, settings, jobs, json_file, errors)
+        return
     seen = {} if attributes is None else datasets.read_attributes(attributes)
 
     try:
@@ -153,6 +170,49 @@ def evaluate(
         raise CatstreamError(
             f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
         )
+
+
+def _evaluate_keyframes(
+    sequences: list[Sequence],
+    most: int,
+    settings: Settings,
+    jobs: int,
+    json_file: Path | None,
+    errors: list[CatstreamError],
+) -> None:
+    """Measure annotation; print the means by number of boxes, and the boxes of each sequence until it is complete."""
+    with INTERRUPTS.leaving():
+        from catstream.evaluation import keyframes
+        from catstream.reports.provenance import provenance
+
+    columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
+    with line_of(messages(), *columns) as progress:
+        task = progress.add_task("starting", total=len(sequences))
+        rows = keyframes.evaluate_keyframes(
+            sequences,
+            most,
+            settings,
+            jobs=jobs,
+            done=lambda rows: progress.update(task, advance=1, description=rows[0].name),
+            failed=errors.append,
+        )
+    for error in errors:
+        complain(error)
+    if not rows:
+        raise CatstreamError("all sequences have failed: see above")
+    means, counts = keyframes.mean_by_boxes(rows), keyframes.boxes_until_complete(rows)
+    made = table("boxes", *keyframes.MEASURES.values(), right=("boxes", *keyframes.MEASURES.values()))
+    for row in means:
+        values = (getattr(row, measure) for measure in keyframes.MEASURES)
+        made.add_row(str(row.boxes), *("-" if value is None else f"{value:.3f}" for value in values))
+    screen().print(made)
+    completed = [count for count in counts.values() if count is not None]
+    mean = f", with {sum(completed) / len(completed):.1f} boxes on average" if completed else ""
+    click.echo(f"{len(completed)} of {counted(len(counts), 'sequence')} complete{mean}")
+    figures = {"rows": [asdict(row) for row in rows], "mean": [asdict(row) for row in means], "complete": counts}
+    write_json(json_file, {**provenance(settings), **figures})
+    if errors:
+        raise CatstreamError(f"{len(errors)} sequences have failed and are not included in the figures")
 
 
 def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:

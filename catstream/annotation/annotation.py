@@ -1,0 +1,342 @@
+"""`catstream.annotate`: tracks between boxes that a person has drawn at keyframes of a video."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, NamedTuple, Self, cast
+
+import numpy as np
+
+from catstream.annotation.decoded import DecodedFrames, decode
+from catstream.annotation.fusion import fuse
+from catstream.annotation.passes import Keyframes, Pass, run_pass
+from catstream.base.arrays import Float64
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED, check_count, check_name, errors_about
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.base.workers import run_tasks
+from catstream.errors import BoxError, ObjectError
+from catstream.messages.kinds import Track
+from catstream.video.source import ALL_FRAMES
+
+#: How a frame of an object is known: by the box of a person, by passes that confirm each other, or by neither.
+Check = Literal["keyframe", "checked", "unchecked"]
+
+#: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
+Progress = Callable[[str, int, int | None], object]
+
+#: The boxes of objects by frame, None where the object is absent: of one object without a name, or by name.
+_BoxesByFrame = Mapping[int, str | Iterable[float] | None]
+KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
+
+_CHECKED = 0.95  #: probability from which a frame is checked
+
+
+class NextFrame(NamedTuple):
+    """The frame to annotate next, and the object.
+
+    errors  expected number of wrong frames in the stretch that the frame divides
+    """
+
+    frame: int
+    object: str
+    errors: float
+
+
+class _Stretch(NamedTuple):
+    """The frames of an object between two keyframes, or between a keyframe and an end of the video."""
+
+    object: str
+    start: int
+    stop: int  # the frame after the last one
+
+
+class Annotation:
+    """The keyframes of the objects of a video, and the tracks between them.
+
+    Call `track` after the constructor; `annotate` does both. Each stretch between two keyframes is tracked from both
+    ends. If that does not check all of its frames, it is tracked from both ends again, with the merged model of all
+    other boxes of the object. `add` tracks only the stretches beside its box. Close the annotation, or use it in a
+    `with`: the decoded frames are in a temporary file until then.
+
+    Parameters
+    ----------
+    video : path of a file or a folder of images
+    boxes : mapping of frame to box, or of object to such a mapping; frames count from 0, None where it is absent
+    settings : Settings or mapping of str
+        The settings that differ from the defaults.
+    part : slice of the frames of the video, whose frames count from 0; by default all
+    jobs : number of processes; None for the number of cores
+    progress : function that is called during the work, see `Progress`
+
+    Attributes
+    ----------
+    frames : DecodedFrames
+    keyframes : dict of the boxes of each object, by name and frame
+
+    Raises
+    ------
+    VideoError
+        If the video is live or cannot be read.
+    BoxError
+        For a box outside its frame, or a frame beyond the end of the video.
+    ObjectError
+        For a name that is not valid, no object, or too many.
+    """
+
+    def __init__(
+        self,
+        video: str | os.PathLike[str],
+        boxes: KeyframeBoxes,
+        settings: Settings | Mapping[str, object] | None = None,
+        *,
+        part: slice = ALL_FRAMES,
+        jobs: int | None = None,
+        progress: Progress = lambda *_: None,
+    ) -> None:
+        self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
+        self._jobs, self._progress = jobs or len(os.sched_getaffinity(0)), progress
+        self.keyframes: dict[str, dict[int, Box | None]] = _parsed(boxes)
+        check_count(len(self.keyframes), self.settings.run.objects_most)
+        self._passes: dict[_Stretch, list[Pass]] = {}
+        self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
+        try:
+            self.frames: DecodedFrames = decode(
+                os.fspath(video),
+                Path(self._folder.name),
+                self.settings,
+                lambda *done: progress("decoding", *done),
+                part,
+            )
+            for name, drawn in self.keyframes.items():
+                for frame, box in drawn.items():
+                    self._check(name, frame, box)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        count = sum(map(len, self.keyframes.values()))
+        return f"<catstream.Annotation of {self.frames.name}: {count} boxes, {self.share_checked:.0%} checked>"
+
+    def close(self) -> None:
+        """Delete the decoded frames. The tracks remain; `add` and `track` cannot be called any more."""
+        self._folder.cleanup()
+
+    def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
+        """Add or replace the box of an object at a frame, None if it is absent there, and track what depends on it.
+
+        BoxError or ObjectError as of the constructor.
+        """
+        name, parsed = check_name(object), None if box is None else Box.parse(box)
+        self._check(name, frame, parsed)
+        check_count(len({*self.keyframes, name}), self.settings.run.objects_most)
+        self.keyframes.setdefault(name, {})[frame] = parsed
+        self._passes = {
+            stretch: passes
+            for stretch, passes in self._passes.items()
+            if stretch.object != name or not stretch.start - 1 <= frame <= stretch.stop
+        }
+        self.track()
+
+    def track(self) -> None:
+        """Track the stretches that are not tracked yet. If it is interrupted, the finished passes remain."""
+        stretches = [stretch for stretch in self._stretches() if not self._passes.get(stretch)]
+        self._run(stretches, use_memory=False)
+        several = [stretch for stretch in stretches if len(self.keyframes[stretch.object]) > 1]
+        self._run([stretch for stretch in several if not self._is_checked(stretch)], use_memory=True)
+
+    @property
+    def tracks(self) -> dict[str, list[Track]]:
+        """The track of each object in all frames, by name; `doubtful` if the frame is unchecked."""
+        tracks = {}
+        for name in self.keyframes:
+            boxes, probabilities, scores = self._fused(name)
+            tracks[name] = [
+                Track(
+                    *(frame + 1, frame, self.frames.times[frame], "absent" if np.isnan(box[0]) else "present"),
+                    None if np.isnan(box[0]) else Box(*box.tolist()),
+                    float(scores[frame]),
+                    0,
+                    object=name,
+                    doubtful=bool(probabilities[frame] < _CHECKED),
+                )
+                for frame, box in enumerate(boxes)
+            ]
+        return tracks
+
+    @property
+    def checked(self) -> dict[str, list[Check]]:
+        """Whether each frame is a keyframe, checked or unchecked, by the name of the object."""
+
+        def check(name: str, frame: int, probability: float) -> Check:
+            if frame in self.keyframes[name]:
+                return "keyframe"
+            return "checked" if probability >= _CHECKED else "unchecked"
+
+        return {
+            name: [check(name, frame, probability) for frame, probability in enumerate(probabilities)]
+            for name, probabilities in self.probabilities.items()
+        }
+
+    @property
+    def probabilities(self) -> dict[str, Float64]:
+        """Probability that each frame is right, float64 (frames,), by the name of the object.
+
+        Right is an IoU above 0.5 with the true box, or no box where the object is absent.
+        """
+        return {name: self._fused(name)[1] for name in self.keyframes}
+
+    @property
+    def share_checked(self) -> float:
+        """Share of frames that are keyframes or checked, over all objects, from 0 to 1."""
+        return float(np.mean([probabilities >= _CHECKED for probabilities in self.probabilities.values()]))
+
+    def passes(self, name: str = UNNAMED) -> list[Pass]:
+        """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
+        own = [one for stretch, passes in self._passes.items() if stretch.object == name for one in passes]
+        return sorted(own, key=lambda one: (one.start, one.stop, one.with_memory))
+
+    def next_frame(self) -> NextFrame | None:
+        """The first of `next_frames`; None if all frames are checked."""
+        return next(iter(self.next_frames()), None)
+
+    def next_frames(self) -> list[NextFrame]:
+        """A frame to annotate in each stretch that is not checked, in the order of their expected errors.
+
+        It divides the expected errors of its stretch into halves; at an end of the video without a keyframe, it is the
+        first or the last frame.
+        """
+        unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
+        return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
+
+    def _check(self, name: str, frame: int, box: Box | None) -> None:
+        """Raise BoxError if a keyframe is not in the video, or its box not in the frame."""
+        with errors_about(name):
+            if not 0 <= frame < len(self.frames):
+                raise BoxError(
+                    f"frame {frame} is not in the video, which has {len(self.frames)} frames, numbered from 0: "
+                    f"give a frame from 0 to {len(self.frames) - 1}"
+                )
+            if box is not None:
+                box.validated(*self.frames.size)
+
+    def _stretches(self) -> Iterator[_Stretch]:
+        """Yield the stretches of all objects that have a frame."""
+        for name, drawn in self.keyframes.items():
+            ends = [-1, *sorted(drawn), len(self.frames)]
+            for before, after in pairwise(ends):
+                if after - before > 1:
+                    yield _Stretch(name, before + 1, after)
+
+    def _run(self, stretches: list[_Stretch], *, use_memory: bool) -> None:
+        """Run the passes of stretches from both of their ends, longest first, and store each as it is finished."""
+        tasks = []
+        for stretch in sorted(stretches, key=lambda stretch: stretch.start - stretch.stop):
+            drawn, last = self.keyframes[stretch.object], len(self.frames) - 1
+            before, after = stretch.start - 1, stretch.stop
+            ways = [(before, min(after, last))] if before in drawn else []
+            ways += [(after, max(before, 0))] if after in drawn else []
+            tasks += [(stretch, self.frames, *way, drawn, self.settings, use_memory) for way in ways]
+        done, total = 0, sum(abs(task[2] - task[3]) for task in tasks)
+        work = "tracking again" if use_memory else "tracking"
+        for stretch, one in run_tasks(_work, tasks, self._jobs) if self._jobs > 1 else (_work(*task) for task in tasks):
+            if one is not None:
+                self._passes.setdefault(stretch, []).append(one)
+            done += stretch.stop - stretch.start
+            self._progress(work, min(done, total), total)
+
+    def _fused(self, name: str) -> tuple[Float64, Float64, Float64]:
+        """Boxes, probabilities and scores of an object in all frames; the last two are 1 at keyframes."""
+        count = len(self.frames)
+        boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
+        for frame, box in self.keyframes[name].items():
+            boxes[frame] = [np.nan] * 4 if box is None else box
+        for stretch in self._stretches():
+            if stretch.object == name:
+                part = slice(stretch.start, stretch.stop)
+                boxes[part], probabilities[part], scores[part] = self._fused_stretch(stretch)
+        return boxes, probabilities, scores
+
+    def _fused_stretch(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
+        # In a fixed order: passes are finished in any.
+        passes = sorted(self._passes.get(stretch, []), key=lambda one: (one.with_memory, one.start))
+        return fuse(passes, stretch.start, stretch.stop, self.keyframes[stretch.object])
+
+    def _is_checked(self, stretch: _Stretch) -> bool:
+        return bool((self._fused_stretch(stretch)[1] >= _CHECKED).all())
+
+    def _next_in(self, stretch: _Stretch) -> NextFrame:
+        errors = 1 - self._fused_stretch(stretch)[1]
+        drawn = self.keyframes[stretch.object]
+        if stretch.start - 1 not in drawn:
+            frame = 0
+        elif stretch.stop not in drawn:
+            frame = len(self.frames) - 1
+        else:
+            frame = stretch.start + int(np.searchsorted(errors.cumsum(), errors.sum() / 2))
+        return NextFrame(frame, stretch.object, float(errors.sum()))
+
+
+def annotate(
+    video: str | os.PathLike[str],
+    boxes: KeyframeBoxes,
+    settings: Settings | Mapping[str, object] | None = None,
+    *,
+    part: slice = ALL_FRAMES,
+    jobs: int | None = None,
+    progress: Progress = lambda *_: None,
+) -> Annotation:
+    """Track objects between boxes at keyframes of a video, and check the tracks.
+
+    Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
+    box is right with a probability of 95 %, see `catstream.annotation.fusion`. Parameters and errors are those of
+    `Annotation`.
+    """
+    annotation = Annotation(video, boxes, settings, part=part, jobs=jobs, progress=progress)
+    try:
+        annotation.track()
+    except BaseException:
+        annotation.close()
+        raise
+    return annotation
+
+
+def _work(
+    stretch: _Stretch,
+    frames: DecodedFrames,
+    start: int,
+    stop: int,
+    keyframes: Keyframes,
+    settings: Settings,
+    use_memory: bool,
+) -> tuple[_Stretch, Pass | None]:
+    return stretch, run_pass(frames, start, stop, keyframes, settings, use_memory=use_memory)
+
+
+def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, Box | None]]:
+    """The boxes by object and frame; ObjectError if there is no object, or a name is not valid."""
+    if all(isinstance(value, Mapping) for value in boxes.values()):
+        by_name = cast(Mapping[str, _BoxesByFrame], boxes)
+    else:
+        by_name = {UNNAMED: cast(_BoxesByFrame, boxes)}
+    if not by_name:
+        raise ObjectError("no object: pass the box of one in at least one frame")
+    parsed: dict[str, dict[int, Box | None]] = {}
+    for name, drawn in by_name.items():
+        with errors_about(check_name(name)):
+            parsed[name] = {int(frame): None if box is None else Box.parse(box) for frame, box in drawn.items()}
+        if all(box is None for box in parsed[name].values()):
+            raise ObjectError(f"{listed([name])} has no box: pass its box in at least one frame")
+    return parsed

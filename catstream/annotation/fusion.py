@@ -1,0 +1,114 @@
+"""Fusion of the passes of a stretch: one box for each frame, and the probability that it is right.
+
+Each pass votes with a weight: it falls linearly from 1 at its own keyframe to 0 at the other one, and is four times as
+high if the pass arrives at the box of the other keyframe, which is evidence that it did not lose the object before. The
+box with the highest weighted sum of IoU wins, and is averaged with those that overlap it. The probability is a logistic
+regression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from catstream.annotation.passes import Keyframes, Pass
+from catstream.base.arrays import Bool, Float64
+
+_ARRIVAL = 0.4  #: IoU with the box of the other keyframe, above which a pass has arrived
+_ARRIVAL_WEIGHT = 4.0
+_SAME = 0.5  #: IoU of two boxes that count as the same
+
+#: Weights of the logistic regression: bias, then those of the features in the order of `_features`.
+_LOGISTIC = np.array([-5.2, 4.2, 4.9, 0.6, 2.7, -0.9])
+
+
+def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) -> tuple[Float64, Float64, Float64]:
+    """Fuse the passes of the frames between two keyframes, or a keyframe and an end of the video.
+
+    start, stop : first of these frames, and the one after the last
+
+    Returns
+    -------
+    boxes : float64 (frames, 4), NaN where the object is absent
+    probabilities : float64 (frames,), of an IoU above 0.5 with the true box, or of a right absence
+    scores : float64 (frames,), of the pass with the winning box
+    """
+    count = stop - start
+    if not passes:
+        return np.full((count, 4), np.nan), np.zeros(count), np.zeros(count)
+    ordered = [_in_order(one, count) for one in passes]
+    boxes, scores = np.stack([each for each, _ in ordered]), np.stack([each for _, each in ordered])
+    arrived = np.array([_arrives(one, keyframes) for one in passes])
+    forward = np.array([one.is_forward for one in passes])
+    way = np.arange(1, count + 1) / (count + 1)
+    weights = np.where(forward[:, None], 1 - way, way) * np.where(arrived, _ARRIVAL_WEIGHT, 1.0)[:, None]
+    shared = iou(boxes[:, None], boxes[None])  # (passes, passes, frames)
+    votes = (shared * weights).sum(axis=1)
+    best, frames = votes.argmax(axis=0), np.arange(count)
+    agreement = shared[best, :, frames].T  # of the winner with each pass, (passes, frames)
+    merged = _averaged(boxes, np.where(agreement > _SAME, weights, 0.0), best)
+    opposite = forward[:, None] != forward[best]
+    features = np.column_stack(
+        [
+            votes.max(axis=0) / weights.sum(axis=0),
+            np.where(opposite, agreement, 0.0).max(axis=0),
+            np.full(count, arrived.mean()),
+            scores.min(axis=0),
+            _distortion(merged, way, keyframes.get(start - 1), keyframes.get(stop)),
+        ]
+    )
+    probabilities = 1 / (1 + np.exp(-_LOGISTIC[0] - features @ _LOGISTIC[1:]))
+    return merged, probabilities, scores[best, frames]
+
+
+def iou(one: Float64, other: Float64) -> Float64:
+    """Intersection over union of boxes (..., 4); 1 if both are NaN, 0 if one is."""
+    low, high = np.maximum(one[..., :2], other[..., :2]), np.minimum(_ends(one), _ends(other))
+    shared = np.prod(np.maximum(high - low, 0), axis=-1)
+    union = np.prod(one[..., 2:], axis=-1) + np.prod(other[..., 2:], axis=-1) - shared
+    both_absent = np.isnan(one[..., 0]) & np.isnan(other[..., 0])
+    ratios: Float64 = np.where(both_absent, 1.0, np.nan_to_num(shared / union))
+    return ratios
+
+
+def _ends(boxes: Float64) -> Float64:
+    ends: Float64 = boxes[..., :2] + boxes[..., 2:]
+    return ends
+
+
+def _in_order(one: Pass, count: int) -> tuple[Float64, Float64]:
+    """Boxes and scores of a pass in the order of the video, without those of a keyframe at its end."""
+    boxes, scores = one.boxes[:count], one.scores[:count]
+    return (boxes, scores) if one.is_forward else (boxes[::-1], scores[::-1])
+
+
+def _arrives(one: Pass, keyframes: Keyframes) -> bool:
+    """Whether a pass ends near the box of the keyframe at its end, or without a box where the object is absent."""
+    if one.stop not in keyframes:
+        return False
+    box = np.array(keyframes[one.stop] or [np.nan] * 4)
+    return bool(iou(one.boxes[-1], box) > _ARRIVAL)
+
+
+def _averaged(boxes: Float64, weights: Float64, best: np.ndarray) -> Float64:
+    """The weighted mean of boxes (passes, frames, 4) of each frame; NaN where the winner has no box."""
+    frames = np.arange(boxes.shape[1])
+    present: Bool = ~np.isnan(boxes[..., 0])
+    weights = np.where(present, weights, 0.0)[..., None]
+    total = weights.sum(axis=0)
+    corners = np.nan_to_num(boxes)
+    mean = (corners * weights).sum(axis=0) / np.where(total, total, 1.0)
+    merged: Float64 = np.where(present[best, frames][:, None], mean, np.nan)
+    return merged
+
+
+def _distortion(boxes: Float64, way: Float64, before: object, after: object) -> Float64:
+    """How much width and height differ from those between the keyframes, as absolute logarithms; 0 if not known."""
+    ends = [np.array(box)[2:] for box in (before, after) if box is not None]
+    if not ends:
+        return np.zeros(len(boxes))
+    expected = np.log(ends[0]) * (1 - way)[:, None] + np.log(ends[-1]) * way[:, None]
+    sizes = np.log(np.nan_to_num(boxes[:, 2:], nan=1.0))
+    differences: Float64 = np.where(np.isnan(boxes[:, 0]), 0.0, np.abs(sizes - expected).sum(axis=1))
+    return differences

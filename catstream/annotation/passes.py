@@ -1,0 +1,110 @@
+"""A pass: the object is tracked from a keyframe in one direction, up to the next keyframe or the end of the video.
+
+A pass is built from the stages of `catstream.MultiTracker`. Its tracker starts at the box of the keyframe, alone or
+with a memory: the merged coreset trees of all other boxes of the object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from catstream.annotation.decoded import DecodedFrames
+from catstream.base.arrays import Float64
+from catstream.base.box import Box
+from catstream.base.names import UNNAMED
+from catstream.base.settings import Settings
+from catstream.base.threads import one_thread
+from catstream.compression.forest import Forest
+from catstream.detection.objects import Detectors
+from catstream.errors import BoxError
+from catstream.jobs.saved_model import SavedModel, merge
+from catstream.messages.kinds import Track
+from catstream.multi import MultiTracker
+from catstream.training.trainer import Trainer
+
+#: The boxes of an object at its keyframes, by number of the frame; None where it is absent.
+Keyframes = Mapping[int, Box | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pass:
+    """The boxes of a pass.
+
+    start        the keyframe that it starts at
+    stop         its last frame: the next keyframe, or the end of the video; before `start` if it runs backwards
+    boxes        float64 (frames, 4), pixels, from the frame after `start` to `stop`; NaN where the object is absent
+    scores       float64 (frames,), scores of the tracker
+    with_memory  whether it began with the model of all boxes of the object
+    """
+
+    start: int
+    stop: int
+    boxes: Float64
+    scores: Float64
+    with_memory: bool = False
+
+    @property
+    def is_forward(self) -> bool:
+        return self.stop > self.start
+
+
+@one_thread(opencv=True)
+def run_pass(
+    frames: DecodedFrames, start: int, stop: int, keyframes: Keyframes, settings: Settings, *, use_memory: bool
+) -> Pass | None:
+    """Track the object of some keyframes from the one at `start` to the frame `stop`.
+
+    Without a memory of the other boxes, only that at `start` is used. With it, an object that is absent at `start` is
+    searched for in the frames after it. Returns None if tracking cannot start: without a box, or with one that looks
+    like all around it.
+    """
+    box, others = keyframes[start], {number: box for number, box in keyframes.items() if number != start}
+    learned = _memory(frames, others, settings) if use_memory else None
+    if box is None and learned is None:
+        return None
+    step = 1 if stop > start else -1
+    route = range(start, stop + step, step)
+    try:
+        tracks = [*_tracks((frames[number] for number in route), box, learned, settings)][1:]
+    except BoxError:
+        return None
+    boxes = np.array([track.box or [np.nan] * 4 for track in tracks], np.float64).reshape(-1, 4)
+    return Pass(start, stop, boxes, np.array([track.score for track in tracks], np.float64), use_memory)
+
+
+def _tracks(
+    images: Iterable[np.ndarray], box: Box | None, learned: SavedModel | None, settings: Settings
+) -> Iterator[Track]:
+    """Track from a box in the first image, or search for the object of a saved model without one."""
+    detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
+    for number, image in enumerate(images):
+        pyramid, begun, continued = detectors.pyramid(image), {}, {}
+        if number == 0:
+            if learned is not None:
+                continued = {UNNAMED: learned.compressor(settings, detectors.network)}
+            if box is not None:
+                begun = detectors.begin_all({UNNAMED: box}, pyramid)
+            elif learned is not None:
+                detectors.seek(UNNAMED, learned.model, learned.box, learned.similarity())
+        tracks, features = detectors.step(pyramid, 0.0, begun)
+        for sample in forest.take(features, continued):
+            detectors.adopt(trainer.train(sample))
+        yield tracks.tracks[UNNAMED]
+
+
+def _memory(frames: DecodedFrames, keyframes: Keyframes, settings: Settings) -> SavedModel | None:
+    """The merged model of the boxes of an object. The rows of each box fill a leaf, which is 16 tracked frames."""
+    models: dict[tuple[str, ...], SavedModel] = {}  # by their rows, which frames of a still video share
+    for number, box in keyframes.items():
+        if box is not None:
+            tracker = MultiTracker(settings)
+            try:
+                tracker.init(frames[number], {UNNAMED: box})
+            except BoxError:
+                continue
+            model = tracker.saved_model()
+            models[model.origins] = model
+    return merge(models.values(), force=True) if len(models) > 1 else next(iter(models.values()), None)

@@ -1,0 +1,207 @@
+"""Evaluation of annotation: boxes are drawn from the ground truth where `Annotation.next_frame` asks for them.
+
+The first box is that of the first frame with the object. Where the annotation asks for a frame with whose box tracking
+cannot start, for example one of a single pixel, the nearest other frame gets a box.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Generator
+from contextlib import closing
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+
+from catstream.annotation.annotation import Annotation
+from catstream.base.arrays import Bool, Float64
+from catstream.base.box import Box
+from catstream.base.settings import Settings
+from catstream.base.workers import run_tasks
+from catstream.errors import BoxError, CatstreamError, VideoError
+from catstream.evaluation.datasets import Sequence
+from catstream.evaluation.scores import overlaps
+
+#: The measures of a row, with their headings.
+MEASURES = {
+    "success": "success",
+    "checked": "checked",
+    "precision": "of these right",
+    "expected": "expected",
+    "complete": "complete",
+    "interpolation": "interpolation",
+    "forward": "forwards only",
+}
+
+#: Expected share of right frames from which an annotation counts as complete.
+COMPLETE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeRow:
+    """The measures of a sequence after a number of boxes, or their means over sequences; shares from 0 to 1.
+
+    A frame is right if the overlap with the ground truth is above 0.5, or no box is reported where it has none.
+
+    name           of the sequence
+    boxes          number of keyframes
+    success        share of right frames
+    checked        share of checked frames and keyframes
+    precision      share of right ones among the checked frames, without keyframes; None if there are none
+    expected       mean probability of the frames to be right
+    complete       whether both `success` and `expected` are at least 0.95
+    interpolation  success of linear interpolation between the same boxes
+    forward        success if each stretch is tracked forwards only, from the same boxes
+    """
+
+    name: str
+    boxes: int
+    success: float
+    checked: float
+    precision: float | None
+    expected: float
+    complete: float
+    interpolation: float
+    forward: float
+
+
+def evaluate_keyframes(
+    sequences: list[Sequence],
+    most: int,
+    settings: Settings,
+    *,
+    jobs: int = 1,
+    done: Callable[[list[KeyframeRow]], None] = lambda _: None,
+    failed: Callable[[CatstreamError], None] | None = None,
+) -> list[KeyframeRow]:
+    """Annotate sequences with 1, 2 ... `most` boxes; return a row for each sequence and number of boxes.
+
+    jobs : number of processes, one sequence in each at a time
+    done : function that is called with the rows of each finished sequence
+    failed : function that is called with the error of each sequence that fails; if None, the error is raised
+    """
+    tasks = [(sequence, most, settings) for sequence in sorted(sequences, key=len, reverse=True)]
+    rows: list[KeyframeRow] = []
+    results = run_tasks(_annotated, tasks, jobs) if jobs > 1 else (_annotated(*task) for task in tasks)
+    with closing(results):
+        for result in results:
+            if not isinstance(result, CatstreamError):
+                rows += result
+                done(result)
+            elif failed is None:
+                raise result
+            else:
+                failed(result)
+    order = {sequence.name: number for number, sequence in enumerate(sequences)}
+    return sorted(rows, key=lambda row: (order[row.name], row.boxes))
+
+
+def mean_by_boxes(rows: list[KeyframeRow]) -> list[KeyframeRow]:
+    """The means over the sequences for each number of boxes; a sequence without frames to check counts in none."""
+    means = []
+    for boxes in sorted({row.boxes for row in rows}):
+        group = [dataclasses.asdict(row) for row in rows if row.boxes == boxes]
+        known = {field: [row[field] for row in group if row[field] is not None] for field in MEASURES}
+        shares: dict[str, Any] = {field: fmean(values) if values else None for field, values in known.items()}
+        means.append(KeyframeRow("mean", boxes, **shares))
+    return means
+
+
+def boxes_until_complete(rows: list[KeyframeRow]) -> dict[str, int | None]:
+    """The number of boxes of each sequence from which it is complete; None if it is not with any number."""
+    first: dict[str, int | None] = {}
+    for row in sorted(rows, key=lambda row: row.boxes):
+        if first.setdefault(row.name, None) is None and row.complete:
+            first[row.name] = row.boxes
+    return first
+
+
+def _annotated(sequence: Sequence, most: int, settings: Settings) -> list[KeyframeRow] | CatstreamError:
+    try:
+        return [*_rows(sequence, most, settings)]
+    except CatstreamError as error:
+        return CatstreamError(f"{sequence.name}: {error}")
+
+
+def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[KeyframeRow]:
+    truth, size = sequence.boxes, sequence.size()
+    usable = [frame for frame in range(len(truth)) if _is_usable(truth[frame], size)]
+    first = next((frame for frame in usable if _box(truth[frame]) is not None), None)
+    if first is None:
+        raise VideoError("tracking can start with no box of the ground truth: use another sequence")
+    part = slice(sequence.begin, sequence.begin + len(sequence))
+    drawn = {first: _box(truth[first])}
+    with Annotation(sequence.path, drawn, settings, part=part, jobs=1) as annotation:
+        annotation.track()
+        while True:
+            yield _row(sequence, annotation)
+            (keyframes,) = annotation.keyframes.values()
+            following, free = annotation.next_frame(), [frame for frame in usable if frame not in keyframes]
+            if following is None or not free or len(keyframes) >= most:
+                break
+            frame = min(free, key=lambda frame: abs(frame - following.frame))
+            annotation.add(frame, _box(truth[frame]))
+        last = _row(sequence, annotation)
+        for boxes in range(len(keyframes) + 1, most + 1):  # more boxes are not asked for
+            yield dataclasses.replace(last, boxes=boxes)
+
+
+def _row(sequence: Sequence, annotation: Annotation) -> KeyframeRow:
+    ((name, tracks),) = annotation.tracks.items()
+    probabilities, keyframes = annotation.probabilities[name], annotation.keyframes[name]
+    right = _right(np.array([track.box or [np.nan] * 4 for track in tracks], np.float64), sequence.boxes)
+    states = np.array(annotation.checked[name])
+    checked, success = states == "checked", float(right.mean())
+    expected = float(probabilities.mean())
+    return KeyframeRow(
+        name=sequence.name,
+        boxes=len(keyframes),
+        success=success,
+        checked=float((states != "unchecked").mean()),
+        precision=float(right[checked].mean()) if checked.any() else None,
+        expected=expected,
+        complete=float(success >= COMPLETE and expected >= COMPLETE),
+        interpolation=float(_right(_interpolated(keyframes, len(right)), sequence.boxes).mean()),
+        forward=float(_right(_forward(annotation, name), sequence.boxes).mean()),
+    )
+
+
+def _right(boxes: Float64, truth: Float64) -> Bool:
+    both_absent = np.isnan(boxes[:, 0]) & np.isnan(truth[:, 0])
+    right: Bool = both_absent | (overlaps(boxes, truth) > 0.5)
+    return right
+
+
+def _interpolated(keyframes: dict[int, Box | None], count: int) -> Float64:
+    """Boxes between the keyframes, linear in all four numbers; before the first and after the last one, its box."""
+    present = sorted(frame for frame, box in keyframes.items() if box is not None)
+    known = np.array([keyframes[frame] for frame in present])
+    boxes = np.column_stack([np.interp(np.arange(count), present, known[:, side]) for side in range(4)])
+    boxes[[frame for frame, box in keyframes.items() if box is None]] = np.nan
+    return boxes
+
+
+def _forward(annotation: Annotation, name: str) -> Float64:
+    """Boxes of the passes that run forwards from each keyframe, without a memory; before the first one, none."""
+    boxes = np.full((len(annotation.frames), 4), np.nan)
+    for one in annotation.passes(name):
+        if one.is_forward and not one.with_memory:
+            boxes[one.start + 1 : one.stop + 1] = one.boxes
+    for frame, box in annotation.keyframes[name].items():
+        boxes[frame] = [np.nan] * 4 if box is None else box
+    return boxes
+
+
+def _box(row: Float64) -> Box | None:
+    return Box(*row.tolist()) if np.isfinite(row).all() else None
+
+
+def _is_usable(row: Float64, size: tuple[int, int]) -> bool:
+    """Whether a person could draw this: a box that tracking can start with, or that the object is absent."""
+    box = _box(row)
+    try:
+        return box is None or bool(box.validated(*size))
+    except BoxError:
+        return False

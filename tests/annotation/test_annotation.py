@@ -1,0 +1,143 @@
+"""Annotation of a rendered video: what is tracked, what is checked, and which frame is asked for."""
+
+import numpy as np
+import pytest
+
+from catstream.annotation import annotation as module
+from catstream.annotation.annotation import Annotation, annotate
+from catstream.base.box import Box
+from catstream.errors import BoxError, CatstreamError, ObjectError, VideoError
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def demo(demo_video):
+    return demo_video(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def both_ends(demo):
+    """The annotation of the video with its object's boxes in the first and the last frame."""
+    video, truth = demo
+    with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=1) as annotation:
+        yield annotation
+
+
+def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_ends):
+    _, truth = demo
+    tracks = both_ends.tracks["anna"]
+    assert all(track.box.overlap(box) > 0.5 for track, box in zip(tracks, truth, strict=True))
+    assert both_ends.checked["anna"] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
+    assert both_ends.share_checked == 1
+    assert both_ends.next_frame() is None
+
+
+def test_a_keyframe_keeps_its_box(demo, both_ends):
+    _, truth = demo
+    assert [both_ends.tracks["anna"][frame].box for frame in (0, -1)] == [truth[0], truth[-1]]
+    assert both_ends.probabilities["anna"][[0, -1]].tolist() == [1, 1]
+
+
+def test_tracks_count_frames_and_have_their_times(both_ends):
+    tracks = both_ends.tracks["anna"]
+    assert [track.frame for track in tracks] == [*range(FRAMES)]
+    assert tracks[-1].time == both_ends.frames.times[-1] > 0
+    assert {track.object for track in tracks} == {"anna"}
+
+
+def test_after_one_box_the_rest_is_tracked_unchecked_and_the_last_frame_is_asked_for(demo):
+    video, truth = demo
+    with annotate(video, {3: truth[3]}, jobs=1) as annotation:
+        assert all(track.box is not None for track in annotation.tracks[""])
+        assert annotation.checked[""].count("unchecked") == FRAMES - 1
+        assert annotation.next_frame().frame == FRAMES - 1
+        assert {question.frame for question in annotation.next_frames()} == {0, FRAMES - 1}
+
+
+def test_a_box_that_is_added_changes_only_the_passes_beside_it(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[0], 12: truth[12], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
+        before = annotation.passes()
+        annotation.add(18, truth[18])
+        after = annotation.passes()
+    assert [one for one in before if one in after] == [one for one in before if one.start + one.stop == 12]
+    assert {(one.start, one.stop) for one in after} == {(0, 12), (12, 0), (12, 18), (18, 12), (18, 23), (23, 18)}
+
+
+def test_two_processes_give_the_same_tracks_as_one(demo, both_ends):
+    video, truth = demo
+    with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=2) as annotation:
+        assert annotation.tracks == both_ends.tracks
+
+
+def test_where_an_object_is_absent_it_has_no_box(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[0], FRAMES - 1: None}, jobs=1) as annotation:
+        assert annotation.tracks[""][-1].state == "absent"
+        annotation.add(FRAMES - 1, truth[-1])
+        assert annotation.tracks[""][-1].box == truth[-1]
+
+
+def test_a_part_of_a_video_counts_its_frames_from_zero(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[10]}, part=slice(10, 15), jobs=1) as annotation:
+        assert len(annotation.frames) == 5
+        assert annotation.tracks[""][-1].box.overlap(truth[14]) > 0.5
+
+
+def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
+    video, truth = demo
+    work, started = module._work, []
+
+    def interrupted(*task):
+        started.append(task)
+        if len(started) > 1:
+            raise KeyboardInterrupt
+        return work(*task)
+
+    monkeypatch.setattr(module, "_work", interrupted)
+    with Annotation(video, {0: truth[0], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
+        with pytest.raises(KeyboardInterrupt):
+            annotation.track()
+        assert len(annotation.passes()) == 1
+        assert annotation.tracks[""][5].box is not None
+
+
+def test_the_decoded_frames_are_deleted_with_the_annotation_and_after_an_error(demo):
+    video, truth = demo
+    annotation = annotate(video, {0: truth[0]}, part=slice(0, 3), jobs=1)
+    path = annotation.frames.path
+    assert path.stat().st_size == np.prod(annotation.frames.shape)
+    annotation.close()
+    assert not path.parent.exists()
+    before = {*path.parent.parent.iterdir()}
+    with pytest.raises(BoxError):
+        annotate(video, {99: truth[0]})
+    assert {*path.parent.parent.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("boxes", "error", "message"),
+    [
+        ({FRAMES: (1, 2, 30, 40)}, BoxError, "frame 24 is not in the video, which has 24 frames"),
+        ({"anna": {0: (400, 2, 30, 40)}}, BoxError, "anna: the box .* outside the frame"),
+        ({"anna": {0: None}}, ObjectError, "anna has no box"),
+        ({}, ObjectError, "no object"),
+        ({"a b": {0: (1, 2, 30, 40)}}, ObjectError, "not a name"),
+    ],
+)
+def test_boxes_that_cannot_be_tracked_are_an_error(demo, boxes, error, message):
+    with pytest.raises(error, match=message):
+        annotate(demo[0], boxes)
+
+
+def test_a_live_source_is_an_error():
+    with pytest.raises(VideoError, match="is live"):
+        annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
+
+
+def test_frames_that_do_not_fit_on_the_disk_are_an_error(demo, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000}))
+    with pytest.raises(CatstreamError, match="TMPDIR"):
+        annotate(demo[0], {0: demo[1][0]})

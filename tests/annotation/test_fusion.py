@@ -1,0 +1,77 @@
+"""Fusion of passes: which box wins, and how probable it is that it is right."""
+
+import numpy as np
+import pytest
+
+from catstream.annotation.fusion import fuse, iou
+from catstream.annotation.passes import Pass
+from catstream.base.box import Box
+
+LEFT, RIGHT = Box(10, 20, 30, 40), Box(110, 20, 30, 40)
+ABSENT = [np.nan] * 4
+
+
+def forward(*boxes, score=0.9):
+    """A pass from keyframe 0 to keyframe 10 with the last of some boxes from some frame on."""
+    return Pass(0, 10, np.array(boxes * 10 if len(boxes) == 1 else boxes, float), np.full(10, score))
+
+
+def backward(*boxes, score=0.9):
+    return Pass(10, 0, np.array(boxes * 10 if len(boxes) == 1 else boxes, float), np.full(10, score))
+
+
+def fused(*passes, drawn):
+    return fuse(passes, 1, 10, drawn)
+
+
+def test_passes_that_agree_give_their_box_with_a_high_probability():
+    boxes, probabilities, _ = fused(forward(LEFT), backward(LEFT), drawn={0: LEFT, 10: LEFT})
+    assert boxes == pytest.approx(np.array([LEFT] * 9))
+    assert (probabilities > 0.95).all()
+
+
+def test_the_nearer_keyframe_wins_where_neither_pass_arrives():
+    boxes, probabilities, _ = fused(forward(LEFT), backward(RIGHT), drawn={0: LEFT, 10: RIGHT})
+    assert boxes[:, 0].tolist() == [10.0] * 5 + [110.0] * 4
+    assert (probabilities < 0.95).all()
+    assert probabilities.argmin() == 4
+
+
+def test_a_pass_that_arrives_at_the_other_keyframe_wins_beyond_the_middle():
+    boxes, _, _ = fused(forward(LEFT), backward(RIGHT), drawn={0: LEFT, 10: LEFT})
+    assert boxes[:7, 0].tolist() == [10.0] * 7
+
+
+def test_a_frame_that_one_pass_saw_alone_is_not_checked():
+    for passes in ([forward(LEFT)], [backward(LEFT)]):
+        assert (fused(*passes, drawn={0: LEFT, 10: LEFT})[1] < 0.95).all()
+
+
+def test_passes_agree_that_an_object_is_absent():
+    boxes, probabilities, _ = fused(forward(ABSENT), backward(ABSENT), drawn={0: None, 10: None})
+    assert np.isnan(boxes).all()
+    assert (probabilities > 0.9).all()
+
+
+def test_the_boxes_of_passes_that_agree_are_averaged_by_their_distance():
+    moved = Box(14, 20, 30, 40)
+    x = fused(forward(LEFT), backward(moved), drawn={0: LEFT, 10: moved})[0][:, 0]
+    assert x == pytest.approx(np.linspace(10.4, 13.6, 9))
+
+
+def test_the_order_of_the_passes_does_not_matter():
+    passes = [forward(LEFT), backward(RIGHT), backward(LEFT)]
+    one, other = (fused(*order, drawn={0: LEFT, 10: LEFT}) for order in (passes, passes[::-1]))
+    assert all(np.allclose(*both) for both in zip(one, other, strict=True))
+
+
+def test_frames_without_a_pass_have_no_box_and_no_probability():
+    boxes, probabilities, _ = fused(drawn={0: LEFT, 10: LEFT})
+    assert np.isnan(boxes).all()
+    assert not probabilities.any()
+
+
+def test_iou_is_one_if_both_are_absent_and_zero_if_one_is():
+    boxes = np.array([LEFT, ABSENT])
+    assert iou(boxes, boxes).tolist() == [1, 1]
+    assert iou(boxes, boxes[::-1]).tolist() == [0, 0]

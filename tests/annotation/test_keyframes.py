@@ -1,0 +1,47 @@
+"""Boxes at keyframes as text: parsed, and the same after they were written and read."""
+
+import pytest
+
+from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes, write_keyframes
+from catstream.base.box import Box
+from catstream.errors import BoxError, CatstreamError, VideoError
+
+DRAWN = {"anna": {0: Box(1.5, 2, 30, 40), 412: None}, "": {7: Box(0.1, 0.2, 3, 4)}}
+
+
+def test_a_file_of_keyframes_is_read_as_it_was_written(tmp_path):
+    write_keyframes(tmp_path / "keyframes.csv", DRAWN)
+    assert by_object(read_keyframes(tmp_path / "keyframes.csv")) == DRAWN
+    assert (tmp_path / "keyframes.csv").read_text().splitlines()[3] == "412,anna,absent,,,"
+
+
+def test_a_file_needs_no_columns_after_absent(tmp_path):
+    (tmp_path / "boxes.csv").write_text("frame,object,x,y,w,h\n3,anna,absent\n")
+    assert read_keyframes(tmp_path / "boxes.csv") == [("anna", 3, None)]
+
+
+@pytest.mark.parametrize(
+    "text", ["anna=1,2,30,40", "anna@=1,2,30,40", "anna@-1=1,2,30,40", "anna@3=1,2,30", "a b@3=1,2,3,4"]
+)
+def test_a_malformed_keyframe_is_an_error_with_an_example_or_the_value(text):
+    with pytest.raises(CatstreamError, match=r"@FRAME=|four numbers|not a name"):
+        parse_keyframe(text)
+
+
+@pytest.mark.parametrize(
+    "line", ["3,anna,1,2,30", "x,anna,1,2,30,40", "3,anna,1,2,30,0", "3,a b,1,2,30,40", "3.5,anna,absent"]
+)
+def test_the_error_of_a_malformed_file_names_its_line(tmp_path, line):
+    (tmp_path / "boxes.csv").write_text(f"frame,object,x,y,w,h\n0,anna,1,2,30,40\n{line}\n")
+    with pytest.raises(VideoError, match="line 3"):
+        read_keyframes(tmp_path / "boxes.csv")
+
+
+def test_a_file_that_does_not_exist_is_an_error_of_one_line(tmp_path):
+    with pytest.raises(VideoError, match="cannot read the boxes"):
+        read_keyframes(tmp_path / "boxes.csv")
+
+
+def test_an_object_has_one_box_in_a_frame():
+    with pytest.raises(BoxError, match="anna has two boxes in frame 3"):
+        by_object([("anna", 3, None), ("ben", 3, None), ("anna", 3, Box(1, 2, 30, 40))])

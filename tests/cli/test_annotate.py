@@ -1,0 +1,83 @@
+"""`catstream annotate`: the files that it writes, the frame that it asks for, and its errors."""
+
+import csv
+import json
+
+import pytest
+
+FRAMES = 12
+
+
+@pytest.fixture
+def demo(demo_video):
+    video, boxes = demo_video(FRAMES)
+    return str(video), [",".join(map(str, box)) for box in boxes]
+
+
+def rows(file):
+    with file.open(newline="") as table:
+        return list(csv.DictReader(table))
+
+
+def test_annotate_writes_the_log_and_its_tables_and_continues_from_its_boxes(demo, succeed, tmp_path):
+    video, boxes = demo
+    out = tmp_path / "out"
+    output, _ = succeed("annotate", video, "--box", f"anna@0={boxes[0]}", "--output", out, "--jobs", 1)
+    assert f"anna: 1 of {FRAMES} frames checked (8%), 1 keyframe" in output
+    assert f"look next at frame {FRAMES - 1} for anna" in output
+    assert [row["frame"] for row in rows(out / "next.csv")] == [str(FRAMES - 1)]
+
+    more = ("--boxes", out / "keyframes.csv", "--box", f"anna@{FRAMES - 1}={boxes[-1]}", "--output", out)
+    output, _ = succeed("annotate", video, *more, "--overwrite", "--jobs", 1)
+    assert "all frames are checked" in output
+    assert rows(out / "next.csv") == []
+    assert len(rows(out / "keyframes.csv")) == 2
+    checked = rows(out / "checked.csv")
+    assert [row["checked"] for row in checked] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
+    assert all(0.95 <= float(row["probability"]) <= 1 for row in checked)
+
+
+def test_the_log_of_an_annotation_is_exported_as_that_of_a_run(demo, succeed, tmp_path):
+    video, boxes = demo
+    succeed("annotate", video, "--box", f"anna@0={boxes[0]}", "--output", tmp_path / "out", "--jobs", 1)
+    succeed("export", tmp_path / "out" / "demo.ndjson", tmp_path / "demo.coco.json", "--size", video)
+    assert len(json.loads((tmp_path / "demo.coco.json").read_text())["annotations"]) == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("boxes", "message"),
+    [
+        (["anna@0=1,2,30,40", "anna@0=1,2,30,41"], "anna has two boxes in frame 0: pass one of them"),
+        (["anna@99=1,2,30,40"], f"anna: frame 99 is not in the video, which has {FRAMES} frames"),
+        (["anna@0=900,2,30,40"], "outside the frame"),
+        (["anna=1,2,30,40"], "expected NAME@FRAME=X,Y,W,H"),
+        ([], "missing box: pass --box NAME@FRAME=X,Y,W,H or --boxes FILE.csv"),
+    ],
+)
+def test_boxes_that_cannot_be_used_are_an_error_of_one_line(demo, fail, tmp_path, boxes, message):
+    options = [word for box in boxes for word in ("--box", box)]
+    assert message in fail("annotate", demo[0], *options, "--output", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_live_source_cannot_be_annotated(fail, tmp_path):
+    assert "is live" in fail("annotate", "rtsp://10.0.0.7/a", "--box", "@0=1,2,30,40", "--output", tmp_path / "out")
+
+
+def test_existing_results_are_replaced_with_overwrite_only(demo, fail, tmp_path):
+    (tmp_path / "next.csv").touch()
+    box = f"@0={demo[1][0]}"
+    assert "next.csv exists already" in fail("annotate", demo[0], "--box", box, "--output", tmp_path)
+
+
+def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, monkeypatch):
+    from catstream.annotation.annotation import Annotation
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Annotation, "track", interrupted)
+    code, _, errors = said("annotate", demo[0], "--box", f"@0={demo[1][0]}", "--output", tmp_path / "out")
+    assert (code, errors) == (130, f"stopped: the results so far are in {tmp_path / 'out'}\n")
+    assert len(rows(tmp_path / "out" / "keyframes.csv")) == 1
+    assert len(rows(tmp_path / "out" / "checked.csv")) == FRAMES
