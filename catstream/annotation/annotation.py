@@ -102,7 +102,7 @@ class Annotation:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         self._jobs, self._progress = jobs or len(os.sched_getaffinity(0)), progress
         self.keyframes: dict[str, dict[int, Box | None]] = _parsed(boxes)
-        check_count(len(self.keyframes), self.settings.run.objects_most)
+        check_count(len(self.keyframes), self.settings.run.max_objects)
         self._passes: dict[_Stretch, list[Pass]] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
@@ -141,7 +141,7 @@ class Annotation:
         """
         name, parsed = check_name(object), None if box is None else Box.parse(box)
         self._check(name, frame, parsed)
-        check_count(len({*self.keyframes, name}), self.settings.run.objects_most)
+        check_count(len({*self.keyframes, name}), self.settings.run.max_objects)
         self.keyframes.setdefault(name, {})[frame] = parsed
         self._passes = {
             stretch: passes

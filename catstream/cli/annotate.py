@@ -15,9 +15,9 @@ from catstream.base.files import write_atomically, writing
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
+from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
-from catstream.processes.options import FOLDER, PATH, with_given, with_overwrite, with_reading
 
 if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 @click.option("--output", type=FOLDER, required=True, help="Folder for the results.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, that of the cores.")
 @with_overwrite
-@with_given
+@with_overrides
 @with_reading
 def annotate(
-    given: dict[str, object],
+    overrides: dict[str, object],
     video: str,
     texts: tuple[str, ...],
     csv_file: Path | None,
@@ -91,7 +91,7 @@ def annotate(
     with bar:
         bar.add_task("decoding", total=None)
         with Annotation(
-            video, drawn, Settings.from_values(given), jobs=jobs, progress=lambda *done: _show(bar, *done)
+            video, drawn, Settings.from_values(overrides), jobs=jobs, progress=lambda *done: _show(bar, *done)
         ) as annotation:
             files = _files(annotation, video, output, overwrite=overwrite)
             files.make_folder()

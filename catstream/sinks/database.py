@@ -96,13 +96,13 @@ class SqliteSink:
                 with self._database:
                     self._database.executemany(_INSERT, rows(self._waiting))
         except _LockedError:
-            self._warnings.warn("locked by another program; frames wait in memory")
+            self._warnings.failed("locked by another program; frames wait in memory")
             return
         except VideoError:
             self._waiting.clear()
             raise
         self._waiting.clear()
-        self._warnings.warn("")
+        self._warnings.working()
 
     def _connect(self) -> sqlite3.Connection:
         with ExitStack() as stack:
@@ -119,7 +119,7 @@ class SqliteSink:
         path = Path(self._place)
         if path.exists() and os.path.samestat(path.stat(), os.fstat(self._lock.fileno())):
             return
-        self._warnings.tell("removed or renamed by another program; the log goes on there without the rows before")
+        self._warnings.log("removed or renamed by another program; the log goes on there without the rows before")
         if self._database is not None:
             self._database.close()
         self._database = None

@@ -113,7 +113,7 @@ class LineSink(ABC):
                 if status.st_size >= self._status.st_size:
                     return
                 rest, problem = self.path.read_bytes().rfind(b"\n") + 1, "truncated"
-        Warnings(str(self.path)).tell(f"{problem} by another program; the log goes on there without the rows before")
+        Warnings(str(self.path)).log(f"{problem} by another program; the log goes on there without the rows before")
         self._file.close()
         with writing(self.path, VideoError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
