@@ -30,7 +30,7 @@ from catstream.jobs.state import last_seq, last_time, locked_for_run, saved
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
-from catstream.video.source import ALL_FRAMES
+from catstream.video.source import ALL_FRAMES, source_text
 from catstream.wire.endpoint import private_folder, reserve_endpoint
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
@@ -136,11 +136,12 @@ class Pipeline:
     ) -> None:
         _check_exclusive(state, resume, box, model)
         start_server()  # it imports while this process opens the source
+        text = None if source is None else source_text(source)
         self._earlier = None if resume is None else Job.load(Path(resume))
         if self._earlier is None:
-            job = Job.new(source, box, settings, models=model, part=part, results=results, paused=paused)
+            job = Job.new(text, box, settings, models=model, part=part, results=results, paused=paused)
         else:
-            job = self._earlier.resumed(source, settings, part=part, results=results, paused=paused)
+            job = self._earlier.resumed(text, settings, part=part, results=results, paused=paused)
         self._save_models = job.results.models if save_model is None else _writable(save_model)
         info = probe(job)
         self._job = job = prepared(job, info)

@@ -23,12 +23,12 @@ from catstream.base.settings import Settings, describe
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
-from catstream.video.source import ALL_FRAMES, source_text
 
 #: Files of saved models: of one object without a name, or by name.
 Models = str | os.PathLike[str] | Mapping[str, str | os.PathLike[str]]
 
 _NAME = "job.safetensors"
+_ALL = slice(None)  # frames
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class Job:
     source: str = field(default="", repr=False)  # it may contain a password
     boxes: dict[str, Box] = field(default_factory=dict)
     models: dict[str, Path] = field(default_factory=dict)
-    part: slice = field(default_factory=lambda: ALL_FRAMES)
+    part: slice = field(default_factory=lambda: _ALL)
     settings: Settings = field(default_factory=Settings)
     size: tuple[int, int] | None = None
     results: Results = Results()
@@ -133,20 +133,20 @@ class Job:
     @classmethod
     def new(
         cls,
-        source: str | os.PathLike[str] | int | None,
+        source: str | None,
         boxes: Boxes | None = None,
         settings: Settings | Mapping[str, object] | None = None,
         *,
         models: Models | None = None,
-        part: slice = ALL_FRAMES,
+        part: slice = _ALL,
         results: Results | None = None,
         paused: bool = False,
     ) -> Job:
-        """The job of a new run, by the arguments of `catstream.Pipeline`."""
+        """The job of a new run, by the arguments of `catstream.Pipeline`; SettingsError without a source."""
         if source is None:
             raise SettingsError("missing source: a new run needs a video, a folder of images, a camera or a stream")
         return cls(
-            source=source_text(source),
+            source=source,
             boxes={} if boxes is None else boxes_by_name(boxes),
             models={name: file.absolute() for name, file in files_by_name(models).items()},
             part=part,
@@ -157,18 +157,18 @@ class Job:
 
     def resumed(
         self,
-        source: str | os.PathLike[str] | int | None = None,
+        source: str | None = None,
         settings: Settings | Mapping[str, object] | None = None,
         *,
-        part: slice = ALL_FRAMES,
+        part: slice = _ALL,
         results: Results | None = None,
         paused: bool = False,
     ) -> Job:
         """The job of the next part of the run; what is not given stays."""
         return replace(
             self,
-            source=self.source if source is None else source_text(source),
-            part=self.part if part == ALL_FRAMES else part,
+            source=self.source if source is None else source,
+            part=self.part if part == _ALL else part,
             settings=settings if isinstance(settings, Settings) else self.settings.replace(settings or {}),
             results=self.results if results is None else results.after(self.results),
             paused=paused,
