@@ -34,7 +34,8 @@ from table import Table, benchmark, command
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.client.control import Control, control
+from catstream.client.attach import control
+from catstream.client.control import Control
 from catstream.compression.forest import Forest
 from catstream.errors import ServiceError
 from catstream.evaluation.datasets import Sequence

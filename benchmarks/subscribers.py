@@ -20,6 +20,7 @@ from table import Table, benchmark, command
 
 import catstream
 from catstream.base.settings import Settings
+from catstream.client.address import Address
 from catstream.errors import SilenceError
 from catstream.loadtest.load import Subscribers
 from catstream.messages.kinds import Track
@@ -84,7 +85,10 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 def run_with(frames: int, readers: int, frozen: int) -> Run:
     """Run a pipeline over the whole video, with subscribers that connect at its start."""
     sequence, joined, ended = rendered(frames, SIZE), list[float](), threading.Event()
-    with TemporaryDirectory(prefix="catstream-") as folder, Subscribers(folder, readers, frozen=frozen) as group:
+    with (
+        TemporaryDirectory(prefix="catstream-") as folder,
+        Subscribers(Address(folder), readers, frozen=frozen) as group,
+    ):
         late = threading.Thread(target=join, args=(folder, ended, joined))
 
         def turn(tracks: Mapping[str, Track]) -> None:

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation, annotate
     from catstream.base.box import Box
     from catstream.base.settings import Settings
-    from catstream.client.control import Control, control
-    from catstream.client.subscription import Subscription, subscribe
+    from catstream.client.attach import control, subscribe
+    from catstream.client.control import Control
+    from catstream.client.subscription import Subscription
     from catstream.errors import CatstreamError
     from catstream.finding.find import Sighting, find
     from catstream.fleet.fleet import Fleet
@@ -70,10 +71,10 @@ _HOMES = {
     "Track": "messages.kinds",
     "Tracker": "tracker",
     "annotate": "annotation.annotation",
-    "control": "client.control",
+    "control": "client.attach",
     "find": "finding.find",
     "merge": "jobs.saved_model",
-    "subscribe": "client.subscription",
+    "subscribe": "client.attach",
 }
 
 

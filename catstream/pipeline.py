@@ -31,7 +31,7 @@ from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
 from catstream.video.source import ALL_FRAMES, source_text
-from catstream.wire.endpoint import private_folder, reserve_endpoint
+from catstream.wire.discovery import private_folder, reserve_endpoint
 
 _ONCE = "a pipeline runs once, and this one has run: make another Pipeline to track the source again"
 _CLOSED = ExitStack()  # marks a pipeline that was closed

@@ -29,7 +29,7 @@ from catstream.base.box import Box
 from catstream.base.threads import one_thread
 from catstream.cli import main
 from catstream.cli.common import INTERRUPTS
-from catstream.client.registry import RegistryServer
+from catstream.fleet.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
 from catstream.video.rendered import render, write
 from catstream.wire.channels import CHANNELS, CONTROL

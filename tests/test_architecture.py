@@ -69,7 +69,7 @@ IMPORTERS = {
     "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/base/settings.py", "catstream/fleet/spec.py"),
-        "catstream/client/registry.py",
+        *("catstream/client/registry.py", "catstream/fleet/registry.py"),
         *("catstream/base/box.py", "catstream/messages"),
         *("catstream/processes/decisions.py", "catstream/compression/forest.py"),
         *("catstream/jobs/job.py", "catstream/evaluation/datasets.py"),

@@ -14,7 +14,8 @@ import yaml
 
 from catstream.base.settings import Settings
 from catstream.cli import group
-from catstream.client.subscription import subscribe
+from catstream.client.address import Address
+from catstream.client.attach import subscribe
 from catstream.messages.kinds import Health
 from catstream.processes.by_hand import parser
 from catstream.processes.start_server import NAMES
@@ -101,7 +102,7 @@ def test_the_page_asks_for_its_token_and_finds_the_pipeline(monkeypatch):
     verb, command, rest = group.resolve_command(options, service["command"])
     page = command.make_context(verb, rest, parent=options).params
     assert (page["endpoint"], page["listen"].port) == (settings("detector").run.endpoint, 8000)
-    server = Server(pipeline_site(page["endpoint"]), host=page["listen"].host, port=0, token=page["token"])
+    server = Server(pipeline_site(Address(page["endpoint"])), host=page["listen"].host, port=0, token=page["token"])
     script = service["healthcheck"]["test"][-1].replace(":8000", f":{urlsplit(server.url).port}")
     with server.in_background():
         subprocess.run([sys.executable, "-P", "-c", script], check=True)

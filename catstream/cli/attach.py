@@ -32,15 +32,15 @@ from catstream.cli.options import (
     with_keys,
     with_overwrite,
 )
-from catstream.client.control import Control, control
-from catstream.client.registry import address_of, locate
-from catstream.client.subscription import REMOVED, Subscription, subscribe, wait_until_running
+from catstream.client.address import Address
+from catstream.client.attach import control, subscribe, wait_until_running
+from catstream.client.control import Control
+from catstream.client.subscription import REMOVED, Subscription
 from catstream.errors import ServiceError, SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
 from catstream.messages.kinds import Health, run_state
 from catstream.wire.channels import CHANNELS, PUBLIC
-from catstream.wire.endpoint import Endpoint, Place, find
 
 _SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
 _OLD_SECONDS = 5.0  # age of what is read, from which they say that the reader is slow
@@ -50,30 +50,32 @@ _PROCESSES = CHANNELS["health"].senders
 def _not_empty(_: click.Context, parameter: click.Parameter, text: str | None) -> str:
     """An option that selects a pipeline: an empty variable of a script must not select the only one that runs."""
     if text == "":
-        raise click.BadParameter("it is empty: give a value, or leave the option out", param=parameter)
+        raise click.BadParameter("is empty: pass a value, or omit the option", param=parameter)
     return text or ""
 
 
-def _endpoint(endpoint: str, stream: str, fleet: str) -> str:
-    if endpoint and (stream or fleet):
-        raise click.UsageError("--endpoint selects a pipeline, --stream and --fleet a stream of a fleet: give one")
-    if fleet and not stream:
-        raise click.UsageError("--fleet selects a fleet: give the name of its stream, too (--stream NAME)")
-    return address_of(fleet, stream) if stream else endpoint
-
-
-with_fleet_address = click.option(
+_with_fleet = click.option(
     "--fleet",
     callback=_not_empty,
     metavar="ADDRESS",
     help="HOST:PORT or name of the fleet; not needed if only one runs here.",
 )
 
-#: Adds the options that select a running pipeline, as two texts: the arguments `endpoint` and `keys`. The endpoint of a
-#: stream of a fleet is its address, `fleet://FLEET/STREAM`.
-with_endpoint = combined(
-    "endpoint",
-    _endpoint,
+#: Adds the options that select a fleet by its registry, as an `Address` without a stream: the argument `address`.
+with_fleet_address = combined("address", lambda fleet, keys: Address(fleet=fleet, keys=keys), _with_fleet, with_keys)
+
+
+def _address(endpoint: str, stream: str, fleet: str, keys: str, source: str = "") -> Address:
+    if endpoint and (stream or fleet):
+        raise click.UsageError("--endpoint (a pipeline) and --stream, --fleet (a stream) are mutually exclusive")
+    if source and (endpoint or stream):
+        raise click.UsageError("--source is mutually exclusive with --endpoint and --stream")
+    if fleet and not stream:
+        raise click.UsageError("--fleet requires --stream NAME")
+    return Address(stream=stream, fleet=fleet, keys=keys) if stream else Address.parse(endpoint, keys, source)
+
+
+_OPTIONS = (
     click.option(
         "--endpoint",
         callback=_not_empty,
@@ -81,15 +83,26 @@ with_endpoint = combined(
         help="Endpoint of the pipeline; not needed if only one runs.",
     ),
     click.option("--stream", callback=_not_empty, metavar="NAME", help="A stream of a fleet, instead of --endpoint."),
-    with_fleet_address,
+    _with_fleet,
     with_keys,
 )
 
-_with_source = click.option(
-    "--source",
-    callback=_not_empty,
-    metavar="SOURCE",
-    help="The source that the pipeline tracks, instead of --endpoint.",
+#: Adds the options that select a running pipeline or a stream of a fleet, as the argument `address`.
+with_address = combined(
+    "address", lambda endpoint, stream, fleet, keys: _address(endpoint, stream, fleet, keys), *_OPTIONS
+)
+
+#: The same, and `--source`.
+_with_address_or_source = combined(
+    "address",
+    _address,
+    *_OPTIONS,
+    click.option(
+        "--source",
+        callback=_not_empty,
+        metavar="SOURCE",
+        help="Select the pipeline by its source instead of --endpoint.",
+    ),
 )
 
 with_wait = click.option(
@@ -102,22 +115,20 @@ with_wait = click.option(
 )
 
 
-def wait_for_pipeline(endpoint: str, keys: str, seconds: float) -> Endpoint:
-    """Wait until a process of the pipeline answers, and return its endpoint; a terminal shows a status line."""
-    with Console(stderr=True).status(f"waiting for a pipeline {endpoint and f'at {endpoint}'}"):
-        return wait_until_running(endpoint, keys, seconds)
+def wait_for_pipeline(address: Address, seconds: float) -> None:
+    """Wait until a process of the pipeline answers; a terminal shows a status line."""
+    with Console(stderr=True).status(f"waiting for a pipeline at {address}"):
+        wait_until_running(address, seconds)
 
 
 @click.command()
 @click.argument("channel", type=click.Choice(list(PUBLIC)))
-@with_endpoint
+@with_address
 @with_wait
 @click.option("--object", "name", metavar="NAME", help="Only the tracks, models or samples of this object.")
 @click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
 @click.option("--count", type=click.IntRange(min=1), help="End after this number of messages.")
-def watch(
-    channel: str, endpoint: str, keys: str, wait: float, name: str | None, as_json: bool, count: int | None
-) -> None:
+def watch(channel: str, address: Address, wait: float, name: str | None, as_json: bool, count: int | None) -> None:
     """Print the messages of a running pipeline, one a line, until it ends or Ctrl-C.
 
     The pipeline does not wait; messages that are dropped because this command
@@ -141,35 +152,36 @@ def watch(
       catstream watch models --endpoint run --count 1 --json
       catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
     """
-    seen = 0
-    with Subscription[Any](endpoint, channel, object=name, keys=keys) as messages:
+    received = 0
+    address = address.with_endpoint()
+    with subscribe(address, channel, object=name) as messages:
         with suppress(KeyboardInterrupt):
-            wait_for_pipeline(messages.endpoint, messages.keys, wait)
-            for message in saying_why_silent(messages):
+            wait_for_pipeline(address, wait)
+            for message in with_silence_warnings(messages):
                 fields = msgspec.to_builtins(message, builtin_types=(bytes,), enc_hook=_described)
                 click.echo(json.dumps(fields, default=_described) if as_json else _line(fields))
-                seen += 1
-                if seen == count:
+                received += 1
+                if received == count:
                     break
         reason = f": {messages.end.reason}" if messages.end is not None else ""
-        click.echo(f"{seen} {channel}, {messages.losses()}{reason}", err=True)
+        click.echo(f"{received} {channel}, {messages.losses()}{reason}", err=True)
 
 
-def saying_why_silent(messages: Subscription[Any]) -> Iterator[Any]:
-    """Each message. It is printed once if they are old, and why none arrives, until there is another reason."""
-    messages.timeout, said, old = _SILENT_SECONDS, "", False
+def with_silence_warnings(messages: Subscription[Any]) -> Iterator[Any]:
+    """Yield the messages; warn if they are old, and if none arrives, once for each reason."""
+    messages.timeout, reason, old = _SILENT_SECONDS, "", False
     while True:
         try:
             for message in messages:
-                said = ""
+                reason = ""
                 if not old and messages.behind >= _OLD_SECONDS:
                     old = True
-                    click.echo(f"behind: what is read is {messages.behind:.0f} s old, as the reader is slow", err=True)
+                    click.echo(f"lagging {messages.behind:.0f} s behind: this subscriber is too slow", err=True)
                 yield message
             return
         except SilenceError as error:
-            before, said = said, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
-            if said != before:
+            before, reason = reason, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
+            if reason != before:
                 click.echo(f"waiting: {error}", err=True)
 
 
@@ -182,10 +194,11 @@ def _described(value: bytes | np.ndarray) -> dict[str, object]:
 
 
 def _line(value: Any) -> str:
-    """The fields of a message that are not empty, each after its name; those of a field that has fields in brackets."""
+    """The fields of a message that are not empty, after their names; the fields of a nested message in brackets."""
     if isinstance(value, dict):
-        shown = ((name, f"({_line(each)})" if isinstance(each, dict) else _line(each)) for name, each in value.items())
-        return "  ".join(f"{name} {text}" for name, text in shown if text not in ("", "()"))
+        texts = {name: _line(field) for name, field in value.items()}
+        texts |= {name: f"({text})" for name, text in texts.items() if isinstance(value[name], dict)}
+        return "  ".join(f"{name} {text}" for name, text in texts.items() if text not in ("", "()"))
     if isinstance(value, list | tuple):
         return ",".join(map(_line, value))
     if isinstance(value, bytes):
@@ -194,13 +207,12 @@ def _line(value: Any) -> str:
 
 
 @click.command()
-@with_endpoint
-@_with_source
+@_with_address_or_source
 @with_json
 @click.option(
     "--wait", default=3.0, show_default=True, type=NumberRange(0), help="Maximum seconds to wait for health reports."
 )
-def status(endpoint: str, keys: str, source: str, as_json: bool, wait: float) -> None:
+def status(address: Address, as_json: bool, wait: float) -> None:
     """Show the state of a running pipeline.
 
     The state is running, waiting (for a box), paused, or lost (the source). The
@@ -217,47 +229,39 @@ def status(endpoint: str, keys: str, source: str, as_json: bool, wait: float) ->
       catstream status --source walk.mp4
       catstream status --endpoint run --json
     """
-    _check_one(endpoint, source)
-    pipeline: Place = find(keys=keys, source=source) if source else endpoint
-    place, reports = _collect_reports(pipeline, keys, wait)
-    summary = _summary(place, reports)
+    address = address.with_endpoint()
+    reports = _collect_reports(address, wait)
+    summary = _summary(str(address), reports)
     if as_json:
         click.echo(json.dumps(summary))
     elif reports:
         click.echo(_format(summary))
         if any(summary["objects"]):  # they have names
             figures = ("state", "score", "model", "leaves")
-            shown = table("object", *figures, right=figures)
-            for name, each in summary["objects"].items():
-                shown.add_row(name or "-", *("-" if cell is None else str(cell) for cell in each.values()))
-            screen().print("", shown, sep="\n")
+            objects = table("object", *figures, right=figures)
+            for name, cells in summary["objects"].items():
+                objects.add_row(name or "-", *("-" if cell is None else str(cell) for cell in cells.values()))
+            screen().print("", objects, sep="\n")
     if silent := [name for name in _PROCESSES if name not in reports]:
-        if not reports:
-            locate(pipeline, keys)  # its error says why a stream of a fleet does not run
-        removed = f": {REMOVED}" if Endpoint.parse(place).lacks_sockets() else ""
-        complain(f"no health report at {place} within {wait:g} s from: {', '.join(silent)}{removed}")
+        removed = f": {REMOVED}" if not reports and address.resolve().lacks_sockets() else ""
+        complain(f"no health report at {address} within {wait:g} s from: {', '.join(silent)}{removed}")
         sys.exit(1)
 
 
-def _check_one(endpoint: str, source: str) -> None:
-    if endpoint and source:
-        raise click.UsageError("--source selects the pipeline, as --endpoint and --stream do: give one of them")
-
-
-def _collect_reports(endpoint: Place, keys: str, seconds: float) -> tuple[str, dict[str, list[Health]]]:
+def _collect_reports(address: Address, seconds: float) -> dict[str, list[Health]]:
     """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
     deadline = time.monotonic() + seconds
     reports: dict[str, list[Health]] = {}
-    with subscribe(endpoint, "health", timeout=seconds, keys=keys) as health, suppress(SilenceError):
+    with subscribe(address, "health", timeout=seconds) as health, suppress(SilenceError):
         for report in health:
             reports.setdefault(report.process, []).append(report)
             if len(reports) == len(_PROCESSES) and len(reports["detector"]) > 1:
                 break
             health.timeout = max(0.0, deadline - time.monotonic())
-    return health.endpoint, reports
+    return reports
 
 
-def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
+def _summary(endpoint: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
     """Return the figures from the reports, None for those that are missing."""
     newest = {name: history[-1] for name, history in reports.items()}
     counters = {name: newest[name].counters if name in newest else {} for name in _PROCESSES}
@@ -271,17 +275,17 @@ def _summary(place: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
         return {name: int(own[name]) if name in own else None for name in names}
 
     return {
-        "endpoint": place,
+        "endpoint": endpoint,
         "ok": len(reports) == len(_PROCESSES),
         "state": newest["detector"].state if detector else None,
         "objects": {
             name: {
-                "state": ("present" if each["present"] else "absent") if "present" in each else None,
-                "score": round(each["score"], 2) if "score" in each else None,
-                "model_version": int(each["model_version"]),
+                "state": ("present" if figures["present"] else "absent") if "present" in figures else None,
+                "score": round(figures["score"], 2) if "score" in figures else None,
+                "model_version": int(figures["model_version"]),
                 "leaves": int(objects["compressor"][name]["leaves"]) if name in objects["compressor"] else None,
             }
-            for name, each in objects["detector"].items()
+            for name, figures in objects["detector"].items()
         },
         "frames": whole("detector", "sent")["sent"],
         "frames_per_second": None if rate is None else round(max(0.0, rate), 1),  # that of a restarted detector falls
@@ -327,25 +331,20 @@ def _format(summary: dict[str, Any]) -> str:
 class _Target:
     """The pipeline that a command is for, as given by the options."""
 
-    endpoint: str
-    source: str
-    keys: str
+    address: Address
     timeout: float
     yes: bool
 
-    def __post_init__(self) -> None:
-        _check_one(self.endpoint, self.source)
-
     @property
     def is_named(self) -> bool:
-        return bool(self.endpoint or self.source)
+        return bool(str(self.address) or self.address.source)
 
     def control(self) -> Control:
         """Connect to the pipeline and print its name. At a terminal, ask for confirmation if it was not named."""
-        pipeline = control(self.endpoint, timeout=self.timeout, keys=self.keys, source=self.source)
+        pipeline = control(self.address, timeout=self.timeout)
         line = f"pipeline: {pipeline.source or 'a pipeline'} at {pipeline.endpoint}"
-        if self.endpoint and not pipeline.source:
-            pass  # nothing more is known than the endpoint
+        if str(self.address) and not pipeline.source:
+            pass  # there is nothing to say beside the endpoint
         elif self.is_named or self.yes or not sys.stdin.isatty():
             click.echo(line, err=True)
         elif not click.confirm(f"{line}. Is this the right one?", default=True, err=True):
@@ -358,8 +357,7 @@ class _Target:
 _with_pipeline = combined(
     "target",
     _Target,
-    with_endpoint,
-    _with_source,
+    _with_address_or_source,
     click.option(
         "--timeout", default=5.0, show_default=True, type=NumberRange(0), help="Seconds to wait for an answer."
     ),
@@ -488,7 +486,7 @@ def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: 
             version = pipeline.save(file, name).version
     elif target.is_named:
         raise click.UsageError(
-            "--state names the folder of a run, --endpoint and --source a running pipeline: give one"
+            "--state (the folder of a run) is mutually exclusive with --endpoint, --stream and --source"
         )
     else:
         content = learned(state, Job.load(state).settings, check_name(name))

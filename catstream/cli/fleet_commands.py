@@ -22,9 +22,9 @@ from catstream.base.files import check_file, write_atomically, writing
 from catstream.base.names import UNNAMED, split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
-from catstream.cli.options import PATH, with_json, with_keys, with_overwrite
+from catstream.cli.options import PATH, with_json, with_overwrite
 from catstream.cli.view import fleet_view
-from catstream.client.registry import Registry
+from catstream.client.address import Address
 from catstream.errors import FleetError
 from catstream.messages.kinds import FleetStatus, StreamStatus
 
@@ -141,9 +141,8 @@ def _has_started(stream: StreamStatus) -> bool:
 
 @fleet.command()
 @with_fleet_address
-@with_keys
 @with_json
-def status(fleet: str, keys: str, as_json: bool) -> None:
+def status(address: Address, as_json: bool) -> None:
     """Show all streams and nodes of a fleet.
 
     The exit code is 1 if something is wrong with a stream: each line below the
@@ -154,13 +153,13 @@ def status(fleet: str, keys: str, as_json: bool) -> None:
       catstream fleet status
       catstream fleet status --fleet 10.0.0.1:5690 --keys my-keys --json | jq .streams
     """
-    with Registry(fleet, keys=keys) as registry:
-        found = registry.streams()
+    with address.registry as registry:
+        fleet = registry.streams()
     if as_json:
-        click.echo(json.dumps(dataclasses.asdict(found)))
+        click.echo(json.dumps(dataclasses.asdict(fleet)))
     else:
-        screen().print(*_tables(found), sep="\n")
-    if any(each.trouble for each in found.streams.values()):
+        screen().print(*_tables(fleet), sep="\n")
+    if any(stream.trouble for stream in fleet.streams.values()):
         sys.exit(1)
 
 
@@ -279,25 +278,25 @@ def down(running: Fleet) -> None:
 
 def _tables(status: FleetStatus) -> list[RenderableType]:
     """The streams, what is wrong with them, a line for each, and the nodes."""
-    troubles = [Text(f"{each.name}: {each.trouble}") for each in status.streams.values() if each.trouble]
+    troubles = [Text(f"{stream.name}: {stream.trouble}") for stream in status.streams.values() if stream.trouble]
     return [_streams(status), *([Text(), *troubles] if troubles else []), _nodes(status)]
 
 
 def _streams(status: FleetStatus) -> Table:
     """A row for each stream, those with trouble first."""
     numbers = ("frame", "skipped", "model")
-    shown = table("stream", "node", "state", *numbers, right=numbers)
-    for each in sorted(status.streams.values(), key=lambda each: (not each.trouble, each.name)):
-        figures = (each.frame, each.skipped, max(each.models.values(), default=0))
-        shown.add_row(each.name, each.node or "-", each.state, *(str(figure or "-") for figure in figures))
-    return shown
+    rows = table("stream", "node", "state", *numbers, right=numbers)
+    for stream in sorted(status.streams.values(), key=lambda stream: (not stream.trouble, stream.name)):
+        figures = (stream.frame, stream.skipped, max(stream.models.values(), default=0))
+        rows.add_row(stream.name, stream.node or "-", stream.state, *(str(figure or "-") for figure in figures))
+    return rows
 
 
 def _nodes(status: FleetStatus) -> Table:
     numbers = ("\nstreams", "\ncores")
-    shown = table("\nnode", "\nstate", "\naddress", *numbers, "\nlabels", right=numbers)
-    for each in status.nodes.values():
-        labels = ", ".join(f"{key}={value}" for key, value in each.labels.items())
-        cores = f"{each.used:.3g} of {each.cores:.3g}"
-        shown.add_row(each.name, each.state, each.address, str(each.streams), cores, labels)
-    return shown
+    rows = table("\nnode", "\nstate", "\naddress", *numbers, "\nlabels", right=numbers)
+    for node in status.nodes.values():
+        labels = ", ".join(f"{key}={value}" for key, value in node.labels.items())
+        cores = f"{node.used:.3g} of {node.cores:.3g}"
+        rows.add_row(node.name, node.state, node.address, str(node.streams), cores, labels)
+    return rows

@@ -33,8 +33,9 @@ from catstream.cli.options import (
     with_part,
     with_reading,
 )
-from catstream.cli.view import PORT, Address, AddressType, with_token
+from catstream.cli.view import PORT, HostPort, HostPortType, with_token
 from catstream.cli.write import check_options, with_sink_options, with_table
+from catstream.client.address import Address
 from catstream.errors import require_extra
 from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
@@ -59,7 +60,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
 @click.option(
     "--view",
-    type=AddressType(),
+    type=HostPortType(),
     is_flag=False,
     flag_value=str(PORT),
     metavar="[[HOST:]PORT]",
@@ -166,7 +167,7 @@ class _Run:
     options: SinkOptions
     overwrite: bool
     saved: dict[str, Path]
-    view: Address | None
+    view: HostPort | None
     token: str | None
     lockstep: bool
     paused: bool
@@ -286,7 +287,7 @@ class _Run:
             boxes=pipeline.boxes,
         )
         origin = Origin(
-            pipeline.source, part, settings.image_rate, keys=settings.keys, options=results.options, head=head
+            pipeline.source, part, settings.image_rate, Address(keys=settings.keys), options=results.options, head=head
         )
         files = RunFiles(origin, results.output, places)
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
@@ -320,12 +321,12 @@ class _Run:
             return True
         return False
 
-    def _serve(self, pipeline: Pipeline, view: Address, stack: ExitStack, console: Console) -> None:
+    def _serve(self, pipeline: Pipeline, view: HostPort, stack: ExitStack, console: Console) -> None:
         """Serve the web page of the pipeline until the stack is left."""
         from catstream.web.app import pipeline_site
         from catstream.web.server import Server
 
-        site = pipeline_site(pipeline.endpoint, pipeline.settings.run.keys)
+        site = pipeline_site(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
         server = Server(site, host=view.host, port=view.port, token=self.token)
         stack.enter_context(server.in_background())
         for url in server.urls:

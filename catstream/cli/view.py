@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import click
 
 from catstream.base.files import state_home, write_atomically
-from catstream.cli.attach import with_endpoint, with_fleet_address
-from catstream.cli.options import Decorator, combined, with_keys
+from catstream.cli.attach import with_address, with_fleet_address
+from catstream.cli.options import Decorator, combined
+from catstream.client.address import Address
 from catstream.errors import ServiceError
 
 if TYPE_CHECKING:
@@ -22,27 +23,27 @@ PORT = 8000
 _LARGEST_PORT = 65535
 
 
-class Address(NamedTuple):
-    """Address that the web server listens on."""
+class HostPort(NamedTuple):
+    """What the web server listens on."""
 
     host: str
     port: int
 
 
-class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
+class HostPortType(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
     """Parameter type [HOST:]PORT; the default host is 127.0.0.1.
 
-    >>> [tuple(AddressType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]
+    >>> [tuple(HostPortType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]
     [('127.0.0.1', 8080), ('0.0.0.0', 8000), ('::', 0)]
     """
 
     name = "[HOST:]PORT"
 
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Address:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> HostPort:
         host, _, port = str(value).rpartition(":")
         if not (port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT):
             self.fail(f"expected [HOST:]PORT, for example 8000 or 0.0.0.0:8000, got {value!r}", param, ctx)
-        return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
+        return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
 
 
 #: In the place of a token: everybody on this machine may use the page.
@@ -84,16 +85,16 @@ _with_listen = click.option(
     "--listen",
     default=f"127.0.0.1:{PORT}",
     show_default=True,
-    type=AddressType(),
+    type=HostPortType(),
     help="Address to listen on; port 0 for any free port.",
 )
 
 
 @click.command()
-@with_endpoint
+@with_address
 @_with_listen
 @with_token()
-def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
+def view(address: Address, listen: HostPort, token: str | None) -> None:
     """Watch and control a running pipeline in a browser.
 
     The page shows the picture with the box of each object, the score, frames
@@ -102,8 +103,8 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
     next one. Ctrl-C ends the server; the pipeline continues.
 
     Only users with the token can watch and control: open the printed link,
-    which ends with it. It is made once, and kept in the file
-    ~/.local/state/catstream/view-token; remove that for another one. The
+    which ends with it. The token is generated once and stored in
+    ~/.local/state/catstream/view-token; delete the file to generate a new one. The
     connection is not encrypted: from other machines, use an ssh tunnel, or a
     proxy with TLS.
 
@@ -113,21 +114,18 @@ def view(endpoint: str, keys: str, listen: Address, token: str | None) -> None:
       catstream view --endpoint run --listen 8080
       VIEW_TOKEN=$(cat my-token) catstream view --listen 0.0.0.0:8000
     """
-    from catstream.client.registry import fleet_and_stream
     from catstream.web.app import pipeline_site
-    from catstream.wire.endpoint import find
 
-    if endpoint and fleet_and_stream(endpoint) is None:
-        find(endpoint, keys)  # its errors are of no passing kind
-    _serve(pipeline_site(endpoint, keys), listen, token)
+    if address.endpoint:
+        address.resolve()  # raises errors that waiting does not solve
+    _serve(pipeline_site(address), listen, token)
 
 
 @click.command("view")
 @with_fleet_address
-@with_keys
 @_with_listen
 @with_token()
-def fleet_view(fleet: str, keys: str, listen: Address, token: str | None) -> None:
+def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
     """Watch all streams of a fleet in a browser.
 
     The page is a table of the streams, those in trouble first, and of the
@@ -143,14 +141,14 @@ def fleet_view(fleet: str, keys: str, listen: Address, token: str | None) -> Non
     """
     from catstream.web.app import fleet_site
 
-    _serve(fleet_site(fleet, keys), listen, token)
+    _serve(fleet_site(address), listen, token)
 
 
-def _serve(site: Site, address: Address, token: str | None) -> None:
+def _serve(site: Site, listen: HostPort, token: str | None) -> None:
     """Print the links of a site, and serve it until Ctrl-C or SIGTERM."""
     from catstream.web.server import Server
 
-    server = Server(site, host=address.host, port=address.port, token=token)
+    server = Server(site, host=listen.host, port=listen.port, token=token)
     for url in server.urls:
         click.echo(url)
     server.run()

@@ -13,10 +13,11 @@ from rich.console import Console
 
 from catstream.base.names import split_name
 from catstream.base.text import counted, listed
-from catstream.cli.attach import saying_why_silent, wait_for_pipeline, with_endpoint, with_wait
+from catstream.cli.attach import wait_for_pipeline, with_address, with_silence_warnings, with_wait
 from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
-from catstream.client.subscription import subscribe
+from catstream.client.address import Address
+from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
@@ -130,11 +131,11 @@ def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, 
         raise click.UsageError(f"--zone-margin {options.margin:g} is larger than the frame: no object can leave a zone")
 
 
-def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], endpoint: str, keys: str) -> Iterator[Track]:
+def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], address: Address) -> Iterator[Track]:
     """Yield tracks; SettingsError as soon as a picture of the pipeline shows that a zone is outside the frame."""
     source = iter(tracks)
     if zones:
-        with subscribe(endpoint, "previews", timeout=0, keys=keys) as previews:
+        with subscribe(address, "previews", timeout=0) as previews:
             for track in source:
                 yield track
                 with suppress(SilenceError):
@@ -148,10 +149,10 @@ def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], endpoint
 @click.argument("places", nargs=-1, required=True, metavar="DEST...")
 @with_overwrite
 @with_sink_options
-@with_endpoint
+@with_address
 @with_wait
 @with_table(SINKS)
-def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoint: str, keys: str, wait: float) -> None:
+def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address: Address, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives, and stays written however the command
@@ -179,16 +180,17 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, endpoin
             destinations.check_result(Path(place), overwrite=overwrite)
     written, reason, run = 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
-    with subscribe(endpoint, "tracks", keys=keys) as tracks:
+    address = address.with_endpoint()
+    with subscribe(address, "tracks") as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
-            wait_for_pipeline(tracks.endpoint, tracks.keys, wait)
-            origin = Origin(endpoint=tracks.endpoint, keys=tracks.keys, options=options)
+            wait_for_pipeline(address, wait)
+            origin = Origin(address=address, options=options)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in _with_zone_check(saying_why_silent(tracks), options.zones, tracks.endpoint, tracks.keys):
+            for track in _with_zone_check(with_silence_warnings(tracks), options.zones, address):
                 run = run or tracks.run
-                if tracks.run != run and not tracks.endpoint.startswith("fleet://"):  # a stream of a fleet may move
+                if tracks.run != run and not address.stream:  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"
                     break
                 # A restarted detector repeats some frames; a track that was missed before is not written out of order.

@@ -20,17 +20,16 @@ from uuid import uuid4
 
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED, check_name
-from catstream.client.registry import follow
 from catstream.errors import CommandRejectedError, ServiceError, SilenceError
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Answer, Command, ModelFile, Verb
 from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Place, find, source_at
+from catstream.wire.discovery import source_at
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
 ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
-REGISTRY_SECONDS = 1.0  #: for the registry before each command; without an answer, the stream has not moved
 
 
 class Control(AbstractContextManager["Control"]):
@@ -38,9 +37,11 @@ class Control(AbstractContextManager["Control"]):
 
     In each command, `object` is the name of an object; without a name, the only object is meant.
 
+    `catstream.control` makes one, and documents the parameters.
+
     Attributes
     ----------
-    endpoint : str
+    endpoint : Endpoint
         Endpoint of the pipeline.
     timeout : float
         Seconds to wait for the answer to a command.
@@ -57,18 +58,14 @@ class Control(AbstractContextManager["Control"]):
         From each command, if the name of the object is not valid.
     """
 
-    def __init__(
-        self, endpoint: Place = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = ""
-    ) -> None:
-        self._stream = follow(endpoint, keys)
-        self._place = self._stream.endpoint if self._stream is not None else find(endpoint, keys, source)
-        self.endpoint, self.timeout = str(self._place), timeout
-        self._commands = Requester[Command, Answer](CONTROL, self._place)
+    def __init__(self, endpoint: Endpoint, *, timeout: float = ANSWER_SECONDS) -> None:
+        self.timeout = timeout
+        self._connect(endpoint)
 
     @property
     def source(self) -> str:
         """Source that the pipeline tracks; empty if it is unknown here."""
-        return source_at(self._place)
+        return source_at(self.endpoint)
 
     def set_box(
         self, box: str | Iterable[float], object: str = UNNAMED, *, keep: bool = False, time: float | None = None
@@ -157,7 +154,6 @@ class Control(AbstractContextManager["Control"]):
             if number is not None and not (math.isfinite(number) and number >= 0):
                 raise ServiceError(f"{name} must be a finite number and not negative (got {number})")
         command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds, time)
-        self._follow()
         if (answer := self._commands.ask(command, self.timeout)) is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
@@ -170,8 +166,6 @@ class Control(AbstractContextManager["Control"]):
     def close(self) -> None:
         """Disconnect; the pipeline continues."""
         self._commands.close()
-        if self._stream is not None:
-            self._stream.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -179,9 +173,9 @@ class Control(AbstractContextManager["Control"]):
     def _newest(self, name: str, version: int) -> SavedModel:
         """Return what was learned of an object up to a version or a later one."""
         deadline = monotonic() + self.timeout
-        with Subscriber(SAVED_MODELS, self._place, ModelFile, about=name) as saved:
-            while (left := deadline - monotonic()) > 0:
-                message = saved.receive(left)
+        with Subscriber(SAVED_MODELS, self.endpoint, ModelFile, about=name) as saved:
+            while (remaining := deadline - monotonic()) > 0:
+                message = saved.receive(remaining)
                 if message is not None and message.version >= version:
                     return SavedModel.from_bytes(message.file, f"the saved model from {self.endpoint}")
         raise SilenceError(
@@ -189,36 +183,6 @@ class Control(AbstractContextManager["Control"]):
             "check the pipeline with catstream status"
         )
 
-    def _follow(self) -> None:
-        """Connect to the pipeline that a stream of a fleet has now; the last one, if the registry does not answer."""
-        if self._stream is None:
-            return
-        self._stream.ask(REGISTRY_SECONDS)
-        if (place := self._stream.endpoint) != self._place:
-            self._commands.close()
-            self._place, self.endpoint = place, str(place)
-            self._commands = Requester[Command, Answer](CONTROL, place)
-
-
-def control(endpoint: Place = "", *, timeout: float = ANSWER_SECONDS, keys: str = "", source: str = "") -> Control:
-    """Connect to a running pipeline to send commands.
-
-    Parameters
-    ----------
-    endpoint : str or path
-        Endpoint of the pipeline, or address of a stream of a fleet, as for `catstream.subscribe`: each command goes
-        where the stream runs then.
-    timeout : float
-        Seconds to wait for the answer to a command.
-    keys : str
-        Folder of the keys of this client, if the pipeline requires keys; their role must be "control".
-    source : str
-        Source that the pipeline tracks, for example "walk.mp4", instead of its endpoint.
-
-    Raises
-    ------
-    ServiceError
-        If `endpoint` is empty and not exactly one pipeline runs, if the fleet has no such stream or it runs nowhere, or
-        if the keys cannot be read.
-    """
-    return Control(endpoint, timeout=timeout, keys=keys, source=source)
+    def _connect(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self._commands = Requester[Command, Answer](CONTROL, endpoint)

@@ -1,24 +1,15 @@
-"""Subscribe to the messages of a running pipeline.
-
-    import catstream
-
-    with catstream.subscribe("run", "tracks") as tracks:
-        for track in tracks:
-            print(track.frame, track.state, track.box)
+"""The messages of a running pipeline, for `catstream.subscribe`.
 
 The pipeline never waits for a subscriber. A slow subscriber misses tracks, and `missed` counts them; `behind` is the
 age of the last one, and with `newest=True` older ones are passed over. With `object="anna"`, only the messages about
 this object are transmitted.
-
-`catstream.subscribe("fleet://cam-7", "tracks")` subscribes to a stream of a fleet, wherever it runs: the subscription
-continues if the stream moves to another node.
 """
 
 from __future__ import annotations
 
-import os
 import threading
 from contextlib import ExitStack
+from functools import partial
 from time import monotonic
 from typing import Any, Generic, Self, TypeVar, cast
 
@@ -26,23 +17,55 @@ import zmq
 import zmq.asyncio
 
 from catstream.base.clock import RunningClock
+from catstream.base.forks import check_not_forked, generation
 from catstream.base.names import check_name
-from catstream.client.registry import FollowedStream, described, follow
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Track, run_state
-from catstream.wire.channels import HEALTH, PUBLIC, TRACKS
-from catstream.wire.endpoint import Endpoint, Place, find
+from catstream.wire.channels import HEALTH, PUBLIC, TRACKS, Channel
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import GapCounter, Subscriber
-from catstream.wire.socket import check_owner
 
-REPORT_SECONDS = 5.0  #: for a health report, by default; each process of a running pipeline sends one every second
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
-REASON_SECONDS = 2.0  #: before the end of a time-out, in which a health report says why nothing arrives
+REASON_SECONDS = 2.0  #: before the end of a timeout, in which a health report says why nothing arrives
 DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
 #: Why nothing arrives from a folder without sockets.
 REMOVED = "is a pipeline running there? It has no sockets: if it runs, they were removed; end it and start it again"
 
 Message = TypeVar("Message")
+
+
+class _Connection:
+    """The sockets of a subscription at one pipeline, and what the health reports of its detector say.
+
+    read    time of the frame that was read last
+    newest  time of the newest frame, by the reports
+    state   of the run in words, by the reports; empty if there was none
+    """
+
+    def __init__(self, channel: Channel[Any], about: str | None, newest: bool, endpoint: Endpoint) -> None:
+        only = None if about is None else channel.messages[0]
+        self.endpoint = endpoint
+        self.read = self.newest = 0.0
+        self.state = ""
+        self._health: Subscriber[Health] | None = None
+        with ExitStack() as stack:
+            messages = Subscriber[Any](channel, endpoint, only, about=about, newest=newest)
+            self.messages = stack.enter_context(messages)
+            # The end has a socket of its own: a slow subscriber could miss it among the messages that are dropped.
+            self.ends: Subscriber[Any] = Subscriber(TRACKS, endpoint, only=End)
+            stack.pop_all()
+
+    def receive_health(self) -> None:
+        """Receive the reports that have arrived; at the first call, the last one arrives at once."""
+        self._health = self._health or Subscriber(HEALTH, self.endpoint)
+        for report in self._health.receive_all():
+            if report.process == "detector":
+                self.newest, self.state = report.counters.get("time", self.newest), run_state(report.counters)[1]
+
+    def close(self) -> None:
+        for socket in (self.messages, self.ends, self._health):
+            if socket is not None:
+                socket.close()
 
 
 class Subscription(Generic[Message]):
@@ -53,22 +76,16 @@ class Subscription(Generic[Message]):
     iteration returns the newest, and older ones that were not read are dropped. Models and samples are kept for each
     object, and the object that has waited longest comes first. With `newest`, the same holds for tracks and features.
 
-    The subscription to a stream of a fleet continues if the stream moves or is started again, and while the registry of
-    the fleet cannot be reached. A frame that the stream repeats is not returned a second time.
+    `catstream.subscribe` makes one, and documents the parameters.
 
     Attributes
     ----------
     end : End or None
-        The last message of the pipeline, or the reason why the stream of a fleet has ended or why there is no such
-        message; None before that.
-    endpoint, keys : str
-        Endpoint of the pipeline, or the address of the stream; folder of the client keys, empty if there are none.
+        The last message of the pipeline, or the reason why there is none; None before that.
     timeout : float or None
         Seconds without a message after which iteration raises `SilenceError`; it may continue afterwards. With a
-        time-out of two seconds or more, the error says whether the run is paused, waits for a box or has lost its
+        timeout of two seconds or more, the error says whether the run is paused, waits for a box or has lost its
         source.
-    place : Endpoint or None
-        Endpoint of the connected pipeline; None if the stream of a fleet has not run yet.
 
     Raises
     ------
@@ -80,49 +97,40 @@ class Subscription(Generic[Message]):
 
     def __init__(
         self,
-        endpoint: Place,
+        endpoint: Endpoint | None,
         channel: str,
         *,
         object: str | None = None,
         timeout: float | None = None,
-        keys: str = "",
         newest: bool = False,
     ) -> None:
         if channel not in PUBLIC:
-            raise ServiceError(
-                f"expected one of the channels {', '.join(PUBLIC)}, got {channel!r}: subscribe to one of them"
-            )
-        self._name, self._channel, self._gaps = channel, PUBLIC[channel], GapCounter()
+            raise ServiceError(f"unknown channel {channel!r}: subscribe to one of {', '.join(PUBLIC)}")
+        self._channel = PUBLIC[channel]
         if object is not None and not self._channel.by_object:
             names = ", ".join(name for name, row in PUBLIC.items() if row.by_object)
             raise ServiceError(
                 f"a message of {channel} is about all objects: subscribe to {names} for one object, or to {channel} "
                 "without an object"
             )
-        self._about = None if object is None else check_name(object)
-        self.endpoint, self.keys, self.timeout, self._newest_only = str(endpoint), keys, timeout, newest
+        self.timeout = timeout
         self.end: End | None = None
-        self.place: Endpoint | None = None
+        self._gaps = GapCounter(of_one_object=object is not None)
+        self._open = partial(_Connection, self._channel, None if object is None else check_name(object), newest)
+        self._connection: _Connection | None = None
         self._close_time = float("inf")  # until which messages may still arrive after the end
-        # The end has a socket of its own: if this subscriber is slow, it could be among the messages that are dropped.
-        self._messages: Subscriber[Any] | None = None
-        self._ends: Subscriber[Any] | None = None
-        self._health: Subscriber[Health] | None = None  # once `behind` was asked for, or nothing has arrived for long
-        self._read = self._newest = 0.0  # times of the frame that was read last, and of the newest one that is known
-        self._clock = RunningClock()  # of the time limit
-        self._state = ""  # of the pipeline, as a health report has said while a message is awaited
-        self._has_run = False  # whether the pipeline was there before
-        self._over = self._closed = False
-        self._owner = os.getpid()
+        self._clock = RunningClock()  # of the timeout
+        self._has_run = endpoint is not None and not endpoint.lacks_sockets()  # whether the pipeline was there before
+        self._closed = False
+        self._generation = generation()
         self._turn = threading.RLock()  # a thread or a signal handler may close while another thread waits
-        self._stream = follow(endpoint, keys)
-        if self._stream is not None:
-            self._follow(self._stream)
-        else:
-            place = find(endpoint, keys)
-            self.endpoint, self.keys = str(place), str(place.keys.folder) if place.keys is not None else ""
-            self._has_run = not place.lacks_sockets()
-            self._connect(place)
+        if endpoint is not None:
+            self._connect(endpoint)
+
+    @property
+    def endpoint(self) -> Endpoint | None:
+        """Endpoint of the pipeline; None if the stream of a fleet has not run yet."""
+        return self._connection.endpoint if self._connection is not None else None
 
     @property
     def missed(self) -> int:
@@ -146,26 +154,26 @@ class Subscription(Generic[Message]):
     def behind(self) -> float:
         """Age of the track or features that were read last: seconds of the source from their frame to the newest one.
 
-        It is known from the health reports of the pipeline, one a second, which are received from the first call on; 0
-        before the first report, and on other channels.
+        It is computed from the health reports of the pipeline, one a second, which are received from the first call on;
+        0 before the first report, and on other channels.
         """
         with self._turn:
-            if self._channel.keeps == "every":
-                self._receive_health()
-            return max(0.0, self._newest - self._read)
+            if self._connection is None or self._channel.keeps != "every":
+                return 0.0
+            self._connection.receive_health()
+            return max(0.0, self._connection.newest - self._connection.read)
 
     @property
     def run(self) -> str:
-        """Id of the run that the last message is from: of one start of one pipeline; empty if it is not known."""
-        return self._messages.run if self._messages is not None else ""
+        """Id of the run that the last message is from: of one start of one pipeline; empty if unknown."""
+        return self._connection.messages.run if self._connection is not None else ""
 
     def close(self) -> None:
         """Disconnect. A loop of another thread or task ends with a ServiceError, soon."""
         self._closed = True
         with self._turn:
-            self._disconnect()
-            if self._stream is not None:
-                self._stream.close()
+            if self._connection is not None:
+                self._connection.close()
 
     def __enter__(self) -> Self:
         return self
@@ -179,7 +187,7 @@ class Subscription(Generic[Message]):
     def __next__(self) -> Message:
         deadline = self._deadline()
         while (message := self._take(deadline)) is None:
-            if self._over:
+            if self._is_over():
                 raise StopIteration
             self._poller(zmq.Poller()).poll(self._milliseconds(deadline))
         return message
@@ -190,31 +198,36 @@ class Subscription(Generic[Message]):
     async def __anext__(self) -> Message:
         deadline = self._deadline()
         while (message := self._take(deadline)) is None:
-            if self._over:
+            if self._is_over():
                 raise StopAsyncIteration
             await self._poller(zmq.asyncio.Poller()).poll(self._milliseconds(deadline))
         return message
 
     def _deadline(self) -> float:
-        """The end of the time-out of a message that is awaited from now on."""
-        self._state = ""
+        """The end of the timeout of the next message."""
+        if self._connection is not None:
+            self._connection.state = ""
         return float("inf") if self.timeout is None else self._clock() + self.timeout
 
     def _poller(self, poller: Any) -> Any:
         """A poller of the sockets, by their descriptors, which another thread may close meanwhile."""
-        for socket in (self._messages, self._ends):
-            if socket is not None and not self._closed:
-                poller.register(socket.fileno(), zmq.POLLIN)
+        with self._turn:
+            if self._connection is not None and not self._closed:
+                for socket in (self._connection.messages, self._connection.ends):
+                    poller.register(socket.fileno(), zmq.POLLIN)
         return poller
 
     def _milliseconds(self, deadline: float) -> float:
         """The time to wait for the sockets."""
-        left = self._close_time - monotonic() if self.end is not None else deadline - self._clock()
-        return 1000 * max(0.0, min(left, CHECK_SECONDS))
+        remaining = self._close_time - monotonic() if self.end is not None else deadline - self._clock()
+        return 1000 * max(0.0, min(remaining, CHECK_SECONDS))
+
+    def _is_over(self) -> bool:
+        return self.end is not None and monotonic() >= self._close_time
 
     def _take(self, deadline: float) -> Message | None:
         """The next message if one has arrived, without waiting; what else is to be done before the next wait."""
-        check_owner(self._owner)  # first: another thread of the original may have held the lock
+        check_not_forked(self._generation)  # first: another thread of the original may have held the lock
         with self._turn:
             if self._closed:
                 raise ServiceError("the subscription was closed, perhaps by another thread or task: make another one")
@@ -223,151 +236,62 @@ class Subscription(Generic[Message]):
                 return message
             if self.end is None:
                 self._look_for_pipeline()
-            if self.end is None and (self.timeout or 0.0) >= REASON_SECONDS > deadline - self._clock():
-                self._receive_health()
-            if self.end is None and self._clock() >= deadline:
-                raise SilenceError(
-                    f"no {self._name} arrived from {self.endpoint} within {self.timeout:g} s: {self._why_silent()}"
-                )
-            self._over = self.end is not None and monotonic() >= self._close_time
-            # One object may have been forgotten before; the end of a fleet's stream may have no number.
-            if self._over and self.end and self.end.seq and self._channel.keeps == "every" and self._about is None:
-                self._gaps.take(self.end.seq)
+            if self.end is None:
+                self._check_timeout(deadline - self._clock())
+            elif self._is_over() and self._channel.keeps == "every":
+                self._gaps.end(self.end)
             return None
 
     def _receive(self) -> Message | None:
-        if self._ends is not None:
-            self._ends.pending()  # ZeroMQ subscribes again at a restarted pipeline only while the socket is looked at
-        while self._messages is not None and (message := self._messages.receive(0)) is not None:
-            if isinstance(message, End):
-                if self._channel.keeps == "every":  # the last message here
-                    self._pipeline_ended(message, 0.0)
-                continue
-            if self._stream is not None and not self._stream.take(message):
-                continue  # the stream was started again, and repeats a frame
-            if isinstance(message, Track | Features):
-                began = message.began if self._about is not None and isinstance(message, Track) else None
-                self._gaps.take(message.seq, began)
-                self._read = message.time
-            return cast(Message, message)
-        if self._ends is not None and self.end is None and (end := self._ends.receive(0)) is not None:
+        """The next message if one has arrived; notes the end."""
+        if (connection := self._connection) is None:
+            return None
+        connection.ends.pending()  # ZeroMQ subscribes again at a restarted pipeline only while the socket is looked at
+        while (message := connection.messages.receive(0)) is not None:
+            if not isinstance(message, End):
+                if isinstance(message, Track | Features):
+                    self._gaps.take(message)
+                    connection.read = message.time
+                return cast(Message, message)
+            if self._channel.keeps == "every":  # the last message here
+                self._pipeline_ended(message, 0.0)
+        if self.end is None and (end := connection.ends.receive(0)) is not None:
             self._pipeline_ended(end, DRAIN_SECONDS)
         return None
 
-    def _receive_health(self) -> None:
-        """Take the health reports of the detector that have arrived; the last one arrives at once."""
-        if self._health is None and self.place is not None and self._channel is not HEALTH:
-            self._health = Subscriber(HEALTH, self.place)
-        for report in self._health.receive_all() if self._health is not None else ():
-            if report.process == "detector":
-                self._newest, self._state = report.counters.get("time", self._newest), run_state(report.counters)[1]
+    def _check_timeout(self, remaining: float) -> None:
+        """Raise SilenceError if no time remains; shortly before, health reports are received for its reason."""
+        if (self.timeout or 0.0) >= REASON_SECONDS > remaining and self._connection and self._channel is not HEALTH:
+            self._connection.receive_health()
+        if remaining <= 0:
+            source = f" from {self.endpoint}" if self.endpoint is not None else ""
+            raise SilenceError(
+                f"no {self._channel.public} arrived{source} within {self.timeout:g} s: {self._silence()}"
+            )
 
-    def _why_silent(self) -> str:
+    def _silence(self) -> str:
         """The reason why no message arrives, as far as it is known."""
-        if self._stream is not None:
-            return described(self._stream.status)
-        if self._state:
-            return f"the state of the pipeline is: {self._state}"
-        removed = self.place is not None and self.place.lacks_sockets()
+        if self._connection is not None and self._connection.state:
+            return f"the state of the pipeline is: {self._connection.state}"
+        removed = self.endpoint is not None and self.endpoint.lacks_sockets()
         return REMOVED if removed else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
-        """End after so many seconds; a stream of a fleet may continue with another pipeline."""
-        if self._stream is not None:
-            self._stream.pipeline_ended(end)
-        else:
-            self.end, self._close_time = end, monotonic() + seconds
+        """End after so many seconds."""
+        self.end, self._close_time = end, monotonic() + seconds
 
     def _look_for_pipeline(self) -> None:
-        """Follow a stream of a fleet; end if the pipeline has removed its sockets from its folder, as it does at last.
+        """End if the pipeline has removed its sockets from its folder, as it does at last.
 
         A subscriber that did not read since a restart has no subscription there, and misses the end.
         """
-        if self._stream is not None:
-            self._follow(self._stream)
-        elif self.place is not None and not self.place.lacks_sockets():
+        if self.endpoint is not None and not self.endpoint.lacks_sockets():
             self._has_run = True
         elif self._has_run:
             gone = "its sockets were removed, and this subscriber did not receive its end"
             self._pipeline_ended(End(0, gone), DRAIN_SECONDS)
 
-    def _follow(self, stream: FollowedStream) -> None:
-        """Connect to the pipeline of a stream of a fleet if it has another one, and end if the stream has ended."""
-        moved = stream.update()
-        if stream.end is not None:
-            self.end, self._close_time = stream.end, monotonic() + DRAIN_SECONDS
-        elif (moved or self._messages is None) and (place := stream.place) is not None:
-            self._disconnect()
-            self._connect(place)
-
-    def _connect(self, place: Endpoint) -> None:
-        only = None if self._about is None else self._channel.messages[0]
-        with ExitStack() as stack:
-            messages = Subscriber[Any](self._channel, place, only, about=self._about, newest=self._newest_only)
-            self._messages = stack.enter_context(messages)
-            self._ends, self.place = Subscriber(TRACKS, place, only=End), place
-            stack.pop_all()
-
-    def _disconnect(self) -> None:
-        if self._messages is not None and self._ends is not None:
-            self._messages.close()
-            self._ends.close()
-        if self._health is not None:
-            self._health.close()
-        self._messages = self._ends = self._health = None
-
-
-def subscribe(
-    endpoint: Place,
-    channel: str,
-    *,
-    object: str | None = None,
-    timeout: float | None = None,
-    keys: str = "",
-    newest: bool = False,
-) -> Subscription[Any]:
-    """Subscribe to a channel of a running pipeline.
-
-    Parameters
-    ----------
-    endpoint : str or path
-        Endpoint of the pipeline, which may start later, as in the setting `run.endpoint`; empty for the only running
-        pipeline of this user. Or the address of a stream of a fleet: `fleet://HOST:PORT/STREAM` with host and port of
-        its registry, `fleet://FLEET/STREAM` for a fleet of this user, `fleet://STREAM` for the only one.
-    channel : str
-        "tracks", "models", "health", "samples", "features" or "previews": the messages are `Track`, `Model` and so on
-        of `catstream.messages.kinds`.
-    object : str or None
-        Name of the one object whose tracks, models or samples are received; "" for the object without a name, None for
-        all objects.
-    timeout : float or None
-        Seconds without a message after which iteration raises `SilenceError`; None to wait without limit.
-    keys : str
-        Folder of the keys of this client, if the pipeline requires keys.
-    newest : bool
-        Whether each iteration returns the newest track of an object that was not read yet, or the newest features, and
-        passes over older ones: for a program that reacts, and is slower than the pipeline.
-
-    Raises
-    ------
-    ObjectError
-        If `object` is not a valid name.
-    ServiceError
-        If there is no such channel, or its messages are not about one object each; if `endpoint` is empty and not
-        exactly one pipeline runs; if the fleet has no such stream; or if the keys cannot be read.
-    SilenceError
-        If the registry of the fleet does not answer.
-    """
-    return Subscription(endpoint, channel, object=object, timeout=timeout, keys=keys, newest=newest)
-
-
-def wait_until_running(endpoint: str, keys: str = "", seconds: float = REPORT_SECONDS) -> Endpoint:
-    """Wait for a health report of the pipeline, and return its endpoint; tracks and models may pause for long.
-
-    SilenceError if no report arrives in time, ServiceError if the pipeline has ended, or as for `subscribe`.
-    """
-    with Subscription[Health](endpoint, "health", timeout=seconds, keys=keys) as reports:
-        if next(reports, None) is None or reports.place is None:
-            reason = reports.end.reason if reports.end is not None else "it has no place"
-            raise ServiceError(f"{endpoint or 'the pipeline'} does not run: {reason}")
-        return reports.place
+    def _connect(self, endpoint: Endpoint) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = self._open(endpoint)

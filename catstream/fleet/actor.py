@@ -20,7 +20,9 @@ from dataclasses import replace
 from hashlib import sha256
 
 from catstream.base.addresses import without_password
-from catstream.client.control import control
+from catstream.client.address import Address
+from catstream.client.attach import control
+from catstream.client.control import Control
 from catstream.errors import (
     CatstreamError,
     CommandRejectedError,
@@ -38,7 +40,7 @@ from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.video.source import is_live
 from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import private_folder
+from catstream.wire.discovery import private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
 
 #: Ports that streams listen on, below those that the kernel gives to connections: each has a block of them.
@@ -218,7 +220,7 @@ class Stream:
         now = self._spec.boxes.keys() | self._spec.models.keys()
         begin, forget = sorted(self._spec.boxes.keys() - before), sorted(before - now)
         if begin or forget:  # a peer that connects for nothing counts as rejected
-            with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
+            with self._control(pipeline) as controlled:
                 for name in begin:
                     controlled.set_box(self._spec.boxes[name], name)
                 for name in forget:
@@ -232,8 +234,12 @@ class Stream:
     def _search(self, pipeline: Pipeline, model: Generation, name: str) -> None:
         """Search for an object by a saved model in the store."""
         learned = SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store")
-        with control(pipeline.endpoint, keys=pipeline.settings.run.keys) as controlled:
+        with self._control(pipeline) as controlled:
             controlled.search(learned, name)
+
+    @staticmethod
+    def _control(pipeline: Pipeline) -> Control:
+        return control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
 
     def _search_merged(self, pipeline: Pipeline, known: dict[str, int]) -> None:
         """Search for each followed object that is not present by a merged model that is newer than the known one."""

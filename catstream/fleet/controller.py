@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Literal
 
 from catstream.base.addresses import without_password
-from catstream.client.registry import RegistryServer
 from catstream.errors import CatstreamError
 from catstream.fleet import lifecycle
 from catstream.fleet.actor import Stream, given_model
 from catstream.fleet.lifecycle import Actor, Node
+from catstream.fleet.registry import RegistryServer
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus

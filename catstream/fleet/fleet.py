@@ -46,7 +46,7 @@ from catstream.jobs import state
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel, merge
 from catstream.messages.kinds import FleetStatus
-from catstream.wire.endpoint import private_folder
+from catstream.wire.discovery import private_folder
 
 ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
 DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end

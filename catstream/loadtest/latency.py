@@ -17,7 +17,8 @@ import numpy as np
 import psutil
 
 from catstream.base.arrays import Float64
-from catstream.client.subscription import Subscription
+from catstream.client.address import Address
+from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
 from catstream.evaluation.scores import overlaps
 from catstream.loadtest.camera import Schedule
@@ -72,16 +73,13 @@ class Observations:
 
 
 @contextmanager
-def observed(endpoints: Sequence[str], name: str, keys: str) -> Iterator[list[Observations]]:
+def observed(addresses: Sequence[Address], name: str) -> Iterator[list[Observations]]:
     """Observe one object of each pipeline in threads, which end with the context or with their pipelines."""
-    seen, ended = [Observations() for _ in endpoints], Event()
+    seen, ended = [Observations() for _ in addresses], Event()
 
-    def observe(endpoint: str, channel: str, observations: Observations) -> None:
+    def observe(address: Address, channel: str, observations: Observations) -> None:
         about = None if channel == "health" else name
-        messages: Subscription[Track | Model | Health] = Subscription(
-            endpoint, channel, object=about, timeout=_POLL_SECONDS, keys=keys
-        )
-        with messages:
+        with subscribe(address, channel, object=about, timeout=_POLL_SECONDS) as messages:
             while not ended.is_set():
                 try:
                     message = next(messages)
@@ -92,8 +90,8 @@ def observed(endpoints: Sequence[str], name: str, keys: str) -> Iterator[list[Ob
                 observations.add(monotonic(), message)
 
     threads = [
-        Thread(target=observe, args=(endpoint, channel, each), name=f"observer of {channel}", daemon=True)
-        for endpoint, each in zip(endpoints, seen, strict=True)
+        Thread(target=observe, args=(address, channel, each), name=f"observer of {channel}", daemon=True)
+        for address, each in zip(addresses, seen, strict=True)
         for channel in ("tracks", "models", "health")
     ]
     for thread in threads:

@@ -17,7 +17,8 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
 from catstream.base.workers import SPAWN, die_with, sharing, sigint_blocked
-from catstream.client.control import control
+from catstream.client.address import Address
+from catstream.client.attach import control
 from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
 from catstream.loadtest import crowd
 from catstream.messages.kinds import End
@@ -25,7 +26,6 @@ from catstream.pipeline import Pipeline
 from catstream.video import rendered
 from catstream.video.frames import jpeg
 from catstream.wire.channels import TRACKS
-from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import GapCounter, Subscriber
 
 _QUALITY = 90  # of JPEG, as network cameras use it
@@ -68,7 +68,7 @@ def render(objects: int, images: int, size: tuple[int, int], done: Callable[[int
 class Stream(threading.Thread):
     """Runs a pipeline until `stop` is called: consumes its tracks and supervises its processes.
 
-    ready : event that is set when the processes are started, so that `endpoint` is known, or the pipeline has failed
+    ready : event that is set when the processes are started, so that `address` is set, or the pipeline has failed
     error : the error of a failed pipeline, else None
     totals : as in `Pipeline`, set at the end
     """
@@ -76,7 +76,7 @@ class Stream(threading.Thread):
     def __init__(self, number: int, url: str, boxes: dict[str, Box], settings: Settings) -> None:
         super().__init__(name=f"stream {number}", daemon=True)
         self.ready = threading.Event()
-        self.endpoint = ""
+        self.address: Address | None = None
         self.error: CatstreamError | None = None
         self.totals: dict[str, int] = {}
         self._url, self._boxes, self._settings = url, boxes, settings
@@ -85,7 +85,8 @@ class Stream(threading.Thread):
     def run(self) -> None:
         try:
             with Pipeline(self._url, self._boxes, self._settings) as pipeline:
-                self._pipeline, self.endpoint = pipeline, pipeline.endpoint
+                self._pipeline = pipeline
+                self.address = Address(pipeline.endpoint, keys=self._settings.run.keys)
                 self.ready.set()
                 for _ in pipeline:
                     pass
@@ -105,10 +106,10 @@ class Stream(threading.Thread):
     def stop(self) -> None:
         """End the run as if its source had ended; `join` waits until everything learned is stored."""
         self.ready.wait(_STOP_SECONDS)
-        if self.is_alive() and self.endpoint:
+        if self.is_alive() and self.address is not None:
             with (
                 suppress(CommandRejectedError, SilenceError),  # it has ended by itself
-                control(self.endpoint, timeout=_STOP_SECONDS, keys=self._settings.run.keys) as pipeline,
+                control(self.address, timeout=_STOP_SECONDS) as pipeline,
             ):
                 pipeline.stop()
 
@@ -124,7 +125,7 @@ class Subscribers:
     from the pipeline. `slow` of the `readers` read two messages per second, and `frozen` are stopped by `freeze`.
     """
 
-    def __init__(self, endpoint: str, readers: int, *, slow: int = 0, frozen: int = 0, keys: str = "") -> None:
+    def __init__(self, address: Address, readers: int, *, slow: int = 0, frozen: int = 0) -> None:
         self._quick, self._readers = readers - slow - frozen, readers
         with sharing():
             self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
@@ -133,9 +134,7 @@ class Subscribers:
         def processes(numbers: range, pace: tuple[int, float]) -> list[Any]:
             parts = [numbers[begin : begin + _PER_PROCESS] for begin in range(0, len(numbers), _PER_PROCESS)]
             rest = pace, self._received, self._missed, os.getpid()
-            return [
-                SPAWN.Process(target=_read_until_end, args=(endpoint, keys, part, *rest), daemon=True) for part in parts
-            ]
+            return [SPAWN.Process(target=_read_until_end, args=(address, part, *rest), daemon=True) for part in parts]
 
         self._fast = processes(range(self._quick), _QUICK)
         self._frozen = processes(range(readers - frozen, readers), _QUICK)
@@ -189,8 +188,7 @@ class Subscribers:
 
 
 def _read_until_end(
-    endpoint: str,
-    keys: str,
+    address: Address,
     numbers: range,
     pace: tuple[int, float],
     received: MutableSequence[int],
@@ -201,8 +199,8 @@ def _read_until_end(
     die_with(parent)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     with ExitStack() as stack:
-        place = Endpoint.parse(endpoint, keys)
-        readers = {number: stack.enter_context(Subscriber(TRACKS, place)) for number in numbers}
+        endpoint = address.resolve()
+        readers = {number: stack.enter_context(Subscriber(TRACKS, endpoint)) for number in numbers}
         gaps = {number: GapCounter() for number in numbers}
         last = dict.fromkeys(numbers, 0)  # number of the last frame: the tracks of all objects in it have the same
         most, pause = pace
@@ -211,11 +209,13 @@ def _read_until_end(
                 for _ in range(most):
                     if (message := reader.receive(0)) is None:
                         break
-                    gaps[number].take(message.seq)
-                    missed[number] = gaps[number].missed
                     if isinstance(message, End):
+                        gaps[number].end(message)
+                        missed[number] = gaps[number].missed
                         del readers[number]
                         break
+                    gaps[number].take(message)
+                    missed[number] = gaps[number].missed
                     received[number] += message.seq != last[number]
                     last[number] = message.seq
             sleep(pause)

@@ -333,11 +333,11 @@ def _started(
     for stream in streams:
         if stream.error is not None:  # it has no endpoint to observe
             raise stream.error
-    keys = plan.settings.run.keys
-    seen = stack.enter_context(observed([stream.endpoint for stream in streams], name, keys))
+    addresses = [stream.address for stream in streams if stream.address is not None]
+    seen = stack.enter_context(observed(addresses, name))
     wait_until(lambda: all(each.warmed_up for each in seen), "learning the first models")
     counts = {"readers": plan.subscribers, "slow": plan.slow_subscribers - plan.frozen, "frozen": plan.frozen}
-    groups = [stack.enter_context(Subscribers(stream.endpoint, keys=keys, **counts)) for stream in streams]
+    groups = [stack.enter_context(Subscribers(address, **counts)) for address in addresses]
     wait_until(lambda: all(group.connected for group in groups), "attaching subscribers")
     for group in groups:
         group.freeze()

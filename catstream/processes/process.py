@@ -21,7 +21,8 @@ from catstream.processes.ending import Ending
 from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import reset_process
 from catstream.wire.channels import HEALTH
-from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.discovery import private_folder
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.rejects import rejects
 

@@ -23,6 +23,7 @@ import msgspec
 from catstream.base.addresses import without_password
 from catstream.base.box import Box
 from catstream.base.files import check_file, check_unlocked, writing
+from catstream.client.address import Address
 from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
@@ -108,8 +109,7 @@ class Origin:
     source      of its frames if they can be read a second time: None beside a running pipeline
     part        the frames that are tracked
     image_rate  frames per second of a folder of images
-    endpoint    of the running pipeline, for a sink that receives other messages, too
-    keys        folder of the keys for this endpoint
+    address     of the running pipeline, for a sink that receives other messages, too
     last        last frame of the file if it is a log that is continued; None for a new file
     size        number of bytes up to the end of that frame
     options     of the destinations, beside their addresses
@@ -119,8 +119,7 @@ class Origin:
     source: str | None = None
     part: slice = field(default_factory=lambda: ALL_FRAMES)
     image_rate: float = RATE
-    endpoint: str = ""
-    keys: str = ""
+    address: Address = field(default_factory=Address)
     last: TrackedFrame | None = None
     size: int = 0
     options: SinkOptions = field(default_factory=SinkOptions)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from catstream.base.files import open_locked, writing
-from catstream.client.subscription import Subscription
+from catstream.client.attach import subscribe
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Health, Model, Preview
 from catstream.sinks.destinations import Origin, TrackedFrame
@@ -47,7 +47,7 @@ class McapSink:
                 number = self._writer.register_schema(name, "jsonschema", schema)
                 self._topics[topic] = self._writer.register_channel(topic, "json", number)
             self._others = {
-                topic: stack.enter_context(Subscription[Any](origin.endpoint, topic, timeout=0, keys=origin.keys))
+                topic: stack.enter_context(subscribe(origin.address, topic, timeout=0))
                 for topic in _SCHEMAS
                 if topic != "tracks"
             }

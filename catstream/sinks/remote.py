@@ -12,6 +12,7 @@ from contextlib import suppress
 from urllib.parse import SplitResult, urlsplit
 from uuid import uuid4
 
+from catstream.client.attach import subscribe
 from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
@@ -76,7 +77,7 @@ class EventMessages:
         self._picture_due = time.monotonic() + _PICTURE_SECONDS
         self._previews: Subscription[Preview] | None = None
         if origin.options.picture:
-            self._previews = Subscription(origin.endpoint, "previews", timeout=0, keys=origin.keys)
+            self._previews = subscribe(origin.address, "previews", timeout=0)
 
     def update(self, tracks: Sequence[Track]) -> list[bytes]:
         """Return the messages of the events of further tracks, and of those that waited for a picture."""

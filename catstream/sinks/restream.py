@@ -1,7 +1,7 @@
 """The pictures of a running pipeline with their boxes, live, as H.264 on an RTSP or RTMP server of the user's.
 
 They are pushed by a process of its own, because FFmpeg blocks all threads of a process while a server does not answer.
-It is this module, run with `-m`: it reads the address, the endpoint and the folder of the keys from standard input,
+It is this module, run with `-m`: it reads the address of the server and that of the pipeline from standard input,
 and writes a byte for each picture that the server accepted. The stream needs the size of a picture, so the first one
 is awaited before the first attempt to connect. From then on, the pipeline makes pictures only while it is connected.
 """
@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Generator
 from contextlib import closing, suppress
+from dataclasses import asdict
 from itertools import chain
 from threading import Thread
 from time import monotonic, sleep
@@ -25,10 +26,10 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from catstream.base.text import counted
-from catstream.client.subscription import Subscription
+from catstream.client.address import Address
+from catstream.client.attach import subscribe
 from catstream.errors import CatstreamError, SilenceError, VideoError
 from catstream.jobs.job import SinkOptions
-from catstream.messages.kinds import Track
 from catstream.sinks.destinations import Origin, TrackedFrame, redacted
 from catstream.sinks.remote import Warnings, reason_of, split
 from catstream.sinks.video_sink import DrawnPictures
@@ -90,7 +91,7 @@ class StreamSink:
             start_new_session=True,  # Ctrl-C is for this process
         )
         stdin, stdout = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
-        stdin.write(json.dumps([self._place, self._origin.endpoint, self._origin.keys]).encode() + b"\n")
+        stdin.write(json.dumps([self._place, asdict(self._origin.address)]).encode() + b"\n")
         stdin.flush()
         self._output = stdout.fileno()
         os.set_blocking(self._output, False)
@@ -130,7 +131,7 @@ def push(place: str, origin: Origin) -> None:
 def _pictures(origin: Origin, image: np.ndarray | None = None) -> Generator[np.ndarray]:
     """Yield each picture until the pipeline ends, and while no tracks arrive the last one again, `image` at first."""
     with (
-        Subscription[Track](origin.endpoint, "tracks", timeout=_REPEAT_SECONDS, keys=origin.keys) as tracks,
+        subscribe(origin.address, "tracks", timeout=_REPEAT_SECONDS) as tracks,
         closing(DrawnPictures(origin)) as pictures,
     ):
         while True:
@@ -153,7 +154,7 @@ def _end_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    address, endpoint, keys = json.loads(sys.stdin.readline())
+    server, address = json.loads(sys.stdin.readline())
     Thread(target=_end_with_parent, daemon=True).start()
     os.set_blocking(1, False)
-    push(address, Origin(endpoint=endpoint, keys=keys))
+    push(server, Origin(address=Address(**address)))

@@ -396,7 +396,7 @@ class RunFiles:
         If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
         raise VideoError if a destination cannot be written any more.
         """
-        origin = replace(self.origin, endpoint=endpoint)
+        origin = replace(self.origin, address=replace(self.origin.address, endpoint=endpoint))
         path = self._log() if resume else None  # before new ones exist, too
         log = None if path is None else Log(path, skip_damaged=skip_damaged)
         last, size = (None, 0) if log is None else log.last_whole_frame()

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from catstream.client.subscription import subscribe
+from catstream.client.attach import subscribe
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, Sink, TrackedFrame
@@ -57,7 +57,7 @@ class DrawnPictures:
     """The small pictures that a running pipeline sends, with their tracks drawn in."""
 
     def __init__(self, origin: Origin) -> None:
-        self._previews = subscribe(origin.endpoint, "previews", timeout=0, keys=origin.keys)
+        self._previews = subscribe(origin.address, "previews", timeout=0)
         self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
         self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
         self._colours = Colours()

@@ -31,6 +31,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.base.box import Box
+from catstream.client.address import Address
 from catstream.errors import BoxError, CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
 from catstream.video.drawing import draw_preview
 from catstream.web import prometheus
@@ -55,14 +56,14 @@ _CODES = {
 }
 
 
-def pipeline_site(endpoint: str = "", keys: str = "") -> Site:
-    """The site of the pipeline at an endpoint, as in `PipelineFeed`."""
-    return Site(PipelineFeed(endpoint, keys))
+def pipeline_site(address: Address) -> Site:
+    """The site of a pipeline, which may start later."""
+    return Site(PipelineFeed(address))
 
 
-def fleet_site(fleet: str = "", keys: str = "") -> Site:
-    """The site of a fleet, which may start later; the arguments are those of `FleetFeed`."""
-    return Site(FleetFeed(fleet, keys))
+def fleet_site(address: Address) -> Site:
+    """The site of a fleet, which may start later; the address names no stream."""
+    return Site(FleetFeed(address))
 
 
 class Site:

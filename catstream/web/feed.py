@@ -12,14 +12,16 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from math import inf
 from time import monotonic
 from typing import Any, cast
 
 from starlette.exceptions import HTTPException
 
+from catstream.client.address import Address
 from catstream.client.control import Control
-from catstream.client.registry import Registry, address_of, locate
+from catstream.client.registry import Registry
 from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
 from catstream.messages.kinds import Answer, End, StreamStatus
@@ -111,17 +113,17 @@ class Feed(ABC):
 class PipelineFeed(Feed):
     """Receives the messages of a pipeline, and reconnects after each end, silence or restart.
 
-    Previews, which cost the pipeline processor time, are received only while a page is open. The endpoint, or the
-    address of a stream of a fleet, is looked up at each connection; it is empty for the only running pipeline.
+    Previews, which cost the pipeline processor time, are received only while a page is open. The address is
+    resolved at each connection.
     """
 
     dashboard: Dashboard
     _pause = PAUSE_SECONDS
 
-    def __init__(self, endpoint: str = "", keys: str = "") -> None:
+    def __init__(self, address: Address) -> None:
         super().__init__()
-        self._endpoint, self._keys = endpoint, keys
-        self._place: Endpoint | None = None  # of the current connection, with its keys
+        self._address = address
+        self._endpoint: Endpoint | None = None  # of the current connection, with its keys
         self.dashboard = Dashboard()
 
     def problem_of(self, stream: str = "") -> str:  # noqa: ARG002  # there is one
@@ -137,29 +139,29 @@ class PipelineFeed(Feed):
 
     def execute(self, **command: Any) -> Answer:
         """Send a command, by its fields, to the pipeline, and wait for its answer."""
-        with Control(self._place or self._endpoint, keys=self._keys) as pipeline:
+        with Control(self._endpoint or self._address.resolve()) as pipeline:
             return pipeline.execute(**command)
 
     def _feed(self) -> None:
-        self._place = locate(self._endpoint, self._keys)
-        self._call(self.dashboard.attach, str(self._place))
+        self._endpoint = self._address.resolve()
+        self._call(self.dashboard.attach, str(self._endpoint))
         subscriptions: dict[str, Subscription[Any]] = {}
         try:
             for channel, timeout in (("tracks", READ_SECONDS), ("health", 0.0), ("models", 0.0)):
-                subscriptions[channel] = Subscription(self._place, channel, timeout=timeout)
-            self._receive(self._place, subscriptions)
+                subscriptions[channel] = Subscription(self._endpoint, channel, timeout=timeout)
+            self._receive(self._endpoint, subscriptions)
         finally:
-            self._place = None
-            for each in subscriptions.values():
-                each.close()
+            self._endpoint = None
+            for subscription in subscriptions.values():
+                subscription.close()
 
-    def _receive(self, place: Endpoint, subscriptions: dict[str, Subscription[Any]]) -> None:
+    def _receive(self, endpoint: Endpoint, subscriptions: dict[str, Subscription[Any]]) -> None:
         """Receive all channels until the pipeline ends or is silent, those that have ended are removed."""
         last_report, last_read, deadline = monotonic(), 0.0, inf
         has_reported = False
         while subscriptions and monotonic() < deadline and not self._stopped.is_set():
             if self.viewers and deadline == inf and "previews" not in subscriptions:
-                subscriptions["previews"] = Subscription(place, "previews", timeout=0.0)
+                subscriptions["previews"] = Subscription(endpoint, "previews", timeout=0.0)
             elif not self.viewers and "previews" in subscriptions:
                 subscriptions.pop("previews").close()
             due = monotonic() - last_read >= READ_SECONDS
@@ -178,10 +180,10 @@ class PipelineFeed(Feed):
                     subscriptions.pop(channel).close()
             if deadline == inf and monotonic() - last_report > SILENCE_SECONDS:
                 if has_reported:
-                    raise SilenceError(f"no health report arrived from {place} within {SILENCE_SECONDS:g} s")
+                    raise SilenceError(f"no health report arrived from {endpoint} within {SILENCE_SECONDS:g} s")
                 raise SilenceError(
-                    f"Waiting for the first health report from {place}. The first start after an installation compiles "
-                    "kernels, which takes about 10 s."
+                    f"Waiting for the first health report from {endpoint}. The first start after an installation "
+                    "compiles kernels, which takes about 10 s."
                 )
             if "tracks" not in subscriptions:  # nothing else waits
                 self._stopped.wait(READ_SECONDS)
@@ -199,15 +201,15 @@ def _next(messages: Subscription[Any]) -> object | None:
 class FleetFeed(Feed):
     """Asks the registry of a fleet once a second for all streams and nodes, and opens the feeds of single streams.
 
-    The address of the fleet is that of `Registry`; the fleet may start later.
+    The address names the fleet and no stream; the fleet may start later.
     """
 
     dashboard: FleetDashboard
     _pause = PERIOD_SECONDS
 
-    def __init__(self, fleet: str = "", keys: str = "") -> None:
+    def __init__(self, address: Address) -> None:
         super().__init__()
-        self._fleet, self._keys = fleet, keys
+        self._address = address
         self._registry: Registry | None = None
         self._streams: dict[str, PipelineFeed] = {}
         self.dashboard = FleetDashboard()
@@ -228,7 +230,7 @@ class FleetFeed(Feed):
                 self.close_unused(0.0)
             if len(self._streams) >= _MAX_FEEDS:
                 raise HTTPException(503, "too many pages of streams are open already\n")
-            self._streams[stream] = PipelineFeed(address_of(self._fleet, stream), self._keys)
+            self._streams[stream] = PipelineFeed(replace(self._address, stream=stream))
             self._streams[stream].start()
         self._streams[stream].used = monotonic()
         return self._streams[stream]
@@ -256,5 +258,6 @@ class FleetFeed(Feed):
     def _feed(self) -> None:
         self._call(self.close_unused)
         if self._registry is None:
-            self._registry = Registry(self._fleet, self._keys, timeout=REGISTRY_SECONDS)
+            self._registry = self._address.registry
+            self._registry.timeout = REGISTRY_SECONDS
         self._call(self.dashboard.take, self._registry.streams(), monotonic())

@@ -20,7 +20,7 @@ from typing import TypeVar
 
 import zmq
 
-from catstream.messages.kinds import End, Health
+from catstream.messages.kinds import End, Features, Health, Track
 from catstream.wire.channels import Channel
 from catstream.wire.codec import Topic, opening, topic_of
 from catstream.wire.endpoint import Endpoint
@@ -193,18 +193,26 @@ class GapCounter:
     before  frames before the first message that was received
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, of_one_object: bool = False) -> None:
         self.missed = self.before = self._seq = 0
-        self._began: int | None = None
+        self._of_one_object = of_one_object
+        self._began: int | None = None  # frame in which the one object began: there were no messages before
 
-    def take(self, seq: int, began: int | None = None) -> None:
-        """Count the frames missing before the number of the next message, or of the end.
+    def take(self, message: Track | Features) -> None:
+        """Count the frames missing before the next message."""
+        if self._of_one_object and isinstance(message, Track) and message.began != self._began:
+            self._began = message.began
+            self._seq = message.seq
+        else:
+            self._count(message.seq)
 
-        If the messages are about one object, it `began` in this frame, and there were none before.
-        """
-        if began is not None and began != self._began:
-            self._began = began
-        elif self._seq:
+    def end(self, end: End) -> None:
+        """Count the frames missing before the end; one object may have been forgotten before it."""
+        if end.seq and not self._of_one_object:
+            self._count(end.seq)
+
+    def _count(self, seq: int) -> None:
+        if self._seq:
             self.missed += max(0, seq - self._seq - 1)
         else:
             self.before = max(0, seq - 1)

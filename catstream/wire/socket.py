@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import atexit
 import errno
-import os
 import warnings
 from collections.abc import Callable
 from functools import cache
@@ -66,15 +65,6 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
     made = zmq.Context()
     made.set(zmq.MAX_SOCKETS, made.get(zmq.SOCKET_LIMIT))
     return made
-
-
-def check_owner(owner: int) -> None:
-    """Raise ServiceError in a copy of the process that made a connection: a fork copies no thread of ZeroMQ."""
-    if owner != os.getpid():
-        raise ServiceError(
-            f"process {owner} has made it, and this one is a copy of that (fork), without its connections: subscribe, "
-            "connect or start a pipeline in the process that uses it"
-        )
 
 
 def _begin_copy() -> None:
@@ -195,7 +185,7 @@ class ChannelSocket(Generic[Message]):
                 self._domain = _ZAP.register(context(), self.channel, keys)
                 self._socket.set(zmq.ZAP_DOMAIN, self._domain)
                 self._socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without a ZAP handler nobody may connect
-            if self._endpoint.taken(self.channel, sender):
+            if self._endpoint.is_in_use(self.channel, sender):
                 raise zmq.ZMQError(zmq.EADDRINUSE)
             self._monitor = Monitor(self._socket)
             self._socket.bind(address)
@@ -323,6 +313,6 @@ class ChannelSocket(Generic[Message]):
         if not any(has_keys(endpoint.address(self.channel, sender)) for sender in self.channel.senders):
             return None
         return (
-            f"the keys in {keys.folder} belong to another pipeline (the one at {endpoint} does not have the key in "
-            "server.pub): ask its administrator for current keys (catstream keys allow)"
+            f"the keys in {keys.folder} belong to another pipeline or fleet (the one at {endpoint} does not have the "
+            "key in server.pub): ask its administrator for current keys (catstream keys allow)"
         )

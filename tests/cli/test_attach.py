@@ -10,7 +10,7 @@ import time
 import pytest
 
 from catstream.cli.attach import _format, _summary
-from catstream.client.control import control
+from catstream.client.attach import control
 from catstream.features.layout import row_length
 from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline

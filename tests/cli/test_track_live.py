@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from catstream.base.box import Box
-from catstream.client.subscription import subscribe
+from catstream.client.attach import subscribe
 from catstream.pipeline import Pipeline
 from catstream.video.rendered import render
 from catstream.video.source import open_source

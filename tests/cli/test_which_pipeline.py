@@ -8,7 +8,7 @@ from click.testing import CliRunner, _NamedTextIOWrapper
 
 from catstream.cli import group
 from catstream.messages.kinds import FleetStatus, StreamStatus
-from catstream.wire.endpoint import private_folder, reserve_endpoint
+from catstream.wire.discovery import private_folder, reserve_endpoint
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from catstream.base.box import Box
-from catstream.client.control import control
+from catstream.client.attach import control
 from catstream.errors import StoreError
 from catstream.fleet import actor as module
 from catstream.fleet.actor import PORTS, Stream, free_ports

@@ -20,7 +20,7 @@ from catstream.fleet import fleet as module
 from catstream.fleet.fleet import Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.wire.endpoint import fleets
+from catstream.wire.discovery import fleets
 from catstream.wire.keys import allow
 from tests.fleet.conftest import LIVE, SOUTH
 
@@ -139,8 +139,8 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
         first = next(tracks)
         assert fleet.drain(before.node).startswith(f"{before.node} is draining; ")
         until(lambda: (found := fleet.status().streams["gate"]).node == other and found.state == "running")
-        place = tracks.place
-        next(track for track in tracks if tracks.place != place)
+        endpoint = tracks.endpoint
+        next(track for track in tracks if tracks.endpoint != endpoint)
     assert first.object == "anna"
     assert fleet.status().streams["gate"].token > before.token
     fleet.drain(other)

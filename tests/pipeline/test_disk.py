@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.subscription import subscribe
+from catstream.client.attach import subscribe
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.jobs.state import TREES
 from catstream.pipeline import Pipeline

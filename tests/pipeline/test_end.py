@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.subscription import subscribe
+from catstream.client.attach import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES

@@ -5,7 +5,7 @@ from contextlib import suppress
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.subscription import subscribe
+from catstream.client.attach import subscribe
 from catstream.errors import ServiceError, SilenceError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES

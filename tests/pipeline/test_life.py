@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.control import control
-from catstream.client.subscription import subscribe
+from catstream.client.attach import control, subscribe
 from catstream.errors import ServiceError
 from catstream.pipeline import Pipeline
 from catstream.video.live_demo import first_box

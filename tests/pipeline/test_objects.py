@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.control import control
+from catstream.client.attach import control
 from catstream.errors import CommandRejectedError
 from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker

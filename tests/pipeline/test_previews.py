@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
-from catstream.client.subscription import subscribe
+from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
 from catstream.processes.outputs import Previews
 from catstream.video.frames import Frame

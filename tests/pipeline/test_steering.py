@@ -11,8 +11,7 @@ import pytest
 import zmq
 
 from catstream.base.settings import Settings
-from catstream.client.control import control
-from catstream.client.subscription import subscribe
+from catstream.client.attach import control, subscribe
 from catstream.errors import (
     BoxError,
     CommandRejectedError,

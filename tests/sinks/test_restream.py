@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from catstream.base.box import Box
+from catstream.client.address import Address
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
@@ -68,7 +69,7 @@ def test_pictures_are_made_and_sent_only_while_the_server_is_there(endpoint, tcp
     with ExitStack() as stack:
         pipeline = Pipeline(endpoint, stack)
         sink = stack.enter_context(
-            closing(open_sink(f"rtmp://127.0.0.1:{port}/live/one", Origin(endpoint=str(endpoint))))
+            closing(open_sink(f"rtmp://127.0.0.1:{port}/live/one", Origin(address=Address(str(endpoint)))))
         )
         for is_subscribed in (True, False):  # the size of the stream is that of the first picture
             until(lambda: pipeline.has_subscribers == is_subscribed, lambda: sink.write(pipeline.next()))  # noqa: B023

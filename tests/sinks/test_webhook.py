@@ -13,6 +13,7 @@ from time import sleep
 import pytest
 
 from catstream.base.box import Box
+from catstream.client.address import Address
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
@@ -119,7 +120,7 @@ def test_an_event_has_the_newest_picture_if_that_is_wanted(receiver, endpoint, u
     options = SinkOptions(picture=True, events=("found", "ended"))
     with Publisher(PREVIEWS, endpoint) as previews:
         url = f"http://127.0.0.1:{receiver.port}"
-        with closing(open_sink(url, Origin(endpoint=str(endpoint), options=options))) as sink:
+        with closing(open_sink(url, Origin(address=Address(str(endpoint)), options=options))) as sink:
             sink.write(TrackedFrame([FOUND]))
             until(lambda: previews.has_subscribers, previews.serve_late_joiners)
             previews.send(Preview(7, 0.28, 640, 480, {}, JPEG))

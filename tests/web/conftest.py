@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box
+from catstream.client.address import Address
 from catstream.messages.kinds import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
 from catstream.web.app import fleet_site, pipeline_site
 from catstream.web.server import Server
@@ -75,7 +76,7 @@ def serve_site():
 @pytest.fixture
 def serve(serve_site, folder):
     """Starts pages of the pipeline in `folder`: a client of each of them."""
-    return lambda **options: serve_site(pipeline_site(str(folder)), **options)
+    return lambda **options: serve_site(pipeline_site(Address(str(folder))), **options)
 
 
 class Fleet:
@@ -112,7 +113,7 @@ def manager(fleet, managing):
 @pytest.fixture
 def serve_fleet(serve_site, fleet, manager):  # noqa: ARG001  # it answers
     """Starts pages of the fleet: a client of each of them."""
-    return lambda **options: serve_site(fleet_site(fleet.address, fleet.keys_of_client), **options)
+    return lambda **options: serve_site(fleet_site(Address(fleet=fleet.address, keys=fleet.keys_of_client)), **options)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from catstream.client.address import Address
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Health
 from catstream.video.drawing import PALETTE
@@ -95,7 +96,7 @@ def test_while_no_frames_are_tracked_the_page_says_why_and_nothing_of_where_the_
 
 
 def test_ready_is_what_tracks_and_a_process_is_silent_some_seconds_after_its_last_report():
-    feed, everyone = PipelineFeed("run"), "no health report from: detector, compressor, trainer"
+    feed, everyone = PipelineFeed(Address("run")), "no health report from: detector, compressor, trainer"
     assert feed.problem_of() == everyone
     for ago, names, more, problem in (
         (SILENCE_SECONDS + 1.0, ("detector", "compressor", "trainer"), {}, everyone),

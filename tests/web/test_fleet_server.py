@@ -7,6 +7,7 @@ import re
 import pytest
 from starlette.exceptions import HTTPException
 
+from catstream.client.address import Address
 from catstream.web import feed
 from catstream.web.feed import FleetFeed
 from catstream.wire.endpoint import Endpoint
@@ -119,7 +120,7 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatc
         fleet.stream(f"cam-{number}")
 
     async def use():
-        streams = FleetFeed(fleet.address)
+        streams = FleetFeed(Address(fleet=fleet.address))
         streams.dashboard.take(fleet.status(), 0.0)
         first = streams.pipeline("cam-1")
         with first.viewed():

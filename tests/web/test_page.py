@@ -8,7 +8,8 @@ import httpx
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.subscription import subscribe
+from catstream.client.address import Address
+from catstream.client.attach import subscribe
 from catstream.pipeline import Pipeline
 from catstream.video.rendered import RATE, Demo
 from catstream.video.writer import VideoWriter
@@ -31,7 +32,7 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
             boxes.append(box)
     # The pipeline continues only if its tracks are received.
     settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})
-    server = Server(pipeline_site(str(folder)), port=0, token="correct-horse-battery")
+    server = Server(pipeline_site(Address(str(folder))), port=0, token="correct-horse-battery")
     words = script_of_browser("page.mjs", server.url, ",".join(map(str, boxes[0])), str(SIZE[0]))
     output = tmp_path / "output"
 
@@ -78,7 +79,7 @@ def test_an_object_of_a_camera_is_followed_from_the_still_picture_in_which_it_wa
     script_of_browser, folder, walker
 ):
     url, find = walker
-    server = Server(pipeline_site(str(folder)), port=0, token=None)
+    server = Server(pipeline_site(Address(str(folder))), port=0, token=None)
     words = script_of_browser("live.mjs", server.url, "1")
     with (
         server.in_background(),

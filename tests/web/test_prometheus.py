@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from catstream.client.address import Address
 from catstream.messages.kinds import Health
 from catstream.web import prometheus
 from catstream.web.feed import FleetFeed, PipelineFeed
@@ -12,7 +13,7 @@ from catstream.web.feed import FleetFeed, PipelineFeed
 
 @pytest.fixture
 def feed():
-    return PipelineFeed()
+    return PipelineFeed(Address())
 
 
 def samples(feed):
@@ -74,7 +75,7 @@ def test_the_state_is_a_metric_and_alerts_on_a_lost_source_or_a_pause_need_no_ot
 
 
 def test_each_number_of_a_stream_and_of_a_node_is_a_metric_with_their_names_as_labels(fleet):
-    feed = FleetFeed(fleet.address)
+    feed = FleetFeed(Address(fleet=fleet.address))
     fleet.stream("cam-7", node="north", models={"anna": 3}, frame=25)
     fleet.stream("cam-8", "failed", trouble="no source")
     fleet.node("north", cores=4.0)

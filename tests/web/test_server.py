@@ -20,6 +20,7 @@ import httpx
 import numpy as np
 import pytest
 
+from catstream.client.address import Address
 from catstream.errors import ServiceError
 from catstream.messages.kinds import Health
 from catstream.web import app
@@ -297,17 +298,17 @@ def test_a_browser_may_open_two_pages_at_two_ports(serve):
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::"])
 def test_a_public_address_requires_a_token(host):
     with pytest.raises(ServiceError, match="without --token none"):
-        Server(pipeline_site(), host=host, port=0)
+        Server(pipeline_site(Address()), host=host, port=0)
 
 
 def test_a_short_token_is_an_error():
     with pytest.raises(ServiceError, match="can be guessed"):
-        Server(pipeline_site(), port=0, token="secret")
+        Server(pipeline_site(Address()), port=0, token="secret")
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_a_server_on_all_interfaces_is_found_at_the_loopback_and_by_the_name_of_the_machine(host):
-    server = Server(pipeline_site(), host=host, port=0, token=TOKEN)
+    server = Server(pipeline_site(Address()), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
         assert httpx.get(server.url, follow_redirects=True).status_code == 200
@@ -328,7 +329,7 @@ def test_a_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatc
 
     monkeypatch.setattr(PipelineFeed, "start", start)
     monkeypatch.setattr(PipelineFeed, "stop", stop)
-    site = pipeline_site()
+    site = pipeline_site(Address())
     monkeypatch.setattr(site, "close", lambda: signal.raise_signal(signal.SIGINT))
     Server(site, port=0, token=TOKEN).run()
     assert len(stops) == 1
@@ -338,7 +339,7 @@ def test_a_command_that_waits_for_its_answer_is_answered_at_the_end_of_the_serve
     begun, answered = threading.Event(), threading.Event()
     monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 1)
     monkeypatch.setattr(PipelineFeed, "execute", lambda *_, **__: begun.set() or answered.wait(30))
-    server = Server(pipeline_site(str(folder)), port=0)
+    server = Server(pipeline_site(Address(str(folder))), port=0)
     with ThreadPoolExecutor(1) as pool:
         with server.in_background():
             asked = pool.submit(httpx.post, f"{server.url}control", json={"verb": "pause"}, timeout=60)
@@ -353,7 +354,7 @@ def test_viewers_that_do_not_read_are_cut_off_at_the_end_without_a_traceback(fol
     updates = []
     monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 0.5)
     monkeypatch.setattr(Dashboard, "updates", lambda *_: updates.append(1) or {"status": "x" * (1 << 20)})
-    server = Server(pipeline_site(str(folder)), port=0)
+    server = Server(pipeline_site(Address(str(folder))), port=0)
     with socket.create_connection(urlsplit(server.url).netloc.split(":")) as viewer, server.in_background():
         viewer.sendall(b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         until(lambda: updates and len(updates) == (time.sleep(0.5), len(updates))[1])
@@ -363,4 +364,4 @@ def test_viewers_that_do_not_read_are_cut_off_at_the_end_without_a_traceback(fol
 def test_a_port_in_use_is_an_error(page):
     port = urlsplit(str(page.base_url)).port
     with pytest.raises(ServiceError, match=rf"127.0.0.1:{port} \(Address already in use\): choose another port"):
-        Server(pipeline_site(), port=port)
+        Server(pipeline_site(Address()), port=port)

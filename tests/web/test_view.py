@@ -12,7 +12,7 @@ import httpx
 import pytest
 from click.testing import CliRunner
 
-from catstream.cli.view import AddressType, with_token
+from catstream.cli.view import HostPortType, with_token
 
 PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics", "/streams/roof/", "/streams/roof/events"]
 OTHER_USER = 65534
@@ -70,7 +70,7 @@ def test_with_no_token_the_page_is_open_to_every_user_of_the_machine_until_sigte
 @pytest.mark.parametrize("text", ["", "x", "host:", "8000:host", "70000", "-1"])
 def test_a_malformed_address_is_an_error(text):
     with pytest.raises(click.BadParameter, match="for example 8000"):
-        AddressType().convert(text, None, None)
+        HostPortType().convert(text, None, None)
 
 
 @pytest.mark.parametrize("prefix", ["", "view-"])

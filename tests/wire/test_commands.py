@@ -175,7 +175,7 @@ def test_of_a_flood_of_commands_64_wait_the_others_are_rejected_and_stop_is_let_
 
 
 def test_control_sends_each_command_with_an_id_of_its_own(endpoint, answering):
-    with answering() as heard, Control(str(endpoint), timeout=20) as control:
+    with answering() as heard, Control(endpoint, timeout=20) as control:
         for answer in (control.set_box((1, 2, 3, 4), keep=True), control.pause(), control.resume(), control.stop()):
             assert (answer.done, answer.frame) == (True, 7)
     assert len({command.id for command in heard}) == 4
@@ -190,7 +190,7 @@ def test_a_rejected_command_raises_an_error_with_the_reason(endpoint, answering)
 
     with (
         answering(refuse),
-        Control(str(endpoint), timeout=20) as control,
+        Control(endpoint, timeout=20) as control,
         pytest.raises(CommandRejectedError, match=r"^pause: it is no time for that$"),
     ):
         control.pause()
@@ -199,7 +199,7 @@ def test_a_rejected_command_raises_an_error_with_the_reason(endpoint, answering)
 def test_a_command_without_an_answer_raises_an_error(endpoint):
     with (
         Responder(CONTROL, endpoint),  # a process that hangs
-        Control(str(endpoint), timeout=0.3) as control,
+        Control(endpoint, timeout=0.3) as control,
         pytest.raises(SilenceError, match=r"no answer to stop from .* within 0\.3 s: is a pipeline running there"),
     ):
         control.stop()

@@ -11,7 +11,8 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from catstream.messages.kinds import End, Model, Sample, Summary, Track
 from catstream.wire.channels import MODELS, SAMPLES, TRACKS
 from catstream.wire.codec import encode, opening, topic_of
-from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.discovery import private_folder
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher, Subscriber
 from tests.wire.examples import model, rejected, track
 

@@ -15,7 +15,7 @@ from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
 from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
-from catstream.wire.endpoint import reserve_endpoint
+from catstream.wire.discovery import reserve_endpoint
 from catstream.wire.newest import Publisher
 from tests.wire.examples import model
 from tests.wire.examples import present as track
@@ -123,7 +123,7 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
     [
         *((channel, "anna", "about all objects: subscribe to samples, models") for channel in ("features", "health")),
         ("tracks", "an na", "'an na' is not a name"),
-        *((channel, None, "expected one of the channels") for channel in ("training", "results", "frames")),
+        *((channel, None, "unknown channel") for channel in ("training", "results", "frames")),
     ],
 )
 def test_what_cannot_be_subscribed_to_is_an_error(endpoint, channel, name, words):

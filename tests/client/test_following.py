@@ -10,13 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import catstream
-from catstream.client.registry import FollowedStream
-from catstream.client.subscription import wait_until_running
+from catstream.client.address import Address
+from catstream.client.attach import wait_until_running
+from catstream.client.following import FollowedStream
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
-from catstream.wire.endpoint import Endpoint, private_folder
+from catstream.wire.discovery import private_folder
+from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, allowed, create, public_key, revoke, synchronise
 from catstream.wire.newest import Publisher
 from tests.wire.examples import present as track
@@ -83,7 +85,7 @@ def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, m
             second = stream.runs()
             stream.send(second, track(9), track(10), End(11, "the source has ended"))
             stream.update(state="ended")
-            assert [each.seq for each in watched.result(60)] == [1, 2, 9, 10]
+            assert [message.seq for message in watched.result(60)] == [1, 2, 9, 10]
             assert tracks.missed == 6
 
 
@@ -110,7 +112,7 @@ def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_on
 def test_a_subscription_waits_for_a_stream_that_runs_nowhere_yet(stream, managing):
     stream.update(state="failed", trouble="there is no camera")
     with managing(stream.status), catstream.subscribe("fleet://cam-7", "tracks", timeout=0.1) as tracks:
-        with pytest.raises(SilenceError, match=r"its state is failed: there is no camera$"):
+        with pytest.raises(SilenceError, match=r"the state of the stream is: failed, there is no camera$"):
             next(tracks)
         tracks.timeout = 60
         watched = stream.watched(tracks)
@@ -130,12 +132,12 @@ def test_all_frames_of_another_source_and_of_a_live_stream_are_returned_after_a_
             first.close()
             stream.send(stream.runs(**change), track(1), track(2), STOPPED)
             stream.update(state="ended")
-            assert [each.seq for each in watched.result(60)] == [1, 2, 1, 2]
+            assert [message.seq for message in watched.result(60)] == [1, 2, 1, 2]
 
 
 def test_an_event_loop_follows_a_stream_too(stream, managing):
     async def watched(tracks):
-        return [each async for each in tracks]
+        return [track async for track in tracks]
 
     with managing(stream.status):
         first = stream.runs()
@@ -162,7 +164,7 @@ def test_the_endpoint_of_a_running_stream_is_that_of_its_pipeline(stream, managi
         tracks = stream.runs()
         with Publisher(HEALTH, tracks._endpoint, "detector") as health:
             health.send(Health("detector", 0.0))
-            waiting = stream._pool.submit(wait_until_running, "fleet://cam-7", "", 60)
+            waiting = stream._pool.submit(wait_until_running, Address.parse("fleet://cam-7"), 60)
             stream._until(waiting.done, health.serve_late_joiners)
         assert str(waiting.result()) == stream.status.streams["cam-7"].endpoint
 
@@ -248,7 +250,7 @@ def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_controll
             registry.answer = None if step == "down" else _Script._status(token, "moving")
         moved = followed.update()
         assert moved == (step == "move")
-        assert (followed.end, str(followed.place)) == (None, f"run-{token}")
+        assert (followed.end, str(followed.endpoint)) == (None, f"run-{token}")
     registry.answer = _Script._status(token, last) if last == "ended" else None
     if last == "removed":
         registry.receive = lambda: FleetStatus("site", 1.7e9)

@@ -1,0 +1,91 @@
+"""Addresses of what a client attaches to, parsed once: where a program or the command line receives them.
+
+run                        the pipeline at this endpoint: a folder, or tcp://HOST:PORT
+                           (empty) the only running pipeline of this user
+fleet://cam-7              a stream of the only fleet of this user on this machine
+fleet://site/cam-7         a stream of the fleet with this name
+fleet://head:5690/cam-7    a stream of the fleet whose registry listens there
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from catstream.client.registry import Registry
+from catstream.errors import ServiceError
+from catstream.wire.discovery import find
+from catstream.wire.endpoint import Endpoint
+
+_SCHEME = "fleet://"
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """A running pipeline, or a stream of a fleet, wherever it runs; and the keys to connect with.
+
+    endpoint  of the pipeline; empty for the only one that runs, or for the one with this source
+    source    that the pipeline tracks, as it was given to the pipeline, or its file name
+    stream    name of the stream; empty for a pipeline
+    fleet     of the stream: HOST:PORT of its registry, or its name; empty for the only one of this user
+    keys      folder of the keys of this client; empty if there are none
+
+    >>> Address.parse("fleet://head:5690/cam-7")
+    Address(endpoint='', source='', stream='cam-7', fleet='head:5690', keys='')
+    >>> str(Address(stream="cam-7", fleet="site")), str(Address.parse("run"))
+    ('fleet://site/cam-7', 'run')
+    """
+
+    endpoint: str = ""
+    source: str = ""
+    stream: str = ""
+    fleet: str = ""
+    keys: str = ""
+
+    def __str__(self) -> str:
+        if not self.stream:
+            return self.endpoint
+        return f"{_SCHEME}{self.fleet}/{self.stream}" if self.fleet else f"{_SCHEME}{self.stream}"
+
+    @classmethod
+    def parse(cls, text: str | os.PathLike[str] | Address, keys: str = "", source: str = "") -> Address:
+        """Parse an endpoint or the address of a stream; ServiceError if it is neither."""
+        if isinstance(text, Address):
+            return text
+        text = os.fspath(text)
+        if not text.startswith(_SCHEME):
+            return cls(text, source, keys=keys)
+        fleet, _, stream = text.removeprefix(_SCHEME).rpartition("/")
+        if not stream or "/" in fleet or (":" in stream and not fleet):
+            raise ServiceError(
+                "the address of a stream is fleet://STREAM, fleet://FLEET/STREAM or fleet://HOST:PORT/STREAM, got "
+                f"{text!r}"
+            )
+        return cls(stream=stream, fleet=fleet, keys=keys)
+
+    @property
+    def registry(self) -> Registry:
+        """A connection to the registry of the fleet; close it."""
+        return Registry(self.fleet, self.keys)
+
+    def with_endpoint(self) -> Address:
+        """The same address; if it names no pipeline, the endpoint of the one that runs, also when others start."""
+        if self.stream or self.endpoint:
+            return self
+        endpoint = self.resolve()
+        return Address(str(endpoint), keys=str(endpoint.keys.folder) if endpoint.keys is not None else "")
+
+    def resolve(self) -> Endpoint:
+        """The endpoint of the pipeline, or of the one that the stream has now.
+
+        ServiceError if there is no such pipeline or stream, or the stream does not run; SilenceError if the registry
+        does not answer. A pipeline at an endpoint that is named may start later.
+        """
+        if self.stream:
+            with self.registry as registry:
+                return registry.running(self.stream)
+        if not self.endpoint:
+            return find(self.source)
+        endpoint = Endpoint.parse(self.endpoint, self.keys)
+        endpoint.check_access()
+        return endpoint

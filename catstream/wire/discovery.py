@@ -1,0 +1,195 @@
+"""How processes of a user find one another: private folders with notes of the pipelines and fleets that run.
+
+A note is a file that is locked as long as its process lives, so that what a killed process left is recognised.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from catstream.base.addresses import without_password
+from catstream.base.files import descriptor, is_locked, lock, writing
+from catstream.base.forks import forked, generation
+from catstream.errors import ServiceError
+from catstream.wire.endpoint import Endpoint, is_too_long, socket_files
+
+_PREFIX = "catstream-"  # of private folders
+_OWNER = "owner"  # file in a private folder, locked while its owner lives
+_NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
+_FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
+_ANY_BYTES = "surrogateescape"  # in notes: the name of a file need not be UTF-8
+
+
+@contextlib.contextmanager
+def private_folder() -> Iterator[Path]:
+    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes.
+
+    It is locked, as programs that remove old temporary files leave a locked folder alone (systemd-tmpfiles).
+    """
+    if not (bases := _base_folders()):
+        raise ServiceError("no folder for temporary files can be written to: set TMPDIR to one")
+    base = next((base for base in bases if not is_too_long(base / f"{_PREFIX}12345678")), bases[0])
+    for path, text in _notes([base], f"{_PREFIX}*/{_OWNER}"):
+        if text is None:
+            shutil.rmtree(path.parent, ignore_errors=True)
+    with contextlib.ExitStack() as stack:
+        with writing(base):
+            folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))
+            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            lock(stack.enter_context(descriptor(folder, os.O_DIRECTORY)))
+            stack.enter_context(note(folder / _OWNER, ""))
+        since = generation()
+        try:
+            yield folder
+        finally:
+            if forked(since):
+                stack.pop_all()
+
+
+@contextlib.contextmanager
+def reserve_endpoint(text: str, default: Path, keys: str = "", source: str = "", fleet: str = "") -> Iterator[Endpoint]:
+    """The endpoint of one pipeline, or of the registry of a fleet, locked for it; removes all socket files afterwards.
+
+    `text` and `keys` are settings. The private folder `default` is used if `text` is empty, and the endpoint is found
+    by a note in it, with the source of the frames, without a password, or the name of the fleet.
+    """
+    endpoint = Endpoint.parse(text or str(default), keys)
+    if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
+        endpoint.keys.listening()
+        endpoint.keys.client(endpoint.keys.public.decode())
+    with contextlib.ExitStack() as stack:
+        if text and endpoint.folder is not None:  # of tcp, the kernel gives a port to one process only
+            folder = stack.enter_context(_locked(endpoint.folder.absolute(), text))
+            endpoint = Endpoint.parse(str(folder), endpoint.keys or "")
+        facts = str(endpoint), str(endpoint.keys.folder) if endpoint.keys is not None else "", fleet or source
+        with writing(default):
+            stack.enter_context(note(default / (_FLEET_NOTE if fleet else _NOTE), "\n".join(facts)))
+        yield endpoint
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, text: str) -> Iterator[Path]:
+    """A folder for the sockets of one pipeline, which is made; the sockets are removed afterwards."""
+    with contextlib.ExitStack() as stack:
+        with writing(folder):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
+        facts = os.fstat(handle)
+        if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
+            raise ServiceError(f"other users may write to {text!r}: give a folder of your own, chmod 700")
+        if not lock(handle):
+            raise ServiceError(
+                f"a pipeline is already running on {text!r}: "
+                "wait for it, or give another folder (--set run.endpoint=FOLDER)"
+            )
+        since = generation()
+        try:
+            yield folder
+        finally:
+            if not forked(since):
+                for file in socket_files(folder):
+                    file.unlink(missing_ok=True)
+
+
+def running() -> list[Endpoint]:
+    """Endpoints of this user's running pipelines, in no order."""
+    return [replace(endpoint, source=source) for endpoint, source in _endpoints(_NOTE)]
+
+
+def fleets() -> dict[str, Endpoint]:
+    """Endpoints of the controllers of this user's running fleets on this machine, by the names of the fleets."""
+    return {name: endpoint for endpoint, name in _endpoints(_FLEET_NOTE)}
+
+
+def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, str]]:
+    """The endpoint in each note whose process is running, and the source or name in it.
+
+    One whose keys cannot be read must not hide the others: it is skipped, or an error if `strict`.
+    """
+    for _, text in _notes(_base_folders(), f"{_PREFIX}*/{note}"):
+        if text:
+            endpoint, keys, about = [*text.split("\n", 2), "", ""][:3]  # another version may write less
+            try:
+                yield Endpoint.parse(endpoint, keys), about
+            except ServiceError:
+                if strict:
+                    raise
+
+
+def find(source: str = "") -> Endpoint:
+    """The endpoint of the user's only running pipeline, or of the one with this source.
+
+    The keys of this user's pipelines are in their notes. The source is as it was given to the pipeline, or its file
+    name. ServiceError if there is none, or more than one.
+    """
+    endpoints = running()
+    if not endpoints:
+        list(_endpoints(_NOTE, strict=True))  # raises the error of a pipeline whose keys cannot be read
+        raise ServiceError("no pipeline of yours is running: start one (catstream track), or pass its --endpoint")
+    source = without_password(source)  # as it is in the note
+    matches = [endpoint for endpoint in endpoints if not source or _has_source(endpoint, source)]
+    if len(matches) == 1:
+        return matches[0]
+    if not matches:
+        raise ServiceError(f"no pipeline of yours tracks {source!r}: running{_listed(endpoints)}")
+    what = f"track {source!r}" if source else "are running"
+    raise ServiceError(f"{len(matches)} pipelines {what}: select one (--endpoint){_listed(matches)}")
+
+
+def _listed(endpoints: list[Endpoint]) -> str:
+    """List the running pipelines, for the end of an error message."""
+    return "".join(f"; {endpoint.source or 'a pipeline'} at {endpoint}" for endpoint in sorted(endpoints, key=str))
+
+
+def source_at(endpoint: Endpoint) -> str:
+    """The source of the pipeline at an endpoint, if that is one of this user; empty if it is not known."""
+    if endpoint.source:
+        return endpoint.source
+    text = str(endpoint.folder.absolute()) if endpoint.folder is not None else str(endpoint)
+    return next((other.source for other in running() if str(other) == text), "")
+
+
+def _has_source(endpoint: Endpoint, source: str) -> bool:
+    """Whether a pipeline has this source: the same text, the same file, or a file of that name."""
+    return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
+
+
+@contextlib.contextmanager
+def note(path: Path, text: str) -> Iterator[None]:
+    """A file that is locked as long as its process uses it; it is never visible without its lock and text."""
+    hidden, since = path.with_name(f".{path.name}"), generation()
+    with descriptor(hidden, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as handle:
+        try:
+            lock(handle, math.inf)
+            os.write(handle, text.encode(errors=_ANY_BYTES))
+            hidden.rename(path)
+            yield
+        finally:
+            if not forked(since):
+                hidden.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
+
+
+def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | None]]:
+    """This user's notes of a pattern: path and text of each, None as the text if the process that locked it is dead."""
+    for folder in folders:
+        for path in folder.glob(pattern):
+            # It may be removed by now, or belong to another user.
+            with contextlib.suppress(OSError), path.open(encoding="utf-8", errors=_ANY_BYTES) as file:
+                if os.fstat(file.fileno()).st_uid == os.geteuid():
+                    yield path, file.read() if is_locked(file.fileno()) else None
+
+
+def _base_folders() -> list[Path]:
+    """The parent folders of private folders, preferred first: the runtime folder of a user is removed at the logout."""
+    bases = [os.environ.get("XDG_RUNTIME_DIR", "")]
+    with contextlib.suppress(FileNotFoundError):  # there is no temporary folder that can be written to
+        bases.insert(0, tempfile.gettempdir())
+    return list(dict.fromkeys(Path(base) for base in bases if os.access(base, os.W_OK)))
