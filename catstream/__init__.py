@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from catstream.client.control import Control, control
     from catstream.client.subscription import Subscription, subscribe
     from catstream.errors import CatstreamError
-    from catstream.finding.find import Sighting, find
+    from catstream.finding.find import Detection, find
     from catstream.fleet.fleet import Fleet
     from catstream.jobs.saved_model import SavedModel, merge
     from catstream.messages.kinds import Track
@@ -36,12 +36,12 @@ __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "Detection",
     "Fleet",
     "MultiTracker",
     "Pipeline",
     "SavedModel",
     "Settings",
-    "Sighting",
     "Subscription",
     "Track",
     "Tracker",
@@ -65,7 +65,7 @@ _HOMES = {
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "base.settings",
-    "Sighting": "finding.find",
+    "Detection": "finding.find",
     "Subscription": "client.subscription",
     "Track": "messages.kinds",
     "Tracker": "tracker",
