@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from catstream.client.control import Control
     from catstream.client.subscription import Subscription
     from catstream.errors import CatstreamError
-    from catstream.finding.find import Sighting, find
+    from catstream.finding.find import Detection, find
     from catstream.fleet.fleet import Fleet
     from catstream.jobs.saved_model import SavedModel, merge
     from catstream.messages.kinds import Track
@@ -37,12 +37,12 @@ __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "Detection",
     "Fleet",
     "MultiTracker",
     "Pipeline",
     "SavedModel",
     "Settings",
-    "Sighting",
     "Subscription",
     "Track",
     "Tracker",
@@ -66,7 +66,7 @@ _HOMES = {
     "MultiTracker": "multi",
     "Pipeline": "pipeline",
     "Settings": "base.settings",
-    "Sighting": "finding.find",
+    "Detection": "finding.find",
     "Subscription": "client.subscription",
     "Track": "messages.kinds",
     "Tracker": "tracker",

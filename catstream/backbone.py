@@ -1,7 +1,7 @@
-"""Makes the file of a network for `features.network` from a backbone, and measures what such a file is good for.
+"""Prepares a backbone for `features.network`, and checks the result.
 
-The backbone is cut at a layer of stride 16. What its training did to the pixels is put in front of it, and behind it a
-1 x 1 convolution that keeps the principal components of its vectors in photographs, centred and scaled.
+The backbone is truncated at a layer of stride 16. The preprocessing of its training is prepended, and a 1 x 1
+convolution appended that projects its vectors to their principal components in photographs, centred and scaled.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _CROP = 224  # side of a crop of a photograph, in pixels
 _CROPS = 256  # of all photographs together
 _SMALLEST = 64  # side of the part of a photograph that becomes a crop, at least
 _INNER = slice(EDGE * CELL // STRIDE, -EDGE * CELL // STRIDE)  # vectors that hardly depend on the edge of a crop
-_KEPT = "catstream.kept_variance"  # in the metadata of the file
+_EXPLAINED = "catstream.explained_variance"  # in the metadata of the file
 
 
 def prepare(
@@ -63,16 +63,16 @@ def prepare(
             f"cannot read the backbone {str(backbone)!r} ({cause_of(error)}): pass an ONNX file"
         ) from None
     crops = list(_crops(Path(images)))
-    model = _cut(model, layer, str(backbone))
-    _put_in_front(model, rgb, np.array(mean), np.array(std))
+    model = _truncated(model, layer, str(backbone))
+    _prepend(model, rgb, np.array(mean), np.array(std))
     run = by_onnxruntime(Path(backbone), model.SerializeToString())
-    vectors = np.concatenate([_inner_vectors(run, each, layer) for each in crops])
+    vectors = np.concatenate([_inner_vectors(run, crop, layer) for crop in crops])
     centre = vectors.mean(axis=0)
     variances, directions = np.linalg.eigh((vectors - centre).T @ (vectors - centre) / len(vectors))
-    kept = variances[-MOST_CHANNELS:].sum()
-    basis = directions[:, -MOST_CHANNELS:].T[::-1] * np.sqrt(ENERGY / kept)
-    _put_behind(model, basis, -basis @ centre)
-    onnx.helper.set_model_props(model, {_KEPT: f"{kept / variances.sum():.4f}"})
+    explained = variances[-MOST_CHANNELS:].sum()
+    basis = directions[:, -MOST_CHANNELS:].T[::-1] * np.sqrt(ENERGY / explained)
+    _append(model, basis, -basis @ centre)
+    onnx.helper.set_model_props(model, {_EXPLAINED: f"{explained / variances.sum():.4f}"})
     with writing(output):
         write_atomically(output, model.SerializeToString())
 
@@ -83,7 +83,9 @@ def _crops(folder: Path) -> Iterator[np.ndarray]:
     chosen = [files[i] for i in np.linspace(0, len(files) - 1, min(len(files), _CROPS)).astype(int)]
     images = [image for file in chosen if (image := ImageReader(pages_of(file) or [(file, 0)])(0)) is not None]
     if not images:
-        raise VideoError(f"the folder {str(folder)!r} and its subfolders hold no images: give a folder of photographs")
+        raise VideoError(
+            f"the folder {str(folder)!r} and its subfolders contain no images: pass a folder of photographs"
+        )
     rng = np.random.default_rng(0)
     for number in range(_CROPS):
         frame = Pyramid(images[number % len(images)])
@@ -93,16 +95,14 @@ def _crops(folder: Path) -> Iterator[np.ndarray]:
         yield frame.cut(x, y, side / _CROP, side / _CROP, _CROP)
 
 
-def _cut(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto:
+def _truncated(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto:
     """The part of a model from its image to a layer, for images of any height and width."""
     import onnx
 
     weights = {each.name for each in model.graph.initializer}
     inputs = [each.name for each in model.graph.input if each.name not in weights]
     if len(inputs) != 1:
-        raise SettingsError(
-            f"the backbone {name!r} has the inputs {', '.join(inputs)}, expected one image: give another"
-        )
+        raise SettingsError(f"the backbone {name!r} has the inputs {', '.join(inputs)}, expected one image")
     made = {tensor: tensor for node in model.graph.node for tensor in node.output}
     tensors = {node.name: node.output[0] for node in model.graph.node} | made
     if layer not in tensors:
@@ -116,7 +116,7 @@ def _cut(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto:
     return part
 
 
-def _put_in_front(model: onnx.ModelProto, rgb: bool, mean: np.ndarray, std: np.ndarray) -> None:
+def _prepend(model: onnx.ModelProto, rgb: bool, mean: np.ndarray, std: np.ndarray) -> None:
     """Add what orders and normalises the channels of the pixels; a convolution of three channels would be slow."""
     (image,) = model.graph.input
     steps: list[tuple[bool, str, np.ndarray, dict[str, Any]]] = [
@@ -131,7 +131,7 @@ def _put_in_front(model: onnx.ModelProto, rgb: bool, mean: np.ndarray, std: np.n
             image.name = node.input[0]
 
 
-def _put_behind(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
+def _append(model: onnx.ModelProto, weights: np.ndarray, bias: np.ndarray) -> None:
     """Add a 1 x 1 convolution of the vectors."""
     (vectors,) = model.graph.output
     parts = weights.astype(np.float32)[:, :, None, None], bias.astype(np.float32)
@@ -153,47 +153,50 @@ def _node(
 
 def _inner_vectors(run: Callable[[np.ndarray], np.ndarray], planes: np.ndarray, layer: str) -> np.ndarray:
     """The vectors of a crop, float64 (k, channels); SettingsError if the layer has another stride than 16."""
-    found, side = run(planes[None].astype(np.float32)), _CROP // STRIDE
-    if found.shape != (1, found.shape[1], side, side):
+    vectors, side = run(planes[None].astype(np.float32)), _CROP // STRIDE
+    if vectors.shape != (1, vectors.shape[1], side, side):
         raise SettingsError(
-            f"the layer {layer!r} is {found.shape} for an image of {_CROP} x {_CROP}, expected (1, any, {side}, "
+            f"the layer {layer!r} is {vectors.shape} for an image of {_CROP} x {_CROP}, expected (1, any, {side}, "
             f"{side}): choose a layer of stride {STRIDE}"
         )
-    return found[0, :, _INNER, _INNER].reshape(found.shape[1], -1).T.astype(np.float64)
+    return vectors[0, :, _INNER, _INNER].reshape(vectors.shape[1], -1).T.astype(np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What a network costs, and what it is good for.
+    """The cost and the quality of a network.
 
-    network    the network
-    kept       share of the variance of the backbone's vectors, 0 if the file does not say it
-    seconds    that it takes for the surroundings of an object, 224 x 224 pixels
-    agreement  correlation of the vectors of a shifted picture with those that are sampled from the picture before
+    network       the network
+    explained     explained variance of the principal components, from 0 to 1; 0 if the file does not contain it
+    seconds       time of one inference on 224 x 224 pixels, the surroundings of an object
+    equivariance  correlation of the vectors of a shifted image with those interpolated from the original one
     """
 
     network: Network
-    kept: float
+    explained: float
     seconds: float
-    agreement: float
+    equivariance: float
 
 
 def check(path: str | os.PathLike[str]) -> Check:
-    """Measure a network; errors as of `Network`."""
+    """Measure the cost and the quality of a network; raises the errors of `Network`."""
     require_extra("network")
     import onnx
 
     network = Network(Path(path))
-    kept = {each.key: each.value for each in onnx.load(os.fspath(path)).metadata_props}.get(_KEPT, "0")
+    metadata = {entry.key: entry.value for entry in onnx.load(os.fspath(path)).metadata_props}
+    explained = metadata.get(_EXPLAINED, "0")
     ((image, _),) = render(1)
     frame, side = Pyramid(image), _CROP // CELL - 2 * EDGE
     window = Window(0.0, 0.0, WINDOW * CELL, WINDOW * CELL).centred(image.shape[1] / 2, image.shape[0] / 2)
     moved = window.centred(window.centre[0] + CELL, window.centre[1] + CELL)  # half of the way to the next vector
-    before, after = (VectorMap.of(network, frame.around(each, side, EDGE), each) for each in (window, moved))
+    before, after = (VectorMap.of(network, frame.around(at, side, EDGE), at) for at in (window, moved))
     sampled, own = before.grid(moved, WINDOW).ravel(), after.grid(moved, WINDOW).ravel()
     times = []
     for _ in range(20):
-        began = time.perf_counter()
+        start = time.perf_counter()
         network(frame.around(window, side, EDGE))
-        times.append(time.perf_counter() - began)
-    return Check(network, float(kept), min(times), float(sampled @ own / np.sqrt((sampled @ sampled) * (own @ own))))
+        times.append(time.perf_counter() - start)
+    return Check(
+        network, float(explained), min(times), float(sampled @ own / np.sqrt((sampled @ sampled) * (own @ own)))
+    )

@@ -33,29 +33,25 @@ from catstream.errors import CatstreamError
 if TYPE_CHECKING:
     from catstream.evaluation.accuracy import Row
     from catstream.evaluation.datasets import Sequence
-    from catstream.loadtest.load_test import Limit, Parameter, Result
+    from catstream.loadtest.load_test import Limit, Result
 
-_FAILED = 1  # exit code if a limit was not met or a stream failed
+_FAILED = 1  # exit status if a limit was exceeded or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 #: Limits of a search if none are given.
-_FIND: dict[str | None, tuple[str, ...]] = {
-    "rate": ("p99=0.1", "skipped=0.01"),
-    "streams": ("p99=0.1", "skipped=0"),
-    None: (),
-}
+_SEARCH_LIMITS = ("p99=0.1", "skipped=0")
 
 
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
-@click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated; see above.")
-@click.option("--starts", type=click.IntRange(min=1), help="Run from N frames of each sequence (TRE).")
-@click.option("--shifts", is_flag=True, help="Run from 12 shifted or scaled first boxes (SRE).")
-@click.option("--jitter", type=click.IntRange(min=1), help="Run from K first boxes that differ by at most 2 %.")
+@click.option("--tracker", "trackers", default="catstream", show_default=True, help="Comma-separated list of trackers.")
+@click.option("--starts", type=click.IntRange(min=1), help="Start from N frames of each sequence (TRE).")
+@click.option("--shifts", is_flag=True, help="Start from 12 shifted or scaled initial boxes (SRE).")
+@click.option("--jitter", type=click.IntRange(min=1), help="Start from K initial boxes that differ by at most 2 %.")
 @click.option("--keyframes", type=click.IntRange(min=1), help="Annotate with up to N boxes from the ground truth.")
-@click.option("--attributes", type=PATH, help="JSON file {sequence: [attribute]}.")
-@click.option("--peer-models", type=PATH, help="Folder of model files for nano and vit.")
-@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of processes.")
-@click.option("--output", type=PATH, help="Folder for results and report.html.")
+@click.option("--attributes", type=PATH, help="JSON file with attributes, {sequence: [attribute]}.")
+@click.option("--peer-models", type=PATH, help="Folder with the model files of nano and vit.")
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of worker processes.")
+@click.option("--output", type=PATH, help="Output folder for the results and report.html.")
 @with_json_file
 @with_settings
 def evaluate(
@@ -72,7 +68,7 @@ def evaluate(
     output: Path | None,
     json_file: Path | None,
 ) -> None:
-    """Measure trackers on annotated sequences.
+    """Measure the accuracy of trackers on annotated sequences.
 
     PATH is a sequence or a folder of sequences. A sequence is a folder with
     images or one video, and a text file with the box of the object in each
@@ -82,26 +78,26 @@ def evaluate(
 
     \b
     TRACKERS
-      catstream        this one, in one process
+      catstream        single-process tracker
       mil              OpenCV's, always available
       csrt, kcf, tld   OpenCV's, with pip install ".[peers]"
       nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER
 
     \b
-    MEASURES, over the frames with the object
-      AUC        area under the success plot: overlap with the ground truth, all thresholds
-      success    share of frames with an overlap above 0.5
-      precision  share of frames whose centre is at most 20 pixels off
-      norm.      normalised precision: the same, relative to the size of the object
-      F          F-score of VOT-LT, if the object is absent in some frames
-      absence noticed   frames without the object in which no box is reported
-      falsely absent    frames with the object in which no box is reported
+    METRICS, over the frames with the object
+      AUC              area under the success plot: IoU at all thresholds
+      success          share of frames with an IoU above 0.5
+      precision        share of frames with a centre error of at most 20 pixels
+      norm. precision  the same, normalised by the size of the object
+      F                F-score of VOT-LT, if the object is absent in some frames
+      absence noticed  frames without the object for which no box is reported
+      falsely absent   frames with the object for which no box is reported
 
-    --starts, --shifts and --jitter make several runs of each sequence; mean and
-    standard deviation are printed. With --output, results are stored in the
+    --starts, --shifts and --jitter run each sequence several times and print
+    means and standard deviations. With --output, results are stored in the
     layouts of the got10k and VOT toolkits, complete runs are not repeated, and
-    report.html shows plots. With --attributes, the report and --json also have
-    the means over the sequences that share an attribute.
+    report.html shows plots. With --attributes, the report and --json include
+    means by attribute.
 
     --keyframes N measures catstream annotate: after a first box, boxes are drawn
     from the ground truth in the frames that it asks for. Printed for 1, 2 ... N
@@ -126,14 +122,14 @@ def evaluate(
     if keyframes is not None and (trackers != "catstream" or output is not None or attributes is not None):
         raise click.UsageError("--keyframes and --tracker, --output or --attributes are mutually exclusive")
     if attributes is not None and output is None and json_file is None:
-        raise click.UsageError("--attributes adds rows to the report and to the JSON file: give --output or --json")
+        raise click.UsageError("--attributes requires --output or --json")
     names = [name.strip() for name in trackers.split(",") if name.strip()]
     errors: list[CatstreamError] = []
     sequences = datasets.find_sequences(*paths, failed=errors.append)
     if keyframes is not None:
         _evaluate_keyframes(sequences, keyframes, settings, jobs, json_file, errors)
         return
-    seen = {} if attributes is None else datasets.read_attributes(attributes)
+    by_sequence = {} if attributes is None else datasets.read_attributes(attributes)
 
     try:
         columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
@@ -157,18 +153,18 @@ def evaluate(
     for error in errors:
         complain(error)
     if not runs:
-        raise CatstreamError("all runs have failed: see above")
+        raise CatstreamError("all runs failed: see above")
     rows = accuracy.rows_of(runs)
     screen().print(_table(rows, accuracy.mean_of(rows)))
     for line in accuracy.describe_flips(rows):
         click.echo(line)
     if json_file is not None or output is not None:
-        write_json(json_file, accuracy.to_json(rows, settings, seen))
+        write_json(json_file, accuracy.to_json(rows, settings, by_sequence))
         if output is not None:
-            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, seen, errors)}")
+            click.echo(f"report: {accuracy.write_report(output / 'report.html', runs, settings, by_sequence, errors)}")
     if errors:
         raise CatstreamError(
-            f"{len(errors)} of {len(errors) + len(runs)} runs have failed and are not included in the figures"
+            f"{len(errors)} of {len(errors) + len(runs)} runs failed and are not included in the results"
         )
 
 
@@ -229,8 +225,8 @@ def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
 
 
 def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
-    if not found or min(size := (int(found[1]), int(found[2]))) < 64:
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if not match or min(size := (int(match[1]), int(match[2]))) < 64:
         raise click.BadParameter(f"a size is WIDTHxHEIGHT, 64x64 to 9999x9999, got {text!r}: for example 640x480")
     return size
 
@@ -241,11 +237,13 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
 )
-@click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="How many of them are slow or frozen.")
+@click.option(
+    "--slow-subscribers", type=click.IntRange(0), default=0, help="Number of slow or frozen subscribers among them."
+)
 @click.option(
     "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
 )
-@click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Seconds.")
+@click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Duration in seconds.")
 @click.option(
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
 )
@@ -256,23 +254,19 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
     show_default=True,
     help="MJPEG over HTTP, or H.264 over RTSP.",
 )
-@click.option("--find-limit", is_flag=True, help="Search for the highest rate that meets the limits.")
-@click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets them.")
-@click.option(
-    "--limit", "limits", multiple=True, metavar="NAME=VALUE", help="A limit to meet; may be repeated; see above."
-)
+@click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
+@click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
 @with_json_file
-@click.option("--output", type=FOLDER, help="Folder for report.html.")
+@click.option("--output", type=FOLDER, help="Output folder for report.html.")
 @with_settings
 def loadtest(
-    find_limit: bool,
     find_streams: bool,
     limits: tuple[str, ...],
     json_file: Path | None,
     output: Path | None,
     **plan: Any,
 ) -> None:
-    """Run pipelines under load, and measure latency and losses.
+    """Measure latency and dropped frames of pipelines under load.
 
     The load test sends a rendered video with ground truth on the loopback
     interface; a pipeline of its own tracks each stream. The camera does not
@@ -287,30 +281,25 @@ def loadtest(
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
       missed                    share of frames whose tracks fast subscribers missed, at most
-      success                   share of frames with an overlap above 0.5, at least
+      success                   share of frames with an IoU above 0.5, at least
 
-    With --find-limit, the search begins with RATE, each rate runs for DURATION,
-    and the limits are p99=0.1 and skipped=0.01 if none are given. With
-    --find-streams, it begins with STREAMS, and the limits are p99=0.1 and
-    skipped=0: how many cameras can this machine serve? The exit code is 1 if a
-    limit was not met or a stream failed.
+    With --find-streams, the load test searches for the number of cameras that
+    this machine can serve: it starts with STREAMS, each step takes DURATION, and
+    the default limits are p99=0.1 and skipped=0. The exit status is 1 if a limit
+    was exceeded or a stream failed.
 
     \b
     EXAMPLES
       catstream loadtest --rate 30 --limit p99=0.1
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
-      catstream loadtest --find-limit --size 320x240
       catstream loadtest --find-streams --rate 25 --size 1920x1080 --source h264
     """
     # Imported here so that --help and the other commands start faster.
     from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
     from catstream.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
 
-    if find_limit and find_streams:
-        raise click.UsageError("--find-limit and --find-streams each search for one number: give one of them")
-    find: Parameter | None = "rate" if find_limit else "streams" if find_streams else None
-    parsed = [Limit.parse(text) for text in limits or _FIND[find]]
+    parsed = [Limit.parse(text) for text in limits or (_SEARCH_LIMITS if find_streams else ())]
     parameters = Plan(**plan)
     if output is not None:
         with writing(output):
@@ -324,7 +313,7 @@ def loadtest(
             progress.update(task, description=activity, completed=share, figures=figures)
 
         def done(result: Result) -> None:
-            if find is not None:
+            if find_streams:
                 (cores, memory), verdict = result.cost, "; ".join(violations(parsed, result)) or "met"
                 click.echo(
                     f"{counted(result.plan.streams, 'stream')}, {result.plan.rate:g} frames/s due; in the worst stream "
@@ -332,20 +321,20 @@ def loadtest(
                     f"{cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
                 )
 
-        load_test = run_load_test(parameters, parsed, find=find, report=report, done=done)
-    for value, reason in load_test.refused.items():
-        click.echo(f"{value:g} streams did not start: {reason}")
+        load_test = run_load_test(parameters, parsed, find=find_streams, report=report, done=done)
+    for streams, reason in load_test.refused.items():
+        click.echo(f"{streams} streams did not start: {reason}")
     if load_test.results:
-        if find is not None:
+        if find_streams:
             click.echo(f"{answer(load_test)}.")
         _print_run(load_test.result, parsed)
         write_json(json_file, to_json(load_test))
         if output is not None:
             click.echo(f"report: {write_report(output / 'report.html', load_test)}")
     if load_test.interrupted:
-        stopped("these are the figures so far" if load_test.results else "there are no measurements yet")
+        stopped("these are the results so far" if load_test.results else "there are no measurements yet")
     for line in load_test.violations:
-        complain(f"broken: {line}")
+        complain(f"limit exceeded: {line}")
     if load_test.violations:
         sys.exit(_FAILED)
 
@@ -357,15 +346,14 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
         f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
         f"{milliseconds(result.camera_late)} ms late"
     )
-    for each in tables(result):
-        heads = list(each.rows[0])
-        made = table(*heads, right=heads[1:])
-        for row in each.rows:
-            made.add_row(*(row.get(head, "") for head in heads))
+    for part in tables(result):
+        made = table(*part.heads, right=part.heads[1:])
+        for row in part.cells:
+            made.add_row(*row)
         screen().print(made)
     if result.other_load > _QUIET_CORES:
         click.echo(
-            f"other processes kept {result.other_load:.1f} cores busy: run it on a quiet machine for reliable figures"
+            f"other processes kept {result.other_load:.1f} cores busy: repeat on an idle machine for reliable results"
         )
     for limit in limits:
         if limit.is_met(result):  # the others are an error

@@ -21,9 +21,9 @@ from catstream.jobs.saved_model import merge as merged
 if TYPE_CHECKING:
     from catstream.finding.files import File
     from catstream.finding.find import Search
-    from catstream.finding.found import FileResult, SearchLog
+    from catstream.finding.results import FileResult, SearchLog
 
-_SHOWN = 12  # intervals that are printed
+_PRINTED = 12  # intervals that are printed
 
 
 def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, float]:
@@ -37,11 +37,13 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=PATH)
 @click.option(
-    "--model", "models", type=PATH, multiple=True, required=True, metavar="FILE", help="A saved model; may be repeated."
+    "--model", "models", type=PATH, multiple=True, required=True, metavar="FILE", help="Saved model; repeatable."
 )
-@click.option("--output", type=PATH, default="found", show_default=True, help="Folder for the results.")
+@click.option("--output", type=PATH, default="detections", show_default=True, help="Output folder.")
 @with_overwrite
-@click.option("--threshold", type=NumberRange(0, 2), default=0.5, show_default=True, help="Least score of a sighting.")
+@click.option(
+    "--threshold", type=NumberRange(0, 2), default=0.5, show_default=True, help="Minimum score of a detection."
+)
 @click.option(
     "--every", type=NumberRange(0, 3600), default=0.2, show_default=True, help="Seconds of a video between two frames."
 )
@@ -67,37 +69,37 @@ def find(
 ) -> None:
     """Find the objects of saved models in videos, folders and images.
 
-    PATH is a video, an image, or a folder, which is searched with all its
-    subfolders. The images of one folder are treated as one sequence.
+    PATH is a video, an image, or a folder, which is searched recursively. The
+    images of a folder are treated as one sequence.
 
-    Of a video, one frame in 0.2 seconds is searched (--every; 0 for every
-    frame), for objects of 0.4 to 2.5 times the learned size (--sizes). A model
-    is a file that `catstream save` wrote. After Ctrl-C, the same command
-    continues with the file that was not finished; finished files are not
-    searched again, unless they have changed or --overwrite is given.
+    Videos are sampled every 0.2 s (--every; 0 searches every frame), and objects
+    are searched at 0.4 to 2.5 times the learned size (--sizes). After Ctrl-C, the
+    same command continues where it stopped; complete files are not searched
+    again, unless they have changed or --overwrite is passed. The exit status is 1
+    if a file could not be read.
 
     \b
-    Writes
-      OUTPUT/report.html     timelines, and pictures of the best sightings
-      OUTPUT/sightings.csv   a row for each sighting: file, object, frame, time, box, score
-      OUTPUT/intervals.csv   a row for each interval: file, object, begin, end
-      OUTPUT/found.json      both, by file
-      OUTPUT/search.ndjson   the log from which a search is continued
+    OUTPUT FILES
+      report.html      timelines, and pictures of the best detections
+      detections.csv   a row for each detection: file, object, frame, time, box, score
+      intervals.csv    a row for each interval: file, object, begin, end
+      results.json     both, by file
+      search.ndjson    log from which an interrupted search continues
 
-    The score is about 1 on the object. If another thing is taken for the object,
-    raise --threshold. If the object is missed, lower it, or track it longer.
+    The score is about 1 on the object. Raise --threshold if there are false
+    positives; lower it, or train on more frames, if the object is missed.
 
     \b
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --save-model anna.safetensors
-      catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output found
+      catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output detections
       catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.finding.files import find_files
         from catstream.finding.find import Search, load_models
-        from catstream.finding.found import SearchLog, write_report, write_tables
+        from catstream.finding.results import SearchLog, write_report, write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes, str(network or ""))
@@ -115,23 +117,24 @@ def find(
             report = write_report(output / "report.html", list(search.models), results)
     _print(results, report)
     if interrupted:
-        stopped("the results so far are kept; the same command continues")
+        stopped("the results so far are saved; the same command continues")
     problems = [problem for result in results for problem in result.problems]
     for problem in problems:
         complain(problem)
     if problems:
-        found = f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}"
-        raise CatstreamError(f"{found}: what could be read was searched")
+        raise CatstreamError(
+            f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}: all other content was searched"
+        )
 
 
 def _search(search: Search, files: list[File], log: SearchLog) -> None:
     """Search all files that are not complete, and show the progress."""
     columns = (
         text("file {task.fields[number]}/{task.total}"),
-        text("{task.fields[frame]}  {task.fields[sightings]} sightings  {task.description}", last=True),
+        text("{task.fields[frame]}  {task.fields[detections]} detections  {task.description}", last=True),
     )
     with line_of(messages(), *columns) as progress:
-        task = progress.add_task("", total=len(files), number=0, frame="", sightings=0)
+        task = progress.add_task("", total=len(files), number=0, frame="", detections=0)
         for number, file in enumerate(files, 1):
             result = log.begin(file)
             if result.complete:
@@ -141,8 +144,8 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
                     with INTERRUPTS.deferred():
                         result.add(step)
                     frame = f"frame {step.frame.number + 1}/{result.frames or '?'}"
-                    found = len(result.sightings)
-                    progress.update(task, description=file.path.name, number=number, frame=frame, sightings=found)
+                    count = len(result.detections)
+                    progress.update(task, description=file.path.name, number=number, frame=frame, detections=count)
             except VideoError as error:
                 result.problems.append(str(error))
             with INTERRUPTS.deferred():
@@ -150,20 +153,22 @@ def _search(search: Search, files: list[File], log: SearchLog) -> None:
 
 
 def _print(results: list[FileResult], report: Path) -> None:
-    from catstream.reports.page import clock
+    from catstream.reports.report import clock
 
-    intervals = sorted((each for result in results for each in result.intervals), key=lambda each: -each.best.score)
-    numbers = ("from", "to", "sightings", "score")
+    intervals = [interval for result in results for interval in result.intervals]
+    intervals.sort(key=lambda interval: -interval.best.score)
+    numbers = ("from", "to", "detections", "score")
     best = table("object", "file", *numbers, right=numbers)
-    for each in intervals[:_SHOWN]:
-        times = clock(each.first.time), clock(each.last.time)
-        best.add_row(each.first.object, each.first.file, *times, str(each.count), f"{each.best.score:.2f}")
+    for interval in intervals[:_PRINTED]:
+        first, last = interval.first, interval.last
+        times = clock(first.time), clock(last.time)
+        best.add_row(first.object, first.file, *times, str(interval.count), f"{interval.best.score:.2f}")
     if intervals:
         screen().print(best)
-    if len(intervals) > _SHOWN:
-        click.echo(f"and {len(intervals) - _SHOWN} more intervals")
+    if len(intervals) > _PRINTED:
+        click.echo(f"and {len(intervals) - _PRINTED} more intervals")
     if not intervals:
-        click.echo("nothing was found")
+        click.echo("no detections")
     click.echo(f"report: {report}")
 
 

@@ -1,4 +1,4 @@
-"""`catstream network`: make the file of a network whose features are used beside HOG and colours, and measure it."""
+"""`catstream network`: prepare and check a network whose features are added to HOG and colours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _Levels = tuple[float, float, float]
 
 @click.group(cls=CommandGroup)
 def network() -> None:
-    """Use the features of a small network beside HOG and colours.
+    """Add the features of a small neural network to HOG and colours.
 
     \b
     EXAMPLES
@@ -28,22 +28,22 @@ def network() -> None:
 
 @network.command()
 @click.argument("backbone", type=PATH, metavar="BACKBONE.onnx")
-@click.option("--layer", required=True, metavar="NAME", help="Layer with a vector for each 16 x 16 pixels.")
-@click.option("--images", required=True, type=PATH, metavar="FOLDER", help="Photographs, a hundred or more.")
-@click.option("-o", "--output", required=True, type=PATH, metavar="FILE.onnx", help="File to write.")
-@click.option("--rgb", is_flag=True, help="The backbone takes red, green, blue; not blue, green, red.")
-@click.option("--mean", nargs=3, type=float, default=(0, 0, 0), help="Subtracted from its channels, of 0 to 255.")
-@click.option("--std", nargs=3, type=float, default=(1, 1, 1), help="By what the rest is divided.")
+@click.option("--layer", required=True, metavar="NAME", help="Layer with stride 16 whose output is used.")
+@click.option("--images", required=True, type=PATH, metavar="FOLDER", help="Folder of photographs for the PCA.")
+@click.option("-o", "--output", required=True, type=PATH, metavar="FILE.onnx", help="Output file.")
+@click.option("--rgb", is_flag=True, help="The backbone expects RGB input (default: BGR).")
+@click.option("--mean", nargs=3, type=float, default=(0, 0, 0), help="Per-channel mean (0-255 scale).")
+@click.option("--std", nargs=3, type=float, default=(1, 1, 1), help="Per-channel standard deviation (0-255 scale).")
 @with_overwrite
 def prepare(
     backbone: Path, layer: str, images: Path, output: Path, rgb: bool, mean: _Levels, std: _Levels, overwrite: bool
 ) -> None:
-    """Make the file for the setting features.network from a backbone.
+    """Prepare a backbone for the setting features.network.
 
-    The backbone is an ONNX file whose input is an image. It is cut at the layer,
-    takes images of any size, and normalises them itself. Its vectors are reduced
-    to at most 32 principal components, those of the photographs in FOLDER and its
-    subfolders, which should show what will be tracked.
+    The backbone is an ONNX file with an image as its input. It is truncated at
+    the layer; the input size becomes dynamic, and the normalisation a part of the
+    graph. The vectors are reduced to at most 32 principal components of the
+    photographs in FOLDER, which should resemble the videos to track.
 
     \b
     EXAMPLES
@@ -63,11 +63,12 @@ def prepare(
 @network.command()
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path), metavar="FILE.onnx")
 def check(file: Path) -> None:
-    """Measure a file for the setting features.network.
+    """Check a file for the setting features.network.
 
-    Prints its cost, the variance of the backbone that is kept, and the
-    correlation of its vectors with those sampled from a run beside them. Near 1,
-    all windows of a frame can be sampled from one run, as tracking does.
+    Prints the time of one inference, the explained variance of the PCA, and the
+    translation equivariance: the correlation of the vectors of a shifted image
+    with those interpolated from the original one. Near 1, all windows of a frame
+    can be interpolated from one inference, as tracking does.
     """
     _print(file)
 
@@ -76,9 +77,9 @@ def _print(file: Path) -> None:
     with INTERRUPTS.leaving():
         from catstream import backbone as backbones
 
-    found = backbones.check(file)
-    click.echo(f"{file}: {found.network.channels} channels, digest {found.network.digest}")
-    if found.kept:
-        click.echo(f"kept variance {found.kept:.0%}")
-    click.echo(f"{found.seconds * 1e3:.1f} ms for the surroundings of an object, twice a frame")
-    click.echo(f"correlation {found.agreement:.2f} with vectors that are sampled from a run 8 pixels beside")
+    measured = backbones.check(file)
+    click.echo(f"{file}: {measured.network.channels} channels, digest {measured.network.digest}")
+    if measured.explained:
+        click.echo(f"explained variance {measured.explained:.0%}")
+    click.echo(f"{measured.seconds * 1e3:.1f} ms for each inference, at most two a frame")
+    click.echo(f"equivariance {measured.equivariance:.2f} (correlation after a shift of 8 pixels)")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from statistics import fmean, pstdev
 
@@ -16,8 +15,8 @@ from catstream.base.settings import Settings
 from catstream.errors import CatstreamError
 from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.scores import OVERLAPS, PIXELS, precision_plot, success_plot
-from catstream.reports.page import SHARES, Axis, plot, table, write_page
 from catstream.reports.provenance import provenance
+from catstream.reports.report import Plot, write_page
 
 #: The measures of a row that are averaged, with their headings.
 MEASURES = {
@@ -35,7 +34,7 @@ COUNTS = ("absent", "noticed", "present", "false")
 #: The headings of `cells`.
 HEADINGS = (*list(MEASURES.values())[:-1], "absence noticed", "falsely absent", MEASURES["fps"])
 
-#: Difference of the smallest and the largest success over several first boxes, above which a sequence flips.
+#: Difference of the smallest and the largest success over several initial boxes, above which a sequence flips.
 FLIP = 0.25
 
 
@@ -47,8 +46,8 @@ class Row:
     from 0 to 1. `lost` is the share of the runs that have lost the object in the end. `f_score` and its two components
     are None if the object is never absent. `noticed` of the `absent` frames without the object, and `false` of the
     `present` ones with it, have no reported box: these are counts over all runs. The spreads are standard deviations
-    over the runs. `flips` is None unless the runs have different first boxes; it is true if their smallest and largest
-    success differ by more than 0.25: then chance decides.
+    over the runs. `flips` is None unless the runs have different initial boxes; it is true if their smallest and
+    largest success differ by more than 0.25: then chance decides.
     """
 
     name: str
@@ -126,7 +125,7 @@ def by_attribute(rows: Iterable[Row], attributes: Mapping[str, Iterable[str]]) -
 
 
 def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
-    """Return the names of the sequences that flip, by tracker; only trackers whose runs have different first boxes."""
+    """Return the names of the sequences that flip, by tracker, if its runs have different initial boxes."""
     found: dict[str, list[str]] = {}
     for row in rows:
         if row.flips is not None:
@@ -139,7 +138,7 @@ def describe_flips(rows: Iterable[Row]) -> list[str]:
     rows = list(rows)
     count = len({row.name for row in rows})
     return [
-        f"{tracker}: {len(names)} of {count} sequences flip with the first box (success differs by more than {FLIP})"
+        f"{tracker}: {len(names)} of {count} sequences flip with the initial box (success differs by more than {FLIP})"
         + (f": {', '.join(names)}" if names else "")
         for tracker, names in flips_of(rows).items()
     ]
@@ -203,64 +202,52 @@ def write_report(
     errors : those of runs that are not included
     """
     rows = rows_of(runs)
-    sequences, frames = len({row.name for row in rows}), sum({row.name: row.frames for row in rows}.values())
-    body = [
-        "<h1>Accuracy</h1>",
-        f'<p class="about">{sequences} sequences, {frames:,} frames, {len(runs)} runs, one pass each. Frames without '
-        "the object count only for F and absence noticed. Absence noticed and falsely absent: frames without and with "
-        "the object for which no box is reported. ± is the standard deviation over the runs of a sequence.</p>",
-        *(f'<p class="about">Not included: {escape(str(error))}</p>' for error in errors),
-        *(f'<p class="about">{escape(line)}</p>' for line in describe_flips(rows)),
-        _plots(runs, {tracker: mean["auc"] or 0.0 for tracker, mean in mean_of(rows).items()}),
-        "<h2>Sequences</h2>",
-        _table(rows),
-        *(["<h2>Attributes</h2>", _attribute_table(rows, attributes)] if attributes else []),
-        "<h2>Settings that are not the default</h2>",
-        f"<pre>{escape(chr(10).join(settings.changed())) or 'none'}</pre>",
-    ]
-    return write_page(path, "evaluation", body)
-
-
-def _plots(runs: list[EvaluationRun], aucs: Mapping[str, float]) -> str:
-    """Plot success and precision of each tracker, averaged over the sequences; each has one colour in both."""
-    trackers = sorted(dict.fromkeys(run.tracker for run in runs), key=lambda tracker: -aucs[tracker])
-
-    def curves(
-        places: np.ndarray, measure: Callable[..., Float64], at: Callable[[Float64], float]
-    ) -> dict[str, tuple[np.ndarray, Float64]]:
-        by_tracker: dict[str, dict[str, list[Float64]]] = {}
-        for run in runs:  # as in the table, the mean is taken first over the starts of a sequence
-            by_tracker.setdefault(run.tracker, {}).setdefault(run.sequence.name, []).append(
-                measure(run.boxes, run.truth)
-            )
-        means = {
-            tracker: np.mean([np.mean(plots, axis=0) for plots in sequences.values()], axis=0)
-            for tracker, sequences in by_tracker.items()
-        }
-        return {f"{tracker}  {at(means[tracker]):.3f}": (places, means[tracker]) for tracker in trackers}
-
-    overlap, distance = (
-        dataclasses.replace(SHARES, label="overlap threshold"),
-        Axis.upto(PIXELS[-1], "distance in pixels"),
-    )
-    success = curves(OVERLAPS, success_plot, lambda curve: float(curve.mean()))
-    precision = curves(PIXELS, precision_plot, lambda curve: float(curve[20]))
-    left = plot("Success (AUC)", overlap, SHARES, success)
-    right = plot("Precision (at 20 pixels)", distance, SHARES, precision)
-    return f'<div class="plots">{left}{right}</div>'
-
-
-def _table(rows: list[Row]) -> str:
-    lines = [[escape(row.name), row.tracker, row.frames, *cells(row)] for row in rows]
     means = mean_of(rows)
-    lines += [["mean", tracker, "", *cells(mean)] for tracker, mean in means.items()]
-    return table(("sequence", "tracker", "frames", *HEADINGS), lines, texts=2, means=len(means))
+    frames = {row.name: row.frames for row in rows}
+    return write_page(
+        path,
+        "evaluation.html",
+        sequences=len(frames),
+        frames=sum(frames.values()),
+        runs=len(runs),
+        errors=errors,
+        flips=describe_flips(rows),
+        plots=_plots(runs, sorted(means, key=lambda tracker: -(means[tracker]["auc"] or 0.0))),
+        headings=[*HEADINGS],
+        rows=[[row.name, row.tracker, row.frames, *cells(row)] for row in rows]
+        + [["mean", tracker, "", *cells(mean)] for tracker, mean in means.items()],
+        means=len(means),
+        attributes=[
+            [attribute, tracker, len({row.name for row in group}), *cells(mean)]
+            for attribute, group in by_attribute(rows, attributes).items()
+            for tracker, mean in mean_of(group).items()
+        ],
+        settings=settings,
+    )
 
 
-def _attribute_table(rows: list[Row], attributes: Mapping[str, Iterable[str]]) -> str:
-    lines = [
-        [escape(attribute), tracker, len({row.name for row in group}), *cells(mean)]
-        for attribute, group in by_attribute(rows, attributes).items()
-        for tracker, mean in mean_of(group).items()
-    ]
-    return table(("attribute", "tracker", "sequences", *HEADINGS), lines, texts=2, means=0)
+def _plots(runs: list[EvaluationRun], trackers: list[str]) -> Iterator[Plot]:
+    """Plot success and precision of each tracker, averaged over the starts of a sequence, then over the sequences."""
+
+    def curve(tracker: str, measure: Callable[..., Float64]) -> Float64:
+        by_sequence: dict[str, list[Float64]] = {}
+        for run in runs:
+            if run.tracker == tracker:
+                by_sequence.setdefault(run.sequence.name, []).append(measure(run.boxes, run.truth))
+        mean: Float64 = np.mean([np.mean(curves, axis=0) for curves in by_sequence.values()], axis=0)
+        return mean
+
+    success = {tracker: curve(tracker, success_plot) for tracker in trackers}
+    precision = {tracker: curve(tracker, precision_plot) for tracker in trackers}
+    yield Plot.of(
+        "Success (AUC)",
+        "overlap threshold",
+        OVERLAPS,
+        {f"{tracker} {shares.mean():.3f}": shares for tracker, shares in success.items()},
+    )
+    yield Plot.of(
+        "Precision (at 20 pixels)",
+        "distance in pixels",
+        PIXELS,
+        {f"{tracker} {shares[20]:.3f}": shares for tracker, shares in precision.items()},
+    )

@@ -20,8 +20,8 @@ A run starts from one of these:
 
     one_pass  one-pass evaluation (OPE): the first box of the ground truth
     temporal  temporal robustness (TRE): several frames
-    spatial   spatial robustness (SRE) of the CVPR2013 benchmark: 12 first boxes, shifted or scaled
-    jittered  several first boxes that differ by at most 2 %: dependence of a result on chance
+    spatial   spatial robustness (SRE) of the CVPR2013 benchmark: 12 initial boxes, shifted or scaled
+    jittered  several initial boxes that differ by at most 2 %: dependence of a result on chance
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
     boxes[_absent(folder, len(boxes))] = np.nan
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
     present = np.isfinite(boxes).all(axis=1).sum()
-    if present < 2:  # a run starts with the first box
+    if present < 2:  # a run starts with the initial box
         raise VideoError(
             f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
             "frame, and the object in at least two frames"
@@ -303,7 +303,7 @@ def _readings(line: str) -> list[list[float]]:
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """A change of the first box: shifts of its centre in widths and heights, and factors of its sides.
+    """A change of the initial box: shifts of its centre in widths and heights, and factors of its sides.
 
     name  part of the name of the run; empty for the box of the ground truth, which is not changed
 
@@ -337,7 +337,7 @@ class Start:
         return "@" + "-".join(parts) if parts else ""
 
     def box(self, sequence: Sequence, size: tuple[int, int] | None = None) -> Box:
-        """Return the first box.
+        """Return the initial box.
 
         size : width and height of the frame; a changed box that tracking cannot start with there is moved until its
             centre is in the frame, and gets sides from 2 pixels to twice those of the frame; None: the box is not moved
@@ -356,7 +356,7 @@ Starts = Callable[[Sequence], list[Start]]
 _DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, -1), "down": (0, 1)}
 _CORNERS = {"left-up": (-1, -1), "right-up": (1, -1), "left-down": (-1, 1), "right-down": (1, 1)}
 
-#: The 12 first boxes of the CVPR2013 benchmark: shifts by 10 % of the box, and four sizes.
+#: The 12 initial boxes of the CVPR2013 benchmark: shifts by 10 % of the box, and four sizes.
 SHIFTS = (
     *(Variation(name, 0.1 * x, 0.1 * y) for name, (x, y) in (_DIRECTIONS | _CORNERS).items()),
     *(Variation(f"size-{factor}", wider=factor, higher=factor) for factor in (0.8, 0.9, 1.1, 1.2)),
@@ -395,7 +395,7 @@ def temporal(count: int) -> Starts:
 
 
 def spatial(sequence: Sequence) -> list[Start]:
-    """Return the first frame with the object, with each of the first boxes in `SHIFTS`."""
+    """Return the first frame with the object, with each of the initial boxes in `SHIFTS`."""
     return [Start(_present(sequence)[0], variation) for variation in SHIFTS]
 
 

@@ -9,7 +9,7 @@ The files have the layouts of the benchmarks' toolkits:
     catstream/settings.json                            settings and versions of the runs
 
 A run is stored as a sequence of its own: NAME if it starts with the first box of the ground truth, otherwise
-NAME@FRAME (a later frame), NAME@VARIATION (a changed first box, for example walk@left) or NAME@FRAME-VARIATION.
+NAME@FRAME (a later frame), NAME@VARIATION (a changed initial box, for example walk@left) or NAME@FRAME-VARIATION.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class EvaluationRun:
 
     tracker     name of the tracker
     sequence    the whole sequence
-    start       frame and variation of the first box
+    start       frame and variation of the initial box
     boxes       float64 (frames, 4) from this frame on, the first as given; NaN if the tracker reported no box
     confidence  float64 (frames,)
     seconds     float64 (frames,), time of the tracker alone, without reading the frame
@@ -133,7 +133,7 @@ def load(output: Path, tracker: str, sequence: Sequence, start: Start) -> Evalua
 
 
 def _has_first_box(run: EvaluationRun) -> bool:
-    """Return whether a stored run has the first box of its start. Only if it may have been moved is a frame read."""
+    """Return whether a stored run has the initial box of its start. Only if it may have been moved is a frame read."""
     if np.array_equal(run.boxes[0], np.round(run.start.box(run.sequence), 4)):
         return True
     if run.start.variation.name:

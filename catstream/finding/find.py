@@ -24,7 +24,8 @@ from catstream.base.box import Box, Window
 from catstream.base.settings import RunSettings, Settings
 from catstream.base.threads import one_thread
 from catstream.detection.context import FrameContext
-from catstream.detection.search import SAME_OVERLAP, Detection, fit_extent
+from catstream.detection.search import SAME_OVERLAP, fit_extent
+from catstream.detection.search import Detection as Candidate
 from catstream.detection.similarity import Similarity
 from catstream.errors import SettingsError, VideoError
 from catstream.features.cells import Cells
@@ -41,7 +42,7 @@ _One = TypeVar("_One", bound=str | os.PathLike[str] | SavedModel)
 
 #: Seconds of a video between two frames that are searched.
 EVERY = 0.2
-#: The least score of a sighting.
+#: The minimum score of a detection.
 THRESHOLD = 0.5
 #: The smallest and the largest size that is searched, as multiples of the learned size.
 SIZES = (0.4, 2.5)
@@ -51,15 +52,15 @@ _ASPECT_STEP = 1.25  # ratio of successive aspect ratios
 _MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for a tiny object in a large frame
 _WIDEST = 1.25  # of a window, as a multiple of the frame: its object fills the frame
 _SMALLEST = 24  # side of a window in pixels: a smaller one shows too little of its object
-_MOST_MAXIMA = 8  # windows of one size that are examined, and sightings of one object in a frame
+_MOST_MAXIMA = 8  # windows of one size that are examined, and detections of one object in a frame
 _FITTED = 0.7  # share of the threshold from which a window is fitted: its score rises by less
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """An object that was found in a frame.
+class Detection:
+    """An object that was detected in a frame.
 
     Attributes
     ----------
@@ -118,7 +119,7 @@ class Scan:
     The score of a window is its similarity to the object (see `catstream.detection.similarity`) times the score of the
     appearance model, of which at most 1 counts: about 1 on the object, and near 0 on an unknown background.
 
-    threshold : least score of a sighting
+    threshold : minimum score of a detection
     sizes : smallest and largest size, as multiples of the learned size
     descriptor : that the models were learned with, if there is one
     """
@@ -187,7 +188,7 @@ def _fitted(frame: Pyramid, window: Window, searched: _Template) -> Seen:
     size = math.sqrt(window.area / searched.window.area)
     likely = searched.window.scaled(size).centred(*window.centre)
     context = FrameContext(frame, searched.model, searched.settings)
-    found = fit_extent(context, Detection(0.0, window), likely)
+    found = fit_extent(context, Candidate(0.0, window), likely)
     return searched.seen(ScoreMap.around(frame, found.window, WINDOW, searched.model), 0, 0, found.window)
 
 
@@ -226,7 +227,7 @@ class Step:
     """A frame that was searched, and the objects that were found in it."""
 
     frame: Frame
-    sightings: list[Sighting]
+    detections: list[Detection]
 
 
 @dataclass(slots=True)
@@ -235,7 +236,7 @@ class Search:
 
     models      name of each object -> its model
     settings    for reading files: the frame rate of images, and whether damage is skipped
-    threshold   least score of a sighting
+    threshold   minimum score of a detection
     every       seconds of a video between two frames that are searched, 0 for every frame
     sizes       smallest and largest size that is searched, as multiples of the learned size
     network     file of the network that the models were learned with, empty for none
@@ -276,12 +277,12 @@ class Search:
         with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
             for (frame, image), found in scanned:
                 place = str(file.path), frame.number, frame.time
-                sightings = [
-                    Sighting(name, *place, each.box, each.score, image)
+                detections = [
+                    Detection(name, *place, each.box, each.score, image)
                     for name, seen in zip(self.models, found, strict=True)
                     for each in seen
                 ]
-                yield Step(frame, sightings)
+                yield Step(frame, detections)
 
 
 def find(
@@ -293,7 +294,7 @@ def find(
     sizes: tuple[float, float] = SIZES,
     skip_damaged: bool = False,
     network: str | os.PathLike[str] = "",
-) -> Iterator[Sighting]:
+) -> Iterator[Detection]:
     """Find the objects of saved models in videos, folders and images.
 
     Parameters
@@ -303,7 +304,7 @@ def find(
     paths : path, or iterable of paths
         Videos, images, and folders, which are searched with all their subfolders.
     threshold : float
-        Least score of a sighting; the score is about 1 on the object.
+        Minimum score of a detection; the score is about 1 on the object.
     every : float
         Seconds of a video between two frames that are searched, 0 for every frame.
     sizes : two floats
@@ -315,7 +316,7 @@ def find(
 
     Yields
     ------
-    Sighting
+    Detection
         Files in the order of `paths`, frames in order, objects in the order of `models`, highest score first.
 
     Raises
@@ -330,12 +331,12 @@ def find(
 
     Examples
     --------
-    >>> for sighting in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
-    ...     print(sighting.file, sighting.time, sighting.box, sighting.score)
+    >>> for detection in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
+    ...     print(detection.file, detection.time, detection.box, detection.score)
     """
     reading = RunSettings(skip_damaged=skip_damaged)
     search = Search(load_models(_several(models)), reading, threshold, every, sizes, os.fspath(network))
-    return _sightings(search, find_files(_several(paths)))
+    return _detections(search, find_files(_several(paths)))
 
 
 def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[str, SavedModel]:
@@ -359,13 +360,13 @@ def _digest(learned: SavedModel) -> str:
     return digest.hexdigest()[:16]
 
 
-def _sightings(search: Search, files: list[File]) -> Iterator[Sighting]:
+def _detections(search: Search, files: list[File]) -> Iterator[Detection]:
     problems: list[VideoError] = []
     for file in files:
         reading = Reading()
         try:
             for step in search.file(file, reading):
-                yield from step.sightings
+                yield from step.detections
         except VideoError as error:
             problems.append(error)
         if file.kind != "video":  # of a video, the caller asked to skip them

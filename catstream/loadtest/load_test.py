@@ -1,4 +1,4 @@
-"""A load test: its plan, its limits, a single run, and the search for the highest rate or number of streams."""
+"""A load test: its plan, its limits, a single run, and the search for the highest number of streams."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from os import getpid
 from statistics import fmean
 from time import monotonic
-from typing import Literal
 
 import numpy as np
 
@@ -34,12 +33,7 @@ from catstream.loadtest.load import Stream, Subscribers, Video, render
 from catstream.loadtest.rtsp import encode
 from catstream.video import rendered
 
-#: Parameters that a search may find, by their names in `Plan`.
-Parameter = Literal["rate", "streams"]
-
 MOST_STREAMS = 64  # of a load test
-_LEAST, _MOST = 0.5, 1000.0  # frames per second
-_PRECISION = 0.05  # maximum relative error of the highest rate
 _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
@@ -390,37 +384,34 @@ class LoadTest:
     """The runs of a load test.
 
     limits       the limits of each run
-    find         the parameter whose highest value is searched for; None if there is no search
+    find         whether the highest number of streams is searched for
     results      all runs, in order; empty if it was interrupted before the first measurement
-    highest      the highest value that meets the limits; None if there was no search, or no such value
+    highest      the highest number of streams that meets the limits; None without a search, or if there is none
     refused      reasons why so many streams did not start, by their number
     interrupted  whether it was interrupted
     """
 
     limits: list[Limit]
-    find: Parameter | None = None
+    find: bool = False
     results: list[Result] = field(default_factory=list)
-    highest: float | None = None
-    refused: dict[float, str] = field(default_factory=dict)
+    highest: int | None = None
+    refused: dict[int, str] = field(default_factory=dict)
     interrupted: bool = False
-
-    def value(self, result: Result) -> float:
-        return float(getattr(result.plan, self.find or "rate"))
 
     @property
     def result(self) -> Result:
-        """The decisive run: the one with the highest value that meets the limits, or the last one if none does."""
+        """The decisive run: the one with the most streams that meets the limits, or the last one if none does."""
         held = [result for result in self.results if not violations(self.limits, result)]
-        return max(held, key=self.value, default=self.results[-1])
+        return max(held, key=lambda result: result.plan.streams, default=self.results[-1])
 
     @property
     def violations(self) -> list[str]:
         """The reasons why the load test has failed, one line each."""
-        if self.find is None:
+        if not self.find:
             return [line for result in self.results for line in violations(self.limits, result)]
         if self.highest is None and not self.interrupted:
-            what, limits = "rate" if self.find == "rate" else "number of streams", ", ".join(map(str, self.limits))
-            return [f"no {what} meets {limits}: the lowest tried was {self.value(self.results[-1]):g}"]
+            lowest = self.results[-1].plan.streams
+            return [f"no number of streams meets {', '.join(map(str, self.limits))}: the lowest tried was {lowest}"]
         return []
 
 
@@ -428,30 +419,29 @@ def run_load_test(
     plan: Plan,
     limits: list[Limit],
     *,
-    find: Parameter | None = None,
+    find: bool = False,
     report: Report = lambda *_: None,
     done: Callable[[Result], None] = lambda _: None,
 ) -> LoadTest:
     """Run a load test. After Ctrl-C, the measurements so far are returned.
 
-    find : search for the highest value of this parameter that meets the limits, beginning with that of the plan
+    find : search for the highest number of streams that meets the limits, beginning with that of the plan
     report, done : functions that are called with the progress, and after each run
     """
     load_test = LoadTest(limits, find)
-    images = rendered.FRAMES if find == "rate" else min(plan.frames, rendered.FRAMES)
+    images = min(plan.frames, rendered.FRAMES)
 
     def report_frames(activity: str, count: int, total: int) -> None:
         report(activity, count / total, f"{count} of {total} frames")
 
-    def holds(value: float) -> bool:
-        tried = replace(plan, rate=value) if find != "streams" else replace(plan, streams=int(value))
+    def holds(streams: int) -> bool:
         try:
-            with Camera(files, plan.size, tried.streams, plan.source) as camera:
-                result = run(tried, video, camera, report)
+            with Camera(files, plan.size, streams, plan.source) as camera:
+                result = run(replace(plan, streams=streams), video, camera, report)
         except ServiceError as error:
-            if find != "streams" or not load_test.results:
+            if not find or not load_test.results:
                 raise
-            load_test.refused[value] = str(error)
+            load_test.refused[streams] = str(error)
             return False
         load_test.results.append(result)
         done(result)
@@ -464,50 +454,30 @@ def run_load_test(
         files = video.files
         if plan.source == "h264":
             files = encode(files, plan.size, lambda count: report_frames("encoding", count, 2 * images))
-        if find == "rate":
-            load_test.highest = find_highest(plan.rate, holds)
-        elif find == "streams":
-            load_test.highest = find_highest(plan.streams, holds, least=1, most=MOST_STREAMS, digits=0, precision=0)
+        if find:
+            load_test.highest = find_highest(plan.streams, holds, MOST_STREAMS)
         else:
-            holds(plan.rate)
+            holds(plan.streams)
     except KeyboardInterrupt:
         load_test.interrupted = True
     return load_test
 
 
-def find_highest(
-    start: float,
-    holds: Callable[[float], bool],
-    *,
-    least: float = _LEAST,
-    most: float = _MOST,
-    digits: int = 1,
-    precision: float = _PRECISION,
-) -> float | None:
-    """Return the highest value for which `holds` is true, to within 5 %; None if it is false even for the lowest one.
+def find_highest(start: int, holds: Callable[[int], bool], most: int) -> int | None:
+    """Return the highest number from 1 to `most` for which `holds` is true; None if it is false even for 1.
 
-    The value is doubled or halved from `start` until the limit is between two values, and then bisected. `holds` is
-    called once for each value, so random variation of its result affects the answer.
+    The number is doubled or halved from `start` until the limit is between two numbers, and then bisected. `holds` is
+    called once for each number, so random variation of its result affects the answer.
 
-    least, most : range of values
-    digits : number of decimals of a value
-    precision : maximum relative error; it is not less than the last decimal
-
-    >>> find_highest(25.0, lambda rate: rate <= 42)
-    40.6
-    >>> find_highest(1, lambda streams: streams <= 42, least=1, most=64, digits=0, precision=0)
-    42.0
+    >>> find_highest(1, lambda streams: streams <= 42, most=64)
+    42
     """
-    low, high, value = 0.0, float("inf"), min(max(start, least), most)
-    while value not in (low, high) and high - low > precision * low:
-        if holds(value):
-            low = value
+    low, high, number = 0, most + 1, min(start, most)
+    doubling = True
+    while high - low > 1:
+        if holds(number):
+            low = number
         else:
-            high = value
-        if low == 0.0:
-            value = max(round(high / 2, digits), least)
-        elif high == float("inf"):
-            value = min(round(2 * low, digits), most)
-        else:
-            value = round((low + high) / 2, digits)
+            high, doubling = number, False
+        number = min(2 * low, most) if doubling else (low + high) // 2
     return low or None

@@ -14,7 +14,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     limits = ["--limit", "max=0", "--limit", "missed=1"]
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
     assert code == 1
-    broken = r"catstream: broken: max is .*, limit at most 0 ms \(from a frame to its track\)"
+    broken = r"catstream: limit exceeded: max is .*, limit at most 0 ms \(from a frame to its track\)"
     assert re.fullmatch(broken, errors.splitlines()[-1])
     assert re.search(r"^0 +\d+\.\d +\d+\.\d %", output, re.MULTILINE)
     assert "met: missed" in output
@@ -33,7 +33,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert figures["processes"]["detector 0"]["cores"] > 0
 
     page = (tmp_path / "load" / "report.html").read_text()
-    assert page.count("<svg") == 3
+    assert "<h2>Streams</h2>" in page
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
 
 
@@ -56,7 +56,7 @@ def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(s
         assert 0 < stream["cores"] < psutil.cpu_count()
         assert 10e6 < stream["memory"] < 2e9
     page = (tmp_path / "load" / "report.html").read_text()
-    places = [page.index(part) for part in ("This machine serves", "p99 of the worst stream", "<h2>Streams</h2>")]
+    places = [page.index(part) for part in ("This machine serves", "Steps of the search", "<h2>Streams</h2>")]
     assert places == sorted(places)
 
 
@@ -67,7 +67,6 @@ def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(s
         (["--size", "20x20"], "for example 640x480"),
         (["--subscribers", 1, "--slow-subscribers", 2], "2 of 1 subscribers cannot be slow"),
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
-        (["--find-limit", "--find-streams"], "give one of them"),
         (["--rate", 0], "0.5<=x<=1000"),
         (["--json", "missing/x.json"], "give a file in a folder that exists"),
         (["--output", "/dev/null/load"], "give another place"),

@@ -16,7 +16,7 @@ def test_a_prepared_backbone_is_measured_and_tracks(said, walk, tmp_path):
     assert said(*words, "-o", tmp_path / "net.onnx")[2].count("exists already") == 1
     code, measured, _ = said("network", "check", tmp_path / "net.onnx")
     assert (code, measured.splitlines()[1]) == (0, output.splitlines()[1])
-    assert "kept variance" in measured
+    assert "explained variance" in measured
     shutil.copytree(walk, tmp_path / "set" / "walk")
     network = f"features.network={tmp_path / 'net.onnx'}"
     code, output, errors = said("evaluate", tmp_path / "set", "--set", network, "--output", tmp_path / "results")
@@ -28,7 +28,7 @@ def test_a_prepared_backbone_is_measured_and_tracks(said, walk, tmp_path):
     [
         ("sixteen", "walk", "has no layer 'sixteen': the nearest names are sixteenth"),
         ("quarter", "walk", r"is (1, 6, 56, 56) for an image of 224 x 224, expected (1, any, 14, 14)"),
-        ("sixteenth", "none", "hold no images"),
+        ("sixteenth", "none", "contain no images"),
     ],
 )
 def test_a_layer_or_a_folder_that_does_not_do_is_one_line_of_error(said, walk, tmp_path, layer, images, what):

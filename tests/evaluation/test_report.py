@@ -64,15 +64,15 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
 def test_the_command_shows_the_spread_over_several_runs_and_counts_the_sequences_that_flip(tmp_path, walk, succeed):
     output, errors = succeed("evaluate", walk, "--jitter", 2, "--tracker", "mil", "--output", tmp_path)
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", output)
-    (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the first box", output + errors)  # MIL is random
+    (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the initial box", output + errors)  # MIL is random
     assert sentence in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--shifts", "--jitter", "2"), "--starts, --shifts and --jitter each choose the runs of a sequence: give one"),
-        (("--attributes", "attributes.json"), "give --output or --json"),
+        (("--shifts", "--jitter", "2"), "--starts, --shifts and --jitter are mutually exclusive"),
+        (("--attributes", "attributes.json"), "--attributes requires --output or --json"),
     ],
 )
 def test_options_that_contradict_one_another_are_an_error(walk, fail, options, message):

@@ -10,7 +10,7 @@ import signal
 import pytest
 
 import catstream
-from catstream.finding.found import FileResult
+from catstream.finding.results import FileResult
 
 
 @pytest.fixture
@@ -34,11 +34,11 @@ def test_the_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
     code, output = run(video)
     assert code == 0, output
     folder = tmp_path / "found"
-    sightings, intervals = rows(folder, "sightings.csv"), rows(folder, "intervals.csv")
-    (file,) = json.loads((folder / "found.json").read_text())["files"]
-    assert (len(file["sightings"]), len(file["intervals"])) == (len(sightings), len(intervals))
-    assert sum(int(interval["sightings"]) for interval in intervals) == len(sightings)
-    assert {sighting["object"] for sighting in sightings} >= {"dahlia"}
+    detections, intervals = rows(folder, "detections.csv"), rows(folder, "intervals.csv")
+    (file,) = json.loads((folder / "results.json").read_text())["files"]
+    assert (len(file["detections"]), len(file["intervals"])) == (len(detections), len(intervals))
+    assert sum(int(interval["detections"]) for interval in intervals) == len(detections)
+    assert {detection["object"] for detection in detections} >= {"dahlia"}
     page = (folder / "report.html").read_text()
     assert page.count("data:image/jpeg") == len(intervals)
     assert not re.search(r'(?:src|href)="(?!data:)', page)
@@ -57,18 +57,18 @@ def test_a_command_that_was_interrupted_keeps_its_results_and_continues(run, vid
     code, output = run(*files)
     assert code == 130
     assert "the same command continues" in output
-    early = rows(tmp_path / "found", "sightings.csv")
+    early = rows(tmp_path / "found", "detections.csv")
     assert {row["file"] for row in early} == {str(file) for file in files}
     assert "searched in part" in (tmp_path / "found" / "report.html").read_text()
 
     assert run(*files)[0] == 0
-    continued, count = rows(tmp_path / "found", "sightings.csv"), len(steps)
+    continued, count = rows(tmp_path / "found", "detections.csv"), len(steps)
     assert count == 16 + 11, "only the second file is searched again"
     assert continued[: len(early)] == early
     assert run(*files)[0] == 0
     assert len(steps) == count, "a complete file is not searched again"
     assert run(*files, "--overwrite")[0] == 0
-    assert rows(tmp_path / "found", "sightings.csv") == continued
+    assert rows(tmp_path / "found", "detections.csv") == continued
 
 
 def test_a_damaged_file_is_reported_and_the_others_are_searched(run, video, tmp_path):
@@ -78,7 +78,7 @@ def test_a_damaged_file_is_reported_and_the_others_are_searched(run, video, tmp_
         code, output = run(tmp_path / "a.mp4", tmp_path / "b.mp4")
         assert (code, "1 problem" in output) == (1, True)
         assert "a.mp4' is not a video" in output
-    assert {row["file"] for row in rows(tmp_path / "found", "sightings.csv")} == {str(tmp_path / "b.mp4")}
+    assert {row["file"] for row in rows(tmp_path / "found", "detections.csv")} == {str(tmp_path / "b.mp4")}
     assert "is not a video" in (tmp_path / "found" / "report.html").read_text()
 
 
@@ -98,7 +98,7 @@ def test_a_name_that_is_not_utf_8_stays_in_the_tables_and_the_report(run, video,
     shutil.copy(video, path)
     code, output = run(path)
     assert code == 0, output
-    for name in ("sightings.csv", "report.html"):
+    for name in ("detections.csv", "report.html"):
         assert b"caf\xe9.mp4" in (tmp_path / "found" / name).read_bytes()
 
 

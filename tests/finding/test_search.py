@@ -1,4 +1,4 @@
-"""Which files are searched, how their frames are, and which sightings are an interval."""
+"""Which files are searched, how their frames are, and which detections are an interval."""
 
 import dataclasses
 import errno
@@ -20,8 +20,8 @@ from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoEr
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
 from catstream.finding.files import Reading, find_files
-from catstream.finding.find import Scan, Search, Sighting, Step, load_models
-from catstream.finding.found import FileResult, SearchLog
+from catstream.finding.find import Detection, Scan, Search, Step, load_models
+from catstream.finding.results import FileResult, SearchLog
 from catstream.video.frames import Frame
 from catstream.video.writer import VideoWriter
 
@@ -60,7 +60,7 @@ def test_one_frame_in_a_time_is_searched_and_the_last_one(search, appearing):
     file = find_files([appearing])[0]
     steps = list(search.file(file))
     assert [step.frame.number for step in steps] == [*range(0, 40, 5), 39]
-    seen = [each.frame for step in steps for each in step.sightings if each.object == "dahlia"]
+    seen = [each.frame for step in steps for each in step.detections if each.object == "dahlia"]
     assert list(dict.fromkeys(seen)) == [15, 20, 25, 30]
     rare = dataclasses.replace(search, every=1.2)
     assert [step.frame.number for step in rare.file(file)] == [0, 30, 39]
@@ -104,7 +104,7 @@ def test_the_log_of_another_search_is_not_continued(search, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ["[]\n", '{"kind":"catstream find 2"}\n', "no json\n", '{"kind":"catstream find 3"}\n']
+    "content", ["[]\n", '{"kind":"catstream find 3"}\n', "no json\n", '{"kind":"catstream find 4"}\n']
 )
 def test_a_file_that_is_no_log_is_an_error_and_stays(search, tmp_path, content):
     (tmp_path / "log").write_text(content)
@@ -113,23 +113,23 @@ def test_a_file_that_is_no_log_is_an_error_and_stays(search, tmp_path, content):
     assert (tmp_path / "log").read_text() == content
 
 
-def test_find_yields_the_sightings_of_all_paths_in_order(model_files, images, appearing, tmp_path):
+def test_find_yields_the_detections_of_all_paths_in_order(model_files, images, appearing, tmp_path):
     (folder := tmp_path / "folder").mkdir()
     for number, place in ((20, folder), (21, folder), (22, tmp_path)):
         cv2.imwrite(str(place / f"{number}.png"), images[number])
     found = list(catstream.find(model_files[0], [folder, appearing, tmp_path / "22.png"]))
-    files = [sighting.file for sighting in found]
+    files = [detection.file for detection in found]
     assert list(dict.fromkeys(files)) == [str(folder), str(appearing), str(tmp_path / "22.png")]
-    names = [sighting.image for sighting in found if sighting.file == str(folder)]
+    names = [detection.image for detection in found if detection.file == str(folder)]
     assert list(dict.fromkeys(names)) == ["20.png", "21.png"]
-    assert {sighting.object for sighting in found} == {"dahlia"}
+    assert {detection.object for detection in found} == {"dahlia"}
 
 
-def test_an_unreadable_file_is_an_error_after_the_sightings_of_the_others(model_files, appearing, tmp_path):
+def test_an_unreadable_file_is_an_error_after_the_detections_of_the_others(model_files, appearing, tmp_path):
     (tmp_path / "damaged.mp4").write_bytes(appearing.read_bytes()[:2000])
-    found, sightings = [], catstream.find(model_files[0], [tmp_path / "damaged.mp4", appearing])
+    found, detections = [], catstream.find(model_files[0], [tmp_path / "damaged.mp4", appearing])
     with pytest.raises(VideoError, match="damaged"):
-        found.extend(sighting.file for sighting in sightings)
+        found.extend(detection.file for detection in detections)
     assert set(found) == {str(appearing)}
 
 
@@ -176,14 +176,14 @@ def test_the_object_is_found_at_its_box(learned, images, demo_video):
         assert dahlia[0].score > 0.7
 
 
-def test_every_sighting_reaches_the_threshold_and_overlaps_no_better_one(learned, images):
+def test_every_detection_reaches_the_threshold_and_overlaps_no_better_one(learned, images):
     for found in Scan(learned, 0.1)(images[30]):
         assert [each.score for each in found] == sorted((each.score for each in found), reverse=True)
         assert all(each.score >= 0.1 for each in found)
         assert all(a.window.overlap(b.window) < 0.3 for k, a in enumerate(found) for b in found[:k])
 
 
-def test_a_frame_without_the_object_or_smaller_than_a_window_has_no_sighting(learned, rng):
+def test_a_frame_without_the_object_or_smaller_than_a_window_has_no_detection(learned, rng):
     noise = rng.integers(0, 256, (240, 320, 3), np.uint8)
     for image in (noise, np.full((240, 320, 3), 128, np.uint8), np.zeros((9, 12, 3), np.uint8)):
         assert Scan(learned)(image) == [[], []]
@@ -192,12 +192,12 @@ def test_a_frame_without_the_object_or_smaller_than_a_window_has_no_sighting(lea
 IMAGE = np.zeros((60, 80, 3), np.uint8)
 
 
-def sighting(time, x=0.0, size=40.0, name="anna", score=0.8):
-    return Sighting(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
+def detection(time, x=0.0, size=40.0, name="anna", score=0.8):
+    return Detection(name, "walk.mp4", round(25 * time), time, Box(x, 50.0, size, size), score)
 
 
 def intervals_of(*steps):
-    """The intervals of the sightings of these steps."""
+    """The intervals of the detections of these steps."""
     result = FileResult("walk.mp4", [], gap=1.0)
     for number, step in enumerate(steps):
         result.add(Step(Frame(number, step[0].time, IMAGE), step))
@@ -205,7 +205,7 @@ def intervals_of(*steps):
 
 
 def test_a_jump_and_a_change_of_size_continue_an_interval_and_a_gap_begins_one():
-    alone = sighting(0.0), sighting(0.2, x=300.0), sighting(0.4, size=80.0), sighting(1.2), sighting(2.5)
+    alone = detection(0.0), detection(0.2, x=300.0), detection(0.4, size=80.0), detection(1.2), detection(2.5)
     assert [interval.count for interval in intervals_of(*([each] for each in alone))] == [4, 1]
 
 
@@ -213,8 +213,8 @@ seen = st.tuples(st.floats(0, 30), st.sampled_from(["anna", "ben"]), st.floats(0
 
 
 @given(st.lists(seen, min_size=1, max_size=40))
-def test_every_sighting_is_in_one_interval_of_its_object(facts):
-    made = [sighting(time, name=name, score=score) for time, name, score in sorted(facts)]
+def test_every_detection_is_in_one_interval_of_its_object(facts):
+    made = [detection(time, name=name, score=score) for time, name, score in sorted(facts)]
     found = intervals_of(*([each] for each in made))
     assert sum(interval.count for interval in found) == len(made)
     for name in ("anna", "ben"):

@@ -18,7 +18,7 @@ from hypothesis import strategies as some
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import State, Track
-from catstream.reports.page import COLOURS
+from catstream.reports.report import COLOURS
 from catstream.video.drawing import PALETTE, Colours, draw, drawn_size
 from catstream.video.source import open_source
 from catstream.video.writer import VideoWriter
