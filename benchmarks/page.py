@@ -184,7 +184,7 @@ def _accuracy(found: Mapping[str, Record]) -> str:
         {peers["machine"]["opencv"]}. F-score over the {leaves} sequences in which the object disappears, in the runs
         beside them: {scores}.
 
-        **Absence is not always noticed**: over four first boxes of each sequence,
+        **Absence is not always noticed**: over four initial boxes of each sequence,
         {_noticed(found["accuracy-jitter"])} In one run, chance decides: see panda."""
 
 
@@ -250,7 +250,7 @@ def _figures(found: Mapping[str, Record]) -> str:
     csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     return filled(f"""
         On {len(found["accuracy"]["sequences"])} public sequences, the area under the success plot (AUC) is
-        **{boxes:.3f}** on average over four first boxes that differ by at most 2 %. With the true first box it is
+        **{boxes:.3f}** on average over four initial boxes that differ by at most 2 %. With the true first box it is
         {ours:.3f}, and that of OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences;
         [Results](docs/results.md) lists the others separately.
 
@@ -341,7 +341,7 @@ SECTIONS = (
             Shown(
                 "accuracy-jitter",
                 several(groups, extremes, absence),
-                "the same, means of four runs of each sequence, from first boxes that differ by at most 2 %",
+                "the same, means of four runs of each sequence, from initial boxes that differ by at most 2 %",
             ),
             Shown("accuracy-peers", groups, "AUC and success beside other trackers, means of one run of each sequence"),
         ),
@@ -350,7 +350,7 @@ SECTIONS = (
         "Beside the paper",
         _paper,
         (
-            Shown("tld-defaults", select(without="(?!defaults)"), "success, mean of four first boxes of each video"),
+            Shown("tld-defaults", select(without="(?!defaults)"), "success, mean of four initial boxes of each video"),
             Shown("tld", select(without="(?!cat)"), "success of one run of each video"),
             Shown("root_or_hierarchy-ours", select(), "means of one run of each of the first 20 sequences"),
             Shown(
@@ -409,7 +409,7 @@ MORE = (
 )
 
 ROBUSTNESS = (
-    Section("Starts and first boxes", _STARTS, (Shown("robustness", robustness), Shown("shifts", select(0)))),
+    Section("Starts and initial boxes", _STARTS, (Shown("robustness", robustness), Shown("shifts", select(0)))),
 )
 
 PAGES = (

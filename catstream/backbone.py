@@ -99,19 +99,19 @@ def _truncated(model: onnx.ModelProto, layer: str, name: str) -> onnx.ModelProto
     """The part of a model from its image to a layer, for images of any height and width."""
     import onnx
 
-    weights = {each.name for each in model.graph.initializer}
-    inputs = [each.name for each in model.graph.input if each.name not in weights]
+    weights = {tensor.name for tensor in model.graph.initializer}
+    inputs = [tensor.name for tensor in model.graph.input if tensor.name not in weights]
     if len(inputs) != 1:
         raise SettingsError(f"the backbone {name!r} has the inputs {', '.join(inputs)}, expected one image")
-    made = {tensor: tensor for node in model.graph.node for tensor in node.output}
-    tensors = {node.name: node.output[0] for node in model.graph.node} | made
+    outputs = {tensor: tensor for node in model.graph.node for tensor in node.output}
+    tensors = {node.name: node.output[0] for node in model.graph.node} | outputs
     if layer not in tensors:
         near = difflib.get_close_matches(layer, tensors, n=3, cutoff=0.0)
         raise SettingsError(f"the backbone {name!r} has no layer {layer!r}: the nearest names are {', '.join(near)}")
     part = onnx.utils.Extractor(model).extract_model(inputs, [tensors[layer]])
     del part.graph.value_info[:]  # the sizes of one image
-    for each in (*part.graph.input, *part.graph.output):
-        for side in list(each.type.tensor_type.shape.dim)[2:]:
+    for tensor in (*part.graph.input, *part.graph.output):
+        for side in list(tensor.type.tensor_type.shape.dim)[2:]:
             side.Clear()
     return part
 

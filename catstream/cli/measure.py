@@ -215,13 +215,13 @@ def _table(rows: list[Row], means: dict[str, dict[str, float | None]]) -> Table:
     from catstream.evaluation.accuracy import HEADINGS, cells
 
     numbers = ("frames", *HEADINGS)
-    made = table("sequence", "tracker", *numbers, right=numbers)
+    output = table("sequence", "tracker", *numbers, right=numbers)
     for row in rows:
-        made.add_row(row.name, row.tracker, str(row.frames), *cells(row))
-    made.add_section()
+        output.add_row(row.name, row.tracker, str(row.frames), *cells(row))
+    output.add_section()
     for tracker, mean in means.items():
-        made.add_row("mean", tracker, "", *cells(mean), style="bold")
-    return made
+        output.add_row("mean", tracker, "", *cells(mean), style="bold")
+    return output
 
 
 def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
@@ -347,10 +347,10 @@ def _print_run(result: Result, limits: list[Limit]) -> None:
         f"{milliseconds(result.camera_late)} ms late"
     )
     for part in tables(result):
-        made = table(*part.heads, right=part.heads[1:])
+        output = table(*part.heads, right=part.heads[1:])
         for row in part.cells:
-            made.add_row(*row)
-        screen().print(made)
+            output.add_row(*row)
+        screen().print(output)
     if result.other_load > _QUIET_CORES:
         click.echo(
             f"other processes kept {result.other_load:.1f} cores busy: repeat on an idle machine for reliable results"
@@ -410,9 +410,8 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
     track.main(arguments, prog_name="catstream track", standalone_mode=False)
     truth = np.array([box or (np.nan,) * 4 for box in boxes])
     tracked = [frame.tracks[0].box for frame in Log(tracks / "demo.ndjson").frames()]
-    found = np.array([box or (np.nan,) * 4 for box in tracked])
-    result = score(found, truth)
-    click.echo(f"success rate: {result.success:.3f} (overlap with the ground truth above 0.5)")
+    result = score(np.array([box or (np.nan,) * 4 for box in tracked]), truth)
+    click.echo(f"success rate: {result.success:.3f} (IoU with the ground truth above 0.5)")
     if result.absence.absent:
         click.echo(f"absence reported: {result.absence.noticed} of {result.absence.absent} frames")
     click.echo(f"annotated video: {tracks / 'demo.mp4'}")

@@ -117,20 +117,20 @@ def cells(measured: Row | Mapping[str, float | None]) -> list[str]:
 
 def by_attribute(rows: Iterable[Row], attributes: Mapping[str, Iterable[str]]) -> dict[str, list[Row]]:
     """Return the rows of the sequences with each attribute; `attributes` are those of each sequence, by its name."""
-    found: dict[str, list[Row]] = {}
+    groups: dict[str, list[Row]] = {}
     for row in rows:
         for attribute in dict.fromkeys(attributes.get(row.name, ())):
-            found.setdefault(attribute, []).append(row)
-    return dict(sorted(found.items()))
+            groups.setdefault(attribute, []).append(row)
+    return dict(sorted(groups.items()))
 
 
 def flips_of(rows: Iterable[Row]) -> dict[str, list[str]]:
     """Return the names of the sequences that flip, by tracker, if its runs have different initial boxes."""
-    found: dict[str, list[str]] = {}
+    names: dict[str, list[str]] = {}
     for row in rows:
         if row.flips is not None:
-            found.setdefault(row.tracker, []).extend([row.name] if row.flips else [])
-    return found
+            names.setdefault(row.tracker, []).extend([row.name] if row.flips else [])
+    return names
 
 
 def describe_flips(rows: Iterable[Row]) -> list[str]:
@@ -185,8 +185,8 @@ def _row(name: str, tracker: str, runs: list[EvaluationRun]) -> Row:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if known else None
+    numbers = [value for value in values if value is not None]
+    return fmean(numbers) if numbers else None
 
 
 def write_report(

@@ -78,15 +78,15 @@ class Sequence:
 
     def frames(self, start: int = 0) -> Generator[UInt8]:
         """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box; VideoError if there are too few."""
-        left = len(self.boxes) - start
+        missing = len(self.boxes) - start
         with open_source(self.path, self.begin + start) as source:
             for frame in source:
                 yield frame.image
-                left -= 1
-                if not left:
+                missing -= 1
+                if not missing:
                     return
         raise VideoError(
-            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {counted(left, 'frame')} too few: "
+            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {counted(missing, 'frame')} too few: "
             "each line of the ground truth needs a frame"
         )
 
@@ -136,7 +136,7 @@ def _folders(path: Path) -> list[Path]:
     if _truths(path) or not path.is_dir():
         return [path]
     inner = (inner for inner in path.iterdir() if not inner.name.startswith("."))
-    return sorted((each for each in inner if each.is_dir() or _is_dead_link(each)), key=natural_order)
+    return sorted((folder for folder in inner if folder.is_dir() or _is_dead_link(folder)), key=natural_order)
 
 
 def _is_there(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""One-pass evaluation: each tracker runs once over each sequence, from the given box, without reinitialisation."""
+"""One-pass evaluation: each tracker runs once over each sequence, from its initial box, without reinitialisation."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ def follow(
     worker = Tracker(settings.for_length(frames)) if tracker == "catstream" else Peer(tracker, peer_models)
     boxes, confidence, seconds = np.full((frames, 4), np.nan), np.full(frames, np.nan), np.zeros(frames)
     for row, image in enumerate(sequence.frames(start.frame)):
-        given = start.box(sequence, image.shape[1::-1]) if row == 0 else None
+        initial = start.box(sequence, image.shape[1::-1]) if row == 0 else None
         begin = perf_counter()
-        if given is not None:
-            worker.init(image, given)
-            box: Box | None = given
+        if initial is not None:
+            worker.init(image, initial)
+            box: Box | None = initial
         else:
             _, box = worker.update(image)
         seconds[row] = perf_counter() - begin
@@ -149,10 +149,10 @@ def _follow_and_save(output: Path | None, task: _Task) -> EvaluationRun | Catstr
 
 def _validate_names(sequences: list[Sequence], trackers: list[str], peer_models: Path | None) -> None:
     if not trackers:
-        raise SettingsError(f"no tracker is given: give one of {', '.join(TRACKERS)}")
+        raise SettingsError(f"missing tracker: pass one of {', '.join(TRACKERS)}")
     for tracker in trackers:
         if tracker not in TRACKERS:
-            raise SettingsError(f"there is no tracker {tracker!r}: give one of {', '.join(TRACKERS)}")
+            raise SettingsError(f"unknown tracker {tracker!r}: pass one of {', '.join(TRACKERS)}")
         if tracker in PEERS:
             Peer(tracker, peer_models)
     names = [sequence.name for sequence in sequences]

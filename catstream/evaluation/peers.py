@@ -68,14 +68,14 @@ class Peer:
     def update(self, frame: np.ndarray) -> tuple[bool, Box | None]:
         """Return whether the object was found, and its box. An error inside OpenCV counts as not found."""
         try:
-            found, box = self._tracker.update(frame)
+            ok, box = self._tracker.update(frame)
         except cv2.error:
-            found, box = False, None
-        if found and self._has_score:
+            ok, box = False, None
+        if ok and self._has_score:
             self.score = float(self._tracker.getTrackingScore())
         else:
-            self.score = float(found)
-        return (True, Box(*map(float, box))) if found else (False, None)
+            self.score = float(ok)
+        return (True, Box(*map(float, box))) if ok else (False, None)
 
 
 def _constructor(name: str, models: Path | None) -> Callable[[], Any]:

@@ -82,10 +82,10 @@ def distances(boxes: Float64, truth: Float64, *, normalised: bool = False) -> Fl
 
     normalised : divide each coordinate by the width or height of the ground truth box
     """
-    apart = (boxes[:, :2] + boxes[:, 2:] / 2) - (truth[:, :2] + truth[:, 2:] / 2)
+    offsets = (boxes[:, :2] + boxes[:, 2:] / 2) - (truth[:, :2] + truth[:, 2:] / 2)
     if normalised:
-        apart = apart / np.maximum(truth[:, 2:], 1)
-    return np.nan_to_num(np.hypot(apart[:, 0], apart[:, 1]), nan=np.inf)
+        offsets = offsets / np.maximum(truth[:, 2:], 1)
+    return np.nan_to_num(np.hypot(offsets[:, 0], offsets[:, 1]), nan=np.inf)
 
 
 def success_plot(boxes: Float64, truth: Float64) -> Float64:

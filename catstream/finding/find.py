@@ -16,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -90,7 +90,7 @@ class Detection:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class Match:
     """A window that shows an object, the object's box in it, and the score: see `Scan`."""
 
     window: Window
@@ -107,17 +107,23 @@ class _Template:
     window: Window
     settings: Settings
 
-    def seen(self, scores: ScoreMap, row: int, column: int, window: Window) -> Seen:
-        """A window whose features are at (row, column) of a map of appearance scores."""
+    @classmethod
+    def of(cls, saved: SavedModel) -> Self:
+        return cls(
+            saved.model, saved.similarity(), Window.around(saved.box, saved.settings.search.context), saved.settings
+        )
+
+    def match(self, scores: ScoreMap, row: int, column: int, window: Window) -> Match:
+        """The match of a window whose features are at (row, column) of a map of appearance scores."""
         score = min(1.0, float(scores.scores[row, column])) * self.similarity(scores.cells.row(row, column))
-        return Seen(window, window.box(self.settings.search.context), score)
+        return Match(window, window.box(self.settings.search.context), score)
 
 
 class Scan:
     """Searches frames for the objects of several models.
 
     The score of a window is its similarity to the object (see `catstream.detection.similarity`) times the score of the
-    appearance model, of which at most 1 counts: about 1 on the object, and near 0 on an unknown background.
+    appearance model, clipped at 1: about 1 on the object, and near 0 on an unknown background.
 
     threshold : minimum score of a detection
     sizes : smallest and largest size, as multiples of the learned size
@@ -126,36 +132,31 @@ class Scan:
 
     def __init__(
         self,
-        learned: Iterable[SavedModel],
+        models: Iterable[SavedModel],
         threshold: float = THRESHOLD,
         sizes: tuple[float, float] = SIZES,
         descriptor: Descriptor | None = None,
     ) -> None:
         self._threshold, self._descriptor = threshold, descriptor
-        self._models = [
-            _Template(
-                each.model, each.similarity(), Window.around(each.box, each.settings.search.context), each.settings
-            )
-            for each in learned
-        ]
+        self._templates = [_Template.of(saved) for saved in models]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
-        for number, searched in enumerate(self._models):
-            for entry in _entries(searched.window, sizes):
+        for number, template in enumerate(self._templates):
+            for entry in _entries(template.window, sizes):
                 self._grid[entry].append(number)
 
     @one_thread()
-    def __call__(self, image: np.ndarray) -> list[list[Seen]]:
+    def __call__(self, image: np.ndarray) -> list[list[Match]]:
         """Search a frame, uint8 (h, w, 3): for each model, fitted windows that do not overlap, best first."""
         frame = Pyramid(image, self._descriptor)
-        found = []
-        for searched, windows in zip(self._models, self.windows(frame), strict=True):
-            seen = [_fitted(frame, each.window, searched) for each in windows]
-            found.append(_suppressed(each for each in seen if each.score >= self._threshold))
-        return found
+        results = []
+        for template, windows in zip(self._templates, self.windows(frame), strict=True):
+            matches = (_fitted(frame, candidate.window, template) for candidate in windows)
+            results.append(_suppressed(match for match in matches if match.score >= self._threshold))
+        return results
 
-    def windows(self, frame: Pyramid) -> list[list[Seen]]:
+    def windows(self, frame: Pyramid) -> list[list[Match]]:
         """For each model, the best windows of the grid, highest score first."""
-        found: list[list[Seen]] = [[] for _ in self._models]
+        matches: list[list[Match]] = [[] for _ in self._templates]
         for entry, numbers in self._grid.items():
             window = _window(*entry)
             if not _is_searchable(window, frame.size):
@@ -163,33 +164,33 @@ class Scan:
             image, step = frame.resized(window, averaged=False)
             cells = Cells.of(image)
             for number in numbers:
-                found[number] += self._maxima(frame, cells, step, self._models[number])
-        return [_suppressed(each) for each in found]
+                matches[number] += self._maxima(frame, cells, step, self._templates[number])
+        return [_suppressed(of_model) for of_model in matches]
 
-    def _maxima(self, frame: Pyramid, cells: Cells, step: tuple[float, float], searched: _Template) -> list[Seen]:
+    def _maxima(self, frame: Pyramid, cells: Cells, step: tuple[float, float], template: _Template) -> list[Match]:
         """The best windows of one size, whose cells are `step` pixels wide and high.
 
         With a descriptor, HOG and colours choose the windows, and it describes only these.
         """
         least = _FITTED * self._threshold
-        model = searched.model
+        model = template.model
         if frame.descriptor is None:  # no similarity is above 1 / share
-            appearance = cells.respond_above(model.weights, model.bias, least * searched.similarity.share)
+            appearance = cells.respond_above(model.weights, model.bias, least * template.similarity.share)
         else:
             appearance = cells.respond(model.weights, model.bias)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
         places = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
-        found = [searched.seen(*scores.complete(frame, place, model), scores.window(*place)) for place in places]
-        return [each for each in found if each.score >= least]
+        matches = [template.match(*scores.complete(frame, place, model), scores.window(*place)) for place in places]
+        return [match for match in matches if match.score >= least]
 
 
-def _fitted(frame: Pyramid, window: Window, searched: _Template) -> Seen:
+def _fitted(frame: Pyramid, window: Window, template: _Template) -> Match:
     """A window at its best size and aspect ratio; the learned aspect ratio is likelier than others."""
-    size = math.sqrt(window.area / searched.window.area)
-    likely = searched.window.scaled(size).centred(*window.centre)
-    context = FrameContext(frame, searched.model, searched.settings)
-    found = fit_extent(context, Candidate(0.0, window), likely)
-    return searched.seen(ScoreMap.around(frame, found.window, WINDOW, searched.model), 0, 0, found.window)
+    size = math.sqrt(window.area / template.window.area)
+    likely = template.window.scaled(size).centred(*window.centre)
+    context = FrameContext(frame, template.model, template.settings)
+    best = fit_extent(context, Candidate(0.0, window), likely).window
+    return template.match(ScoreMap.around(frame, best, WINDOW, template.model), 0, 0, best)
 
 
 def _entries(window: Window, sizes: tuple[float, float]) -> list[tuple[int, int]]:
@@ -213,13 +214,13 @@ def _is_searchable(window: Window, size: tuple[int, int]) -> bool:
     return width * side / window.w * height * side / window.h <= _MOST_PIXELS
 
 
-def _suppressed(found: Iterable[Seen]) -> list[Seen]:
-    """The windows that overlap no better one, highest score first."""
-    kept: list[Seen] = []
-    for each in sorted(found, key=lambda one: -one.score):
-        if len(kept) < _MOST_MAXIMA and all(each.window.overlap(other.window) < SAME_OVERLAP for other in kept):
-            kept.append(each)
-    return kept
+def _suppressed(matches: Iterable[Match]) -> list[Match]:
+    """Non-maximum suppression: the windows that overlap no better one, highest score first."""
+    best: list[Match] = []
+    for match in sorted(matches, key=lambda match: -match.score):
+        if len(best) < _MOST_MAXIMA and all(match.window.overlap(other.window) < SAME_OVERLAP for other in best):
+            best.append(match)
+    return best
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,15 +256,15 @@ class Search:
         if not 0 < low <= high < 100:
             raise SettingsError(f"expected two positive sizes, the smaller one first, got {low:g},{high:g}: give 0.5,2")
         descriptor = descriptor_of(Settings(features={"network": self.network}))
-        for name, learned in self.models.items():
-            learned.check_network(digest_of(descriptor), f"the model of {name!r}", "this search has")
+        for name, saved in self.models.items():
+            saved.check_network(digest_of(descriptor), f"the model of {name!r}", "this search has")
         self._scan = Scan(self.models.values(), self.threshold, self.sizes, descriptor)
 
     @property
     def description(self) -> dict[str, Any]:
         """Models and options, as values of JSON: two searches with the same description have the same results."""
         return {
-            "models": {name: _digest(learned) for name, learned in self.models.items()},
+            "models": {name: _digest(saved) for name, saved in self.models.items()},
             "threshold": self.threshold,
             "every": self.every,
             "sizes": list(self.sizes),
@@ -275,12 +276,12 @@ class Search:
         """Search a file. At damage of a video, VideoError is raised after the steps before it."""
         frames = file.frames(self.every, self.settings, reading or Reading())
         with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
-            for (frame, image), found in scanned:
+            for (frame, image), results in scanned:
                 place = str(file.path), frame.number, frame.time
                 detections = [
-                    Detection(name, *place, each.box, each.score, image)
-                    for name, seen in zip(self.models, found, strict=True)
-                    for each in seen
+                    Detection(name, *place, match.box, match.score, image)
+                    for name, matches in zip(self.models, results, strict=True)
+                    for match in matches
                 ]
                 yield Step(frame, detections)
 
@@ -342,21 +343,21 @@ def find(
 def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[str, SavedModel]:
     """Load models; return each by the name of its object, or of its file."""
     named: dict[str, SavedModel] = {}
-    for number, each in enumerate(models, 1):
-        learned = each if isinstance(each, SavedModel) else SavedModel.load(each)
-        name = learned.object or (f"object-{number}" if isinstance(each, SavedModel) else Path(each).stem)
+    for number, model in enumerate(models, 1):
+        saved = model if isinstance(model, SavedModel) else SavedModel.load(model)
+        name = saved.object or (f"object-{number}" if isinstance(model, SavedModel) else Path(model).stem)
         if name in named:
             raise SettingsError(f"two models are named {name!r}: rename the file of one, or save it under another name")
-        named[name] = learned
+        named[name] = saved
     if not named:
         raise SettingsError("a search needs at least one model: `catstream save` and `track --save-model` write one")
     return named
 
 
-def _digest(learned: SavedModel) -> str:
-    """Identifies what is searched with: weights, bias and size."""
-    digest = hashlib.sha256(learned.model.weights.tobytes())
-    digest.update(np.array([learned.model.bias, *learned.box[2:]]).tobytes())
+def _digest(saved: SavedModel) -> str:
+    """A digest of weights, bias and size."""
+    digest = hashlib.sha256(saved.model.weights.tobytes())
+    digest.update(np.array([saved.model.bias, *saved.box[2:]]).tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -375,26 +376,26 @@ def _detections(search: Search, files: list[File]) -> Iterator[Detection]:
         raise problems[0]
 
 
-def _several(given: _One | Iterable[_One]) -> Iterable[_One]:
+def _several(values: _One | Iterable[_One]) -> Iterable[_One]:
     """One value or several, as several."""
-    return [given] if isinstance(given, str | os.PathLike | SavedModel) else given
+    return [values] if isinstance(values, str | os.PathLike | SavedModel) else values
 
 
-def _scanned(scan: Scan, frames: Iterator[NamedFrame]) -> Generator[tuple[NamedFrame, list[list[Seen]]]]:
+def _scanned(scan: Scan, frames: Iterator[NamedFrame]) -> Generator[tuple[NamedFrame, list[list[Match]]]]:
     """Scan frames in several threads, and yield the results in order; an error of the source comes after them."""
     workers = len(os.sched_getaffinity(0))
-    pending: deque[tuple[NamedFrame, Future[list[list[Seen]]]]] = deque()
+    pending: deque[tuple[NamedFrame, Future[list[list[Match]]]]] = deque()
     problem: VideoError | None = None
     with ThreadPoolExecutor(workers, "scan") as pool:
         try:
-            for searched in frames:
-                pending.append((searched, pool.submit(scan, searched[0].image)))
+            for named_frame in frames:
+                pending.append((named_frame, pool.submit(scan, named_frame[0].image)))
                 if len(pending) > workers:
-                    first, found = pending.popleft()
-                    yield first, found.result()
+                    first, matches = pending.popleft()
+                    yield first, matches.result()
         except VideoError as error:
             problem = error
-        for searched, found in pending:
-            yield searched, found.result()
+        for named_frame, matches in pending:
+            yield named_frame, matches.result()
     if problem is not None:
         raise problem

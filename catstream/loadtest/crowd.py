@@ -52,9 +52,9 @@ def render(
         boxes: dict[str, Box | None] = {}
         for name, sprite, path in reversed(list(zip(NAMES, sprites, paths, strict=False))):
             place = sprite.transform(path[frame], view)
-            seen = sprite.paint(image, place, free)
+            visible = sprite.paint(image, place, free)
             free *= 1 - cv2.warpAffine(sprite.mask, place, SIZE)
-            boxes[name] = sprite.box(place) if seen >= VISIBLE else None
+            boxes[name] = sprite.box(place) if visible >= VISIBLE else None
         yield resized(lake.with_noise(image, frame), dict(reversed(boxes.items())), size)
 
 

@@ -75,7 +75,7 @@ class Observations:
 @contextmanager
 def observed(addresses: Sequence[Address], name: str) -> Iterator[list[Observations]]:
     """Observe one object of each pipeline in threads, which end with the context or with their pipelines."""
-    seen, ended = [Observations() for _ in addresses], Event()
+    streams, ended = [Observations() for _ in addresses], Event()
 
     def observe(address: Address, channel: str, observations: Observations) -> None:
         about = None if channel == "health" else name
@@ -90,14 +90,14 @@ def observed(addresses: Sequence[Address], name: str) -> Iterator[list[Observati
                 observations.add(monotonic(), message)
 
     threads = [
-        Thread(target=observe, args=(address, channel, each), name=f"observer of {channel}", daemon=True)
-        for address, each in zip(addresses, seen, strict=True)
+        Thread(target=observe, args=(address, channel, stream), name=f"observer of {channel}", daemon=True)
+        for address, stream in zip(addresses, streams, strict=True)
         for channel in ("tracks", "models", "health")
     ]
     for thread in threads:
         thread.start()
     try:
-        yield seen
+        yield streams
     finally:
         ended.set()
         for thread in threads:

@@ -52,12 +52,12 @@ class Video(NamedTuple):
 def render(objects: int, images: int, size: tuple[int, int], done: Callable[[int], None]) -> Video:
     """Render the first images of the demo video of so many objects; `done` is called with their number so far."""
     files, truth = [], []
-    shown: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
+    frames: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
     if objects == 1:
-        shown = ((image, {UNNAMED: box}) for image, box in rendered.render(images, size))
+        frames = ((image, {UNNAMED: box}) for image, box in rendered.render(images, size))
     else:
-        shown = crowd.render(objects, images, size)
-    for image, boxes in shown:
+        frames = crowd.render(objects, images, size)
+    for image, boxes in frames:
         files.append(jpeg(image, quality=_QUALITY))
         truth.append(boxes)
         done(len(files))

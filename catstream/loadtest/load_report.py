@@ -45,17 +45,17 @@ def tables(result: Result) -> Iterator[Table]:
     streams = [
         {
             "stream": str(number),
-            "frames/s": f"{each.rate(result.plan.rate):.1f}",
-            "skipped": f"{100 * each.skipped_share:.1f} %",
+            "frames/s": f"{stream.rate(result.plan.rate):.1f}",
+            "skipped": f"{100 * stream.skipped_share:.1f} %",
             "cores": f"{result.cores(number):.2f}",
             "MB": f"{result.stream_memory(number) / 1e6:.0f}",
-            **_latencies(each.track, each.model),
-            "lag": str(each.max_lag),
-            "not stored": _shown(each.not_stored, "d"),
-            "success": _shown(each.success, ".3f"),
-            "of tracked": _shown(each.success_followed, ".3f"),
+            **_latencies(stream.track, stream.model),
+            "lag": str(stream.max_lag),
+            "not stored": _cell(stream.not_stored, "d"),
+            "success": _cell(stream.success, ".3f"),
+            "of tracked": _cell(stream.success_followed, ".3f"),
         }
-        for number, each in enumerate(result.streams)
+        for number, stream in enumerate(result.streams)
     ]
     yield Table(
         "Streams",
@@ -104,7 +104,7 @@ def _latencies(track: Float64, model: Float64) -> dict[str, str]:
     return {name: milliseconds(seconds) for name, seconds in (percentiles(track) | of_model).items()}
 
 
-def _shown(value: float | None, form: str) -> str:
+def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
@@ -114,7 +114,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
     Units are seconds, bytes, and shares from 0 to 1.
     """
     result = load_test.result
-    plan = {each.name: getattr(result.plan, each.name) for each in fields(result.plan) if each.name != "settings"}
+    plan = {item.name: getattr(result.plan, item.name) for item in fields(result.plan) if item.name != "settings"}
     return {
         **provenance(result.plan.settings),
         "plan": plan,

@@ -259,18 +259,18 @@ def run(plan: Plan, video: Video, camera: Camera, report: Report) -> Result:
     streams = [Stream(number, url, video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
     usage, interrupted, next_reading = Usage(), False, 0.0
     with ExitStack() as stack:
-        seen, groups = _started(plan, streams, next(iter(video.boxes)), stack, report)
+        observations, groups = _started(plan, streams, next(iter(video.boxes)), stack, report)
 
         def processes() -> dict[str, list[int]]:
             return _pids(streams, groups) | {"camera": [camera.pid], "load test": [getpid()]}
 
         schedules = camera.play(Schedule(monotonic() + _LEAD_SECONDS + 0.5 / plan.rate, plan.rate, plan.frames))
         try:
-            for now in _until_the_last_track(plan, streams, seen, schedules):
+            for now in _until_the_last_track(plan, streams, observations, schedules):
                 if now >= next_reading:
                     next_reading = now + _READING_SECONDS
                     usage.read(processes())
-                report(*_progress(plan, seen, now - schedules[0].start))
+                report(*_progress(plan, observations, now - schedules[0].start))
         except KeyboardInterrupt:
             interrupted = True
         end, late = monotonic(), camera.late
@@ -287,8 +287,8 @@ def run(plan: Plan, video: Video, camera: Camera, report: Report) -> Result:
         plan=plan,
         seconds=min(due) / plan.rate,
         streams=[
-            measure(each, schedule, number, video.truth, end, stream.totals)
-            for each, schedule, number, stream in zip(seen, schedules, due, streams, strict=True)
+            measure(observation, schedule, number, video.truth, end, stream.totals)
+            for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
         usage=usage.readings,
         received=[count for group in groups for count in group.received()],
@@ -328,14 +328,14 @@ def _started(
         if stream.error is not None:  # it has no endpoint to observe
             raise stream.error
     addresses = [stream.address for stream in streams if stream.address is not None]
-    seen = stack.enter_context(observed(addresses, name))
-    wait_until(lambda: all(each.warmed_up for each in seen), "learning the first models")
+    observations = stack.enter_context(observed(addresses, name))
+    wait_until(lambda: all(stream.warmed_up for stream in observations), "learning the first models")
     counts = {"readers": plan.subscribers, "slow": plan.slow_subscribers - plan.frozen, "frozen": plan.frozen}
     groups = [stack.enter_context(Subscribers(address, **counts)) for address in addresses]
     wait_until(lambda: all(group.connected for group in groups), "attaching subscribers")
     for group in groups:
         group.freeze()
-    return seen, groups
+    return observations, groups
 
 
 def _stop(streams: list[Stream]) -> None:
@@ -347,30 +347,30 @@ def _stop(streams: list[Stream]) -> None:
 
 
 def _until_the_last_track(
-    plan: Plan, streams: list[Stream], seen: list[Observations], schedules: list[Schedule]
+    plan: Plan, streams: list[Stream], observations: list[Observations], schedules: list[Schedule]
 ) -> Iterator[float]:
     """Yield the time twenty times a second.
 
     It ends if the last frame of each stream was tracked, if the grace time for it is over, or if all streams failed.
     """
 
-    def is_tracked(observations: Observations, schedule: Schedule) -> bool:
-        newest = observations.tracks[-1][1].pts
+    def is_tracked(stream: Observations, schedule: Schedule) -> bool:
+        newest = stream.tracks[-1][1].pts
         return newest is not None and schedule.number(newest) >= plan.frames - 1
 
     last = schedules[-1].due(plan.frames - 1)
     while (now := monotonic()) < last + _GRACE_SECONDS and any(stream.is_alive() for stream in streams):
-        if now > last and all(map(is_tracked, seen, schedules)):
+        if now > last and all(map(is_tracked, observations, schedules)):
             break
         yield now
         time.sleep(_LOOP_SECONDS)
 
 
-def _progress(plan: Plan, seen: list[Observations], passed: float) -> tuple[str, float, str]:
-    latest = max(each.tracks[-1][0] - (each.tracks[-1][1].pts or 0.0) for each in seen)
-    received = sum(len(each.tracks) for each in seen)
+def _progress(plan: Plan, observations: list[Observations], passed: float) -> tuple[str, float, str]:
+    latest = max(stream.tracks[-1][0] - (stream.tracks[-1][1].pts or 0.0) for stream in observations)
+    received = sum(len(stream.tracks) for stream in observations)
     figures = f"{received} tracks, the last {1000 * latest:.0f} ms after its frame"
-    return f"{plan.frames * len(seen)} frames", min(max(passed / plan.duration, 0.0), 1.0), figures
+    return f"{plan.frames * len(observations)} frames", min(max(passed / plan.duration, 0.0), 1.0), figures
 
 
 def _pids(streams: list[Stream], groups: list[Subscribers]) -> dict[str, list[int]]:
@@ -401,8 +401,8 @@ class LoadTest:
     @property
     def result(self) -> Result:
         """The decisive run: the one with the most streams that meets the limits, or the last one if none does."""
-        held = [result for result in self.results if not violations(self.limits, result)]
-        return max(held, key=lambda result: result.plan.streams, default=self.results[-1])
+        passed = [result for result in self.results if not violations(self.limits, result)]
+        return max(passed, key=lambda result: result.plan.streams, default=self.results[-1])
 
     @property
     def violations(self) -> list[str]:

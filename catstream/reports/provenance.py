@@ -28,12 +28,12 @@ def provenance(settings: Settings, words: Sequence[str] | None = None) -> dict[s
     The commit is that of the checkout, with -dirty if files were changed, and None if catstream runs from elsewhere;
     the settings are those that differ from the default; `words` are those of the command, by default of this process.
     """
-    given = [Path(sys.argv[0]).name, *sys.argv[1:]] if words is None else words
+    command = [Path(sys.argv[0]).name, *sys.argv[1:]] if words is None else words
     return {
         "version": version("catstream"),
         "commit": _commit(),
         "date": datetime.now(UTC).date().isoformat(),
-        "command": shlex.join(map(_without_folder, given)),
+        "command": shlex.join(map(_without_folder, command)),
         "settings": settings.changed(),
         "machine": machine(),
     }

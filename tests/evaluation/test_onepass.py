@@ -166,7 +166,7 @@ def test_a_moved_first_box_is_found_again_and_a_different_one_is_not(tmp_path, s
     [
         (1, ["catstream", "kfc"], "no tracker 'kfc'"),
         (2, ["catstream"], "two sequences are named 'walk'"),
-        (1, [], "no tracker is given"),
+        (1, [], "missing tracker"),
     ],
 )
 def test_unknown_trackers_and_equal_names_are_errors_before_the_first_run(sequence, counted, count, trackers, message):
@@ -242,7 +242,7 @@ def test_a_sequence_flips_if_its_success_depends_on_the_first_box(sequence, run)
     rows = rows_of(map(with_success, (12, 9), starts)) + rows_of(map(with_success, (12, 10), starts))
     assert [row.flips for row in rows] == [True, False]  # 9 of 12 frames have the object: 0.33 and 0.22 are lost
     assert flips_of(rows[:1]) == {"catstream": ["walk"]}
-    said = "catstream: 0 of 1 sequences flip with the first box (success differs by more than 0.25)"
+    said = "catstream: 0 of 1 sequences flip with the initial box (success differs by more than 0.25)"
     assert describe_flips(rows[1:]) == [said]
     assert flips_of(rows_of([with_success(3, start) for start in temporal(2)(sequence)])) == {}
 

@@ -71,7 +71,7 @@ def test_the_command_shows_the_spread_over_several_runs_and_counts_the_sequences
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--shifts", "--jitter", "2"), "--starts, --shifts and --jitter are mutually exclusive"),
+        (("--shifts", "--jitter", "2"), "--starts, --shifts, --jitter and --keyframes are mutually exclusive"),
         (("--attributes", "attributes.json"), "--attributes requires --output or --json"),
     ],
 )
