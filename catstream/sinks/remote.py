@@ -56,7 +56,7 @@ class Warnings:
         since = self._working_since = self._working_since or now
         if self._problems and now - since >= _STABLE_SECONDS:
             self._problems.clear()
-            self.log("reconnected")
+            self.log("recovered")
 
     def log(self, text: str) -> None:
         _log.warning("%s: %s", self._address, text)

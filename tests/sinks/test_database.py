@@ -13,6 +13,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
+from catstream.sinks import remote
 from catstream.sinks.destinations import Head, Origin, TrackedFrame, open_sink
 from catstream.sinks.track_log import Log, RunFiles
 
@@ -109,7 +110,8 @@ def test_another_database_is_no_log(tmp_path):
         read(tmp_path / "t.sqlite")
 
 
-def test_frames_wait_while_another_program_locks_the_database_and_are_written_after_it(tmp_path, caplog):
+def test_frames_wait_while_another_program_locks_the_database_and_are_written_after_it(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(remote, "_STABLE_SECONDS", 0.0)
     path = tmp_path / "t.sqlite"
     with closing(open_sink(str(path), Origin())) as sink:
         with closing(sqlite3.connect(path, isolation_level=None)) as other:
@@ -121,7 +123,7 @@ def test_frames_wait_while_another_program_locks_the_database_and_are_written_af
         assert [frame.number for frame in Log(path).frames()] == [0, 1, 3, 9]
     assert [message.rpartition(": ")[2] for message in caplog.messages] == [
         "locked by another program; frames wait in memory",
-        "is back",
+        "recovered",
     ]
 
 

@@ -132,7 +132,7 @@ def test_an_event_has_the_newest_picture_if_that_is_wanted(receiver, endpoint, u
 def test_events_wait_for_the_first_picture_for_some_seconds_only(receiver, endpoint, monkeypatch, until):
     monkeypatch.setattr(remote, "_PICTURE_SECONDS", 0.1)
     url = f"http://127.0.0.1:{receiver.port}"
-    with closing(open_sink(url, Origin(endpoint=str(endpoint), options=SinkOptions(picture=True)))) as sink:
+    with closing(open_sink(url, Origin(address=Address(str(endpoint)), options=SinkOptions(picture=True)))) as sink:
         until(lambda: receiver.requests, lambda: sink.write(TrackedFrame([FOUND])))
     assert [body["picture"] for body in receiver.bodies] == [None, None]
 
@@ -166,7 +166,7 @@ def test_each_problem_of_a_destination_is_logged_once_until_it_has_recovered(mon
         warnings.working()
     warnings.failed("refused")
     assert [record.getMessage() for record in caplog.records] == [
-        f"mqtt://host/yard: {line}" for line in ("refused", "connection lost", "reconnected", "refused")
+        f"mqtt://host/yard: {line}" for line in ("refused", "connection lost", "recovered", "refused")
     ]
 
 
@@ -179,13 +179,13 @@ def test_a_receiver_that_was_away_gets_all_events_in_order(caplog, until, monkey
         lose(sink, 1)
         back = Receiver(port)
         until(lambda: len(back.requests) == 3)
-        until(lambda: "reconnected" in caplog.text, lambda: sink.write(TrackedFrame([])))
+        until(lambda: "recovered" in caplog.text, lambda: sink.write(TrackedFrame([])))
     back.close()
     assert told(back) == ALL
     assert sink.missed == 0
     warned = [record.getMessage() for record in caplog.records]
     assert [line.partition(" (")[0] for line in warned] == [
-        f"http://127.0.0.1:{port}/...: no answer", f"http://127.0.0.1:{port}/...: reconnected",
+        f"http://127.0.0.1:{port}/...: no answer", f"http://127.0.0.1:{port}/...: recovered",
     ]  # fmt: skip
 
 
