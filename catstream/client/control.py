@@ -15,10 +15,10 @@ import os
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from time import monotonic
 from uuid import uuid4
 
 from catstream.base.box import Box
+from catstream.base.clock import STEP_SECONDS, RunningClock
 from catstream.base.names import UNNAMED, check_name
 from catstream.errors import CommandRejectedError, ServiceError, SilenceError
 from catstream.jobs.saved_model import SavedModel
@@ -172,10 +172,10 @@ class Control(AbstractContextManager["Control"]):
 
     def _newest(self, name: str, version: int) -> SavedModel:
         """Return what was learned of an object up to a version or a later one."""
-        deadline = monotonic() + self.timeout
+        clock = RunningClock()
         with Subscriber(SAVED_MODELS, self.endpoint, ModelFile, about=name) as saved:
-            while (remaining := deadline - monotonic()) > 0:
-                message = saved.receive(remaining)
+            while (remaining := self.timeout - clock()) > 0:
+                message = saved.receive(min(remaining, STEP_SECONDS))
                 if message is not None and message.version >= version:
                     return SavedModel.from_bytes(message.file, f"the saved model from {self.endpoint}")
         raise SilenceError(

@@ -11,11 +11,11 @@ import os
 import random
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
@@ -38,6 +38,7 @@ RESTART_SECONDS = 0.1  #: before the second restart in a minute; doubled for eac
 RESTARTS, RECENT_SECONDS = 5, 60.0  #: how often a process may be restarted, and in which time
 APART_SECONDS = 3.0  #: that a process may have ended before the run; then it is started again
 SHUTDOWN_SECONDS = 12.0  #: limit for all processes to end before they are killed
+LEAST_SECONDS = 0.1  #: for each of them, also if the others have used all of that time
 EXIT_SECONDS = 12.0  #: limit for the detector to exit after the end of the stream was received
 ENDED = (0, SOURCE_FAILED)  #: exit codes of a process that has ended with the run
 
@@ -147,12 +148,11 @@ class Child:
         self.silent = self.silent + seconds if turns == self._turns and self.code is None else 0.0
         return self.silent > self.memory.watchdog.patience
 
-    def terminate(self, seconds: float, turn: Callable[[], object]) -> None:
-        """Ask the process to end, and wait at most `seconds` for it; `turn` is called again and again meanwhile."""
+    def terminate(self, is_over: Callable[[], bool], turn: Callable[[], object]) -> None:
+        """Ask the process to end, and wait until it has or the time `is_over`; `turn` is called meanwhile."""
         if self.process is not None:
             self.process.send_signal(signal.SIGTERM)
-            deadline = time.monotonic() + seconds
-            while self.process.poll() is None and time.monotonic() < deadline:
+            while self.process.poll() is None and not is_over():
                 turn()
 
     def end(self) -> None:
@@ -258,10 +258,10 @@ class Supervisor:
             with self._stack:
                 deadline = math.inf
                 try:
-                    while not self._ending.is_set() and time.monotonic() < deadline:
+                    while not self._ending.is_set() and self._clock() < deadline:
                         self._turn()
                         if self.end is not None:
-                            deadline = min(deadline, time.monotonic() + EXIT_SECONDS)
+                            deadline = min(deadline, self._clock() + EXIT_SECONDS)
                             if self._children["detector"].code in ENDED:
                                 break
                     self._receive_health()
@@ -347,9 +347,14 @@ class Supervisor:
             child.end()
             child.due = now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1)
 
+    def _is_late(self, deadline: float) -> bool:
+        """Whether no process is waited for any longer."""
+        return self._hurries.is_set() or self._clock() >= deadline
+
     def _shut_down(self) -> None:
         """End the processes, the detector first, as its last messages need the others; what does not end is killed."""
-        deadline = time.monotonic() + SHUTDOWN_SECONDS
+        deadline = self._clock() + SHUTDOWN_SECONDS
         for child in self._children.values():
-            child.terminate(max(0.1, deadline - time.monotonic()) * (not self._hurries.is_set()), self._turn)
+            least = self._clock() + LEAST_SECONDS  # for each, also if those before it have used all of the time
+            child.terminate(partial(self._is_late, max(deadline, least)), self._turn)
         self._receive_health()

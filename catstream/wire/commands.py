@@ -15,6 +15,7 @@ from typing import Generic, Protocol, TypeVar, cast
 
 import zmq
 
+from catstream.base.clock import RunningClock
 from catstream.messages.kinds import Answer as CommandAnswer
 from catstream.messages.kinds import Command
 from catstream.wire.channels import Channel
@@ -53,15 +54,15 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
 
     def ask(self, question: Question, seconds: float) -> Answer | None:
         """Send a question until it is answered; None if no answer arrived in time."""
-        data, now = self._encode(question), monotonic()
-        deadline, repeat_at = now + seconds, now
-        while now < deadline:
+        data, clock = self._encode(question), RunningClock()
+        now = repeat_at = 0.0
+        while now < seconds:
             if now >= repeat_at or not self._in_transit:
                 self._send(data)
                 repeat_at = now + RETRY_SECONDS + len(data) / RETRY_BYTES_PER_SECOND
-            if (answer := self.receive(question.id, min(deadline - now, LOOK_SECONDS))) is not None:
+            if (answer := self.receive(question.id, min(seconds - now, LOOK_SECONDS))) is not None:
                 return answer
-            now = monotonic()
+            now = clock()
         return None
 
     def send(self, question: Question) -> None:

@@ -1,0 +1,48 @@
+"""Backpressure: a detector waits for its owner and for the compressor, and for nobody else."""
+
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from catstream.jobs.job import Job
+from catstream.messages.kinds import Features, Tracks
+from catstream.processes.outputs import Outputs
+from catstream.processes.process import Process
+from catstream.wire.results import ResultsReceiver
+
+
+@pytest.fixture
+def process(folder, monkeypatch):
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # the handlers of this process stay
+    job = Job("walk.mp4", endpoint=str(folder), run="one").resumed(settings={"run.unstored_frames": 4})
+    with closing(Process("detector", job)) as made:
+        yield made
+
+
+def test_a_detector_is_no_more_frames_ahead_of_its_owner_than_may_be_unstored(process):
+    waits = []
+
+    def turn():
+        """The owner reads one frame."""
+        waits.append(process.owner.read)
+        process.owner.read += 1
+
+    owner = ResultsReceiver(replace(process.endpoint, run=""), 5, 0)
+    with owner, Outputs(process, turn, lambda *_: None) as outputs:
+        outputs._send_features = lambda _: None  # the compressor has room
+        for seq in range(1, 8):
+            outputs.send(Tracks(seq, seq - 1, {}), Features(seq, seq - 1, 0.0, {}))
+        assert waits == [0, 1, 2], "frames 5, 6 and 7 wait for frames 1, 2 and 3"
+        assert [owner.receive(60).seq for _ in range(7)] == list(range(1, 8))
+
+
+def test_after_a_signal_a_detector_waits_for_nobody_and_sends_nothing_after_a_dropped_message(process):
+    process.ending._handle()
+    with Outputs(process, lambda: pytest.fail("it waits"), lambda *_: None) as outputs:
+        for seq in range(1, 9):
+            outputs.send(Tracks(seq, seq - 1, {}), Features(seq, seq - 1, 0.0, {}))
+        assert outputs.features.window.sent == 4, "nobody has stored one"
+        outputs.features.window._unacknowledged.clear()
+        outputs.send(Tracks(9, 8, {}), Features(9, 8, 0.0, {}))
+        assert outputs.features.window.sent == 4
