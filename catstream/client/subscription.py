@@ -265,9 +265,7 @@ class Subscription(Generic[Message]):
             self._connection.receive_health()
         if remaining <= 0:
             source = f" from {self.endpoint}" if self.endpoint is not None else ""
-            raise SilenceError(
-                f"no {self._channel.public} arrived{source} within {self.timeout:g} s: {self._silence()}"
-            )
+            raise SilenceError(f"no {self._channel.name} arrived{source} within {self.timeout:g} s: {self._silence()}")
 
     def _silence(self) -> str:
         """The reason why no message arrives, as far as it is known."""

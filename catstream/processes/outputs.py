@@ -14,7 +14,7 @@ from catstream.processes.process import TURN_SECONDS, Process
 from catstream.video.frames import Frame, jpeg
 from catstream.video.source import is_live
 from catstream.wire.acknowledged import Sender
-from catstream.wire.channels import FEATURES, PREVIEWS, TRACKS, TRAINING
+from catstream.wire.channels import ACKNOWLEDGED_FEATURES, FEATURES, PREVIEWS, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.results import ResultsSender
@@ -44,10 +44,10 @@ class Outputs(AbstractContextManager["Outputs"]):
         self._process, self._turn, endpoint = process, turn, process.endpoint
         with ExitStack() as stack:
             window = process.settings.run.unstored_frames
-            self.features = stack.enter_context(Sender(FEATURES, endpoint, window, replied))
+            self.features = stack.enter_context(Sender(ACKNOWLEDGED_FEATURES, endpoint, window, replied))
             self._owner = stack.enter_context(ResultsSender(endpoint)) if process.owner is not None else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
-            self._training = stack.enter_context(Publisher(TRAINING, endpoint))
+            self._copies = stack.enter_context(Publisher(FEATURES, endpoint))
             self.previews = stack.enter_context(Previews(endpoint, stores=is_live(process.job.source)))
             self._stack = stack.pop_all()
         self._complete = True  # whether no message was dropped: none may follow it
@@ -55,7 +55,7 @@ class Outputs(AbstractContextManager["Outputs"]):
     def serve_late_joiners(self) -> None:
         """Send the end or the newest preview to new subscribers."""
         self._tracks.serve_late_joiners()
-        self._training.serve_late_joiners()
+        self._copies.serve_late_joiners()
         self.previews.turn()
 
     def send(self, tracks: Tracks, features: Features) -> None:
@@ -86,7 +86,7 @@ class Outputs(AbstractContextManager["Outputs"]):
         """Send the tracks of a frame, one message an object, and its features to all subscribers; or the end."""
         for track in tracks.tracks.values() if isinstance(tracks, Tracks) else (tracks,):
             self._tracks.send(track)
-        self._training.send(features)
+        self._copies.send(features)
 
     def end(self, seq: int, counters: Callable[[], dict[str, float]]) -> End:
         """Send the end after message `seq`: to the compressor, and once that has stored everything, to the owner.

@@ -1,6 +1,7 @@
 """The channels between the processes: their messages, their two ends, and their behaviour with slow readers.
 
-    features   the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
+    acknowledged-features
+               the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
                retransmitted to a restarted receiver
     samples    only the newest of each object counts; a late joiner gets the last ones at once
     models     as samples
@@ -9,9 +10,9 @@
     results    the tracks again, one message a frame, for the program that started the pipeline, its owner
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes
-    control    commands and their answers; a command without an answer is sent again, and carried out once
+    control    commands and their answers; a command without an answer is sent again, and executed once
     saved-models   the coreset trees of each object as a file, the newest; none is made while nobody subscribes
-    training   a copy of the messages of `features`, to any number of subscribers; nothing is sent while there is none
+    features   a copy of these messages, to any number of subscribers; nothing is sent while there is none
 
 The controller of a fleet has an endpoint of its own, with one channel:
 
@@ -64,8 +65,8 @@ class Channel(Generic[Message]):
     keeps            "every" message, or the "newest"
     port             offset from the first port; each further sender takes the next one
     megabytes        size of the largest message
-    public           name by which a client subscribes (`catstream.subscribe`, `catstream watch`), empty if none does
     role             role that a peer which connects needs at least
+    is_public        whether a client may subscribe by its name (`catstream.subscribe`, `catstream watch`)
     high_water_mark  how many messages a subscriber may lag behind before it misses some
     """
 
@@ -76,8 +77,8 @@ class Channel(Generic[Message]):
     keeps: Literal["every", "newest"]
     port: int
     megabytes: int
-    public: str = ""
     role: Role = "pipeline"
+    is_public: bool = False
     high_water_mark: int = 1000
 
     @property
@@ -94,28 +95,26 @@ class Channel(Generic[Message]):
 _ALL = ("detector", "compressor", "trainer")
 _FEATURES = 512  # MiB: an object takes 4.3 MB in its first frame, there are at most 64, and their saved models
 
-FEATURES: Channel[Features | End] = Channel(
-    "features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
+ACKNOWLEDGED_FEATURES: Channel[Features | End] = Channel(
+    "acknowledged-features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
 )
 SAMPLES: Channel[Sample | End] = Channel(
-    "samples", (Sample, End), ("compressor",), None, "newest", 1, 512, "samples", "watch", high_water_mark=16
+    "samples", (Sample, End), ("compressor",), None, "newest", 1, 512, "watch", True, high_water_mark=16
 )
 MODELS: Channel[Model] = Channel(
-    "models", (Model,), ("trainer",), None, "newest", 2, 1, "models", "watch", high_water_mark=256
+    "models", (Model,), ("trainer",), None, "newest", 2, 1, "watch", True, high_water_mark=256
 )
-TRACKS: Channel[Track | End] = Channel("tracks", (Track, End), ("detector",), None, "every", 3, 1, "tracks", "watch")
+TRACKS: Channel[Track | End] = Channel("tracks", (Track, End), ("detector",), None, "every", 3, 1, "watch", True)
 RESULTS: Channel[Tracks | End] = Channel("results", (Tracks, End), ("detector",), "owner", "every", port=4, megabytes=1)
-HEALTH: Channel[Health] = Channel(
-    "health", (Health,), _ALL, None, "newest", 5, 1, "health", "watch", high_water_mark=16
-)
+HEALTH: Channel[Health] = Channel("health", (Health,), _ALL, None, "newest", 5, 1, "watch", True, high_water_mark=16)
 PREVIEWS: Channel[Preview] = Channel(
-    "previews", (Preview,), ("detector",), None, "newest", 8, 1, "previews", "watch", high_water_mark=8
+    "previews", (Preview,), ("detector",), None, "newest", 8, 1, "watch", True, high_water_mark=8
 )
 CONTROL: Channel[Command | Answer] = Channel(
     "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=64, role="control"
 )
-TRAINING: Channel[Features | End] = Channel(
-    "training", (Features, End), ("detector",), None, "every", 10, _FEATURES, "features", "watch", high_water_mark=64
+FEATURES: Channel[Features | End] = Channel(
+    "features", (Features, End), ("detector",), None, "every", 10, _FEATURES, "watch", True, high_water_mark=64
 )
 SAVED_MODELS: Channel[ModelFile] = Channel(
     "saved-models", (ModelFile,), ("compressor",), None, "newest", 11, 512, role="watch", high_water_mark=2
@@ -124,11 +123,22 @@ SAVED_MODELS: Channel[ModelFile] = Channel(
 #: THE TABLE, by name.
 CHANNELS: dict[str, Channel[object]] = {
     channel.name: channel
-    for channel in (FEATURES, SAMPLES, MODELS, TRACKS, RESULTS, HEALTH, PREVIEWS, CONTROL, TRAINING, SAVED_MODELS)
+    for channel in (
+        ACKNOWLEDGED_FEATURES,
+        SAMPLES,
+        MODELS,
+        TRACKS,
+        RESULTS,
+        HEALTH,
+        PREVIEWS,
+        CONTROL,
+        FEATURES,
+        SAVED_MODELS,
+    )
 }
 
-#: The channels that a client may subscribe to, by their public names.
-PUBLIC: dict[str, Channel[object]] = {channel.public: channel for channel in CHANNELS.values() if channel.public}
+#: The channels that a client may subscribe to, by name.
+PUBLIC: dict[str, Channel[object]] = {name: channel for name, channel in CHANNELS.items() if channel.is_public}
 
 #: The only channel of the controller of a fleet, which is no process of a pipeline and has an endpoint of its own.
 REGISTRY: Channel[Question | Listing] = Channel(

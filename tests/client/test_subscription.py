@@ -14,7 +14,7 @@ import catstream
 from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
-from catstream.wire.channels import CHANNELS, HEALTH, MODELS, TRACKS, TRAINING
+from catstream.wire.channels import CHANNELS, FEATURES, HEALTH, MODELS, TRACKS
 from catstream.wire.discovery import reserve_endpoint
 from catstream.wire.newest import Publisher
 from tests.wire.examples import model
@@ -123,7 +123,7 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
     [
         *((channel, "anna", "about all objects: subscribe to samples, models") for channel in ("features", "health")),
         ("tracks", "an na", "'an na' is not a name"),
-        *((channel, None, "unknown channel") for channel in ("training", "results", "frames")),
+        *((channel, None, "unknown channel") for channel in ("acknowledged-features", "results", "frames")),
     ],
 )
 def test_what_cannot_be_subscribed_to_is_an_error(endpoint, channel, name, words):
@@ -189,7 +189,7 @@ def test_the_health_of_each_process_arrives_once(endpoint):
 
 def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
     with (
-        Publisher(TRAINING, endpoint) as training,
+        Publisher(FEATURES, endpoint) as training,
         catstream.subscribe(str(endpoint), "features", timeout=0.05) as subscription,
     ):
         until(lambda: training.has_subscribers, training.serve_late_joiners)
@@ -206,7 +206,7 @@ def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(end
 
 def test_a_message_without_a_subscriber_is_not_encoded(endpoint, until):
     no_message = object()
-    with Publisher(TRAINING, endpoint) as training:
+    with Publisher(FEATURES, endpoint) as training:
         training.send(no_message)
         with catstream.subscribe(str(endpoint), "features"):
             until(lambda: training.has_subscribers, training.serve_late_joiners)
