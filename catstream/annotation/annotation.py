@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple, Self, cast
+from typing import NamedTuple, Self, cast
 
 import numpy as np
 
@@ -21,11 +21,8 @@ from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.workers import run_tasks
 from catstream.errors import BoxError, ObjectError
-from catstream.messages.kinds import Track
+from catstream.messages.kinds import Check, Track
 from catstream.video.source import ALL_FRAMES
-
-#: How a frame of an object is known: by the box of a person, by passes that confirm each other, or by neither.
-Check = Literal["keyframe", "checked", "unchecked"]
 
 #: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
 Progress = Callable[[str, int, int | None], object]
@@ -34,7 +31,7 @@ Progress = Callable[[str, int, int | None], object]
 _BoxesByFrame = Mapping[int, str | Iterable[float] | None]
 KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
 
-_CHECKED = 0.95  #: probability from which a frame is checked
+_CHECKED = 0.96  #: probability from which a frame is checked
 
 
 class NextFrame(NamedTuple):
@@ -61,8 +58,8 @@ class Annotation:
 
     Call `track` after the constructor; `annotate` does both. Each stretch between two keyframes is tracked from both
     ends. If that does not check all of its frames, it is tracked from both ends again, with the merged model of all
-    other boxes of the object. `add` tracks only the stretches beside its box. Close the annotation, or use it in a
-    `with`: the decoded frames are in a temporary file until then.
+    other boxes of the object. `add` tracks only beside its box; earlier passes are still used as far as they agree with
+    it. Close the annotation, or use it in a `with`: the decoded frames are in a temporary file until then.
 
     Parameters
     ----------
@@ -103,7 +100,7 @@ class Annotation:
         self._jobs, self._progress = jobs or len(os.sched_getaffinity(0)), progress
         self.keyframes: dict[str, dict[int, Box | None]] = _parsed(boxes)
         check_count(len(self.keyframes), self.settings.run.max_objects)
-        self._passes: dict[_Stretch, list[Pass]] = {}
+        self._passes: dict[str, list[Pass]] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
             self.frames: DecodedFrames = decode(
@@ -142,24 +139,20 @@ class Annotation:
         name, parsed = check_name(object), None if box is None else Box.parse(box)
         self._check(name, frame, parsed)
         check_count(len({*self.keyframes, name}), self.settings.run.max_objects)
+        if frame in self.keyframes.get(name, {}):  # what was tracked from the box before is wrong
+            self._passes[name] = [one for one in self.passes(name) if frame not in (one.start, one.stop)]
         self.keyframes.setdefault(name, {})[frame] = parsed
-        self._passes = {
-            stretch: passes
-            for stretch, passes in self._passes.items()
-            if stretch.object != name or not stretch.start - 1 <= frame <= stretch.stop
-        }
         self.track()
 
     def track(self) -> None:
-        """Track the stretches that are not tracked yet. If it is interrupted, the finished passes remain."""
-        stretches = [stretch for stretch in self._stretches() if not self._passes.get(stretch)]
-        self._run(stretches, use_memory=False)
-        several = [stretch for stretch in stretches if len(self.keyframes[stretch.object]) > 1]
+        """Run the passes that are missing. If it is interrupted, the finished passes remain."""
+        self._run(self._stretches(), use_memory=False)
+        several = [stretch for stretch in self._stretches() if len(self.keyframes[stretch.object]) > 1]
         self._run([stretch for stretch in several if not self._is_checked(stretch)], use_memory=True)
 
     @property
     def tracks(self) -> dict[str, list[Track]]:
-        """The track of each object in all frames, by name; `doubtful` if the frame is unchecked."""
+        """The track of each object in all frames, by name, with `checked` and `probability`; doubtful if unchecked."""
         tracks = {}
         for name in self.keyframes:
             boxes, probabilities, scores = self._fused(name)
@@ -168,27 +161,20 @@ class Annotation:
                     *(frame + 1, frame, self.frames.times[frame], "absent" if np.isnan(box[0]) else "present"),
                     None if np.isnan(box[0]) else Box(*box.tolist()),
                     float(scores[frame]),
-                    0,
+                    model_version=0,
                     object=name,
-                    doubtful=bool(probabilities[frame] < _CHECKED),
+                    doubtful=check == "unchecked",
+                    checked=check,
+                    probability=float(probabilities[frame]),
                 )
-                for frame, box in enumerate(boxes)
+                for frame, (box, check) in enumerate(zip(boxes, self._checks(name, probabilities), strict=True))
             ]
         return tracks
 
     @property
     def checked(self) -> dict[str, list[Check]]:
         """Whether each frame is a keyframe, checked or unchecked, by the name of the object."""
-
-        def check(name: str, frame: int, probability: float) -> Check:
-            if frame in self.keyframes[name]:
-                return "keyframe"
-            return "checked" if probability >= _CHECKED else "unchecked"
-
-        return {
-            name: [check(name, frame, probability) for frame, probability in enumerate(probabilities)]
-            for name, probabilities in self.probabilities.items()
-        }
+        return {name: self._checks(name, probabilities) for name, probabilities in self.probabilities.items()}
 
     @property
     def probabilities(self) -> dict[str, Float64]:
@@ -205,8 +191,7 @@ class Annotation:
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
-        own = [one for stretch, passes in self._passes.items() if stretch.object == name for one in passes]
-        return sorted(own, key=lambda one: (one.start, one.stop, one.with_memory))
+        return sorted(self._passes.get(name, []), key=lambda one: (one.start, one.stop, one.with_memory))
 
     def next_frame(self) -> NextFrame | None:
         """The first of `next_frames`; None if all frames are checked."""
@@ -240,22 +225,39 @@ class Annotation:
                 if after - before > 1:
                     yield _Stretch(name, before + 1, after)
 
-    def _run(self, stretches: list[_Stretch], *, use_memory: bool) -> None:
-        """Run the passes of stretches from both of their ends, longest first, and store each as it is finished."""
+    def _ways(self, stretch: _Stretch) -> list[tuple[int, int]]:
+        """Start and stop of the passes of a stretch: one from each of its ends that is a keyframe."""
+        drawn, before, after = self.keyframes[stretch.object], stretch.start - 1, stretch.stop
+        ways = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
+        return [way for way in ways if way[0] in drawn]
+
+    def _run(self, stretches: Iterable[_Stretch], *, use_memory: bool) -> None:
+        """Run the missing passes of stretches from both of their ends, longest first; store each once it is finished.
+
+        A pass without a memory is not missing if a longer one starts at the same keyframe: it has the same boxes.
+        """
         tasks = []
-        for stretch in sorted(stretches, key=lambda stretch: stretch.start - stretch.stop):
-            drawn, last = self.keyframes[stretch.object], len(self.frames) - 1
-            before, after = stretch.start - 1, stretch.stop
-            ways = [(before, min(after, last))] if before in drawn else []
-            ways += [(after, max(before, 0))] if after in drawn else []
-            tasks += [(stretch, self.frames, *way, drawn, self.settings, use_memory) for way in ways]
-        done, total = 0, sum(abs(task[2] - task[3]) for task in tasks)
-        work = "tracking again" if use_memory else "tracking"
-        for stretch, one in run_tasks(_work, tasks, self._jobs) if self._jobs > 1 else (_work(*task) for task in tasks):
+        for stretch in stretches:
+            name, drawn = stretch.object, self.keyframes[stretch.object]
+            for way in self._ways(stretch):
+                same = (one for one in self.passes(name) if one.start == way[0] and one.with_memory == use_memory)
+                done = any(one.stop == way[1] or (one.covers(*way) and not use_memory) for one in same)
+                if not done and (use_memory or drawn[way[0]] is not None):
+                    tasks.append((name, self.frames, *way, dict(drawn), self.settings, use_memory))
+        tasks.sort(key=lambda task: -abs(task[2] - task[3]))
+        total, finished = sum(abs(task[2] - task[3]) for task in tasks), 0
+        results = run_tasks(_work, tasks, self._jobs) if self._jobs > 1 else (_work(*task) for task in tasks)
+        for name, frames, one in results:
             if one is not None:
-                self._passes.setdefault(stretch, []).append(one)
-            done += stretch.stop - stretch.start
-            self._progress(work, min(done, total), total)
+                self._passes.setdefault(name, []).append(one)
+            finished += frames
+            self._progress("tracking again" if use_memory else "tracking", finished, total)
+
+    def _checks(self, name: str, probabilities: Float64) -> list[Check]:
+        checks: list[Check] = ["checked" if each >= _CHECKED else "unchecked" for each in probabilities]
+        for frame in self.keyframes[name]:
+            checks[frame] = "keyframe"
+        return checks
 
     def _fused(self, name: str) -> tuple[Float64, Float64, Float64]:
         """Boxes, probabilities and scores of an object in all frames; the last two are 1 at keyframes."""
@@ -270,9 +272,9 @@ class Annotation:
         return boxes, probabilities, scores
 
     def _fused_stretch(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
-        # In a fixed order: passes are finished in any.
-        passes = sorted(self._passes.get(stretch, []), key=lambda one: (one.with_memory, one.start))
-        return fuse(passes, stretch.start, stretch.stop, self.keyframes[stretch.object])
+        drawn = self.keyframes[stretch.object]
+        parts = [one.part(*way, drawn) for way in self._ways(stretch) for one in self.passes(stretch.object)]
+        return fuse([part for part in parts if part is not None], stretch.start, stretch.stop, drawn)
 
     def _is_checked(self, stretch: _Stretch) -> bool:
         return bool((self._fused_stretch(stretch)[1] >= _CHECKED).all())
@@ -301,7 +303,7 @@ def annotate(
     """Track objects between boxes at keyframes of a video, and check the tracks.
 
     Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
-    box is right with a probability of 95 %, see `catstream.annotation.fusion`. Parameters and errors are those of
+    box is right with a probability of 96 %, see `catstream.annotation.fusion`. Parameters and errors are those of
     `Annotation`.
     """
     annotation = Annotation(video, boxes, settings, part=part, jobs=jobs, progress=progress)
@@ -314,15 +316,10 @@ def annotate(
 
 
 def _work(
-    stretch: _Stretch,
-    frames: DecodedFrames,
-    start: int,
-    stop: int,
-    keyframes: Keyframes,
-    settings: Settings,
-    use_memory: bool,
-) -> tuple[_Stretch, Pass | None]:
-    return stretch, run_pass(frames, start, stop, keyframes, settings, use_memory=use_memory)
+    name: str, frames: DecodedFrames, start: int, stop: int, keyframes: Keyframes, settings: Settings, use_memory: bool
+) -> tuple[str, int, Pass | None]:
+    """Run a pass; return the name of its object and its number of frames with it."""
+    return name, abs(start - stop), run_pass(frames, start, stop, keyframes, settings, use_memory=use_memory)
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, Box | None]]:

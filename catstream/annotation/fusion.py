@@ -12,19 +12,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from catstream.annotation.passes import Keyframes, Pass
+from catstream.annotation.passes import Keyframes, Pass, iou
 from catstream.base.arrays import Bool, Float64
 
-_ARRIVAL = 0.4  #: IoU with the box of the other keyframe, above which a pass has arrived
 _ARRIVAL_WEIGHT = 4.0
 _SAME = 0.5  #: IoU of two boxes that count as the same
 
-#: Weights of the logistic regression: bias, then those of the features in the order of `_features`.
-_LOGISTIC = np.array([-5.2, 4.2, 4.9, 0.6, 2.7, -0.9])
+#: Weights of the logistic regression: bias, then those of the features in `fuse`. They were fitted on sixteen sequences
+#: with one to eight boxes, each sequence with the same weight; the last one was lowered, so that frames with passes in
+#: only one direction are never checked.
+_LOGISTIC = np.array([-6.3, 5.75, 2.1, 5.2, -2.5])
 
 
 def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) -> tuple[Float64, Float64, Float64]:
-    """Fuse the passes of the frames between two keyframes, or a keyframe and an end of the video.
+    """Fuse passes, or their parts, over the frames between two keyframes, or a keyframe and an end of the video.
 
     start, stop : first of these frames, and the one after the last
 
@@ -53,28 +54,12 @@ def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) ->
         [
             votes.max(axis=0) / weights.sum(axis=0),
             np.where(opposite, agreement, 0.0).max(axis=0),
-            np.full(count, arrived.mean()),
-            scores.min(axis=0),
-            _distortion(merged, way, keyframes.get(start - 1), keyframes.get(stop)),
+            scores.clip(0, 1).min(axis=0),
+            np.full(count, forward.all() or not forward.any()),
         ]
     )
     probabilities = 1 / (1 + np.exp(-_LOGISTIC[0] - features @ _LOGISTIC[1:]))
     return merged, probabilities, scores[best, frames]
-
-
-def iou(one: Float64, other: Float64) -> Float64:
-    """Intersection over union of boxes (..., 4); 1 if both are NaN, 0 if one is."""
-    low, high = np.maximum(one[..., :2], other[..., :2]), np.minimum(_ends(one), _ends(other))
-    shared = np.prod(np.maximum(high - low, 0), axis=-1)
-    union = np.prod(one[..., 2:], axis=-1) + np.prod(other[..., 2:], axis=-1) - shared
-    both_absent = np.isnan(one[..., 0]) & np.isnan(other[..., 0])
-    ratios: Float64 = np.where(both_absent, 1.0, np.nan_to_num(shared / union))
-    return ratios
-
-
-def _ends(boxes: Float64) -> Float64:
-    ends: Float64 = boxes[..., :2] + boxes[..., 2:]
-    return ends
 
 
 def _in_order(one: Pass, count: int) -> tuple[Float64, Float64]:
@@ -85,10 +70,7 @@ def _in_order(one: Pass, count: int) -> tuple[Float64, Float64]:
 
 def _arrives(one: Pass, keyframes: Keyframes) -> bool:
     """Whether a pass ends near the box of the keyframe at its end, or without a box where the object is absent."""
-    if one.stop not in keyframes:
-        return False
-    box = np.array(keyframes[one.stop] or [np.nan] * 4)
-    return bool(iou(one.boxes[-1], box) > _ARRIVAL)
+    return one.stop in keyframes and one.is_near(one.stop, keyframes[one.stop])
 
 
 def _averaged(boxes: Float64, weights: Float64, best: np.ndarray) -> Float64:
@@ -101,14 +83,3 @@ def _averaged(boxes: Float64, weights: Float64, best: np.ndarray) -> Float64:
     mean = (corners * weights).sum(axis=0) / np.where(total, total, 1.0)
     merged: Float64 = np.where(present[best, frames][:, None], mean, np.nan)
     return merged
-
-
-def _distortion(boxes: Float64, way: Float64, before: object, after: object) -> Float64:
-    """How much width and height differ from those between the keyframes, as absolute logarithms; 0 if not known."""
-    ends = [np.array(box)[2:] for box in (before, after) if box is not None]
-    if not ends:
-        return np.zeros(len(boxes))
-    expected = np.log(ends[0]) * (1 - way)[:, None] + np.log(ends[-1]) * way[:, None]
-    sizes = np.log(np.nan_to_num(boxes[:, 2:], nan=1.0))
-    differences: Float64 = np.where(np.isnan(boxes[:, 0]), 0.0, np.abs(sizes - expected).sum(axis=1))
-    return differences

@@ -29,15 +29,18 @@ from catstream.training.trainer import Trainer
 Keyframes = Mapping[int, Box | None]
 
 
+_NEAR = 0.4  #: IoU with the box of a keyframe, above which a pass has not lost the object there
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """The boxes of a pass.
+    """The boxes of a pass, or of a part of it.
 
     start        the keyframe that it starts at
     stop         its last frame: the next keyframe, or the end of the video; before `start` if it runs backwards
     boxes        float64 (frames, 4), pixels, from the frame after `start` to `stop`; NaN where the object is absent
     scores       float64 (frames,), scores of the tracker
-    with_memory  whether it began with the model of all boxes of the object
+    with_memory  whether it began with the model of the other boxes of the object
     """
 
     start: int
@@ -49,6 +52,41 @@ class Pass:
     @property
     def is_forward(self) -> bool:
         return self.stop > self.start
+
+    def covers(self, start: int, stop: int) -> bool:
+        """Whether it runs from `start` or before it, in the same direction, to `stop` or beyond it."""
+        way = 1 if self.is_forward else -1
+        return way * self.start <= way * start < way * stop <= way * self.stop
+
+    def is_near(self, frame: int, box: Box | None) -> bool:
+        """Whether it has the object at the box of a frame after its start, or rightly has no box there."""
+        drawn = np.array([np.nan] * 4 if box is None else box)
+        return bool(iou(self.boxes[abs(frame - self.start) - 1], drawn) > _NEAR)
+
+    def part(self, start: int, stop: int, keyframes: Keyframes) -> Pass | None:
+        """Its part from a keyframe on to `stop`; None if it does not cover it, or has lost the object before."""
+        if not self.covers(start, stop):
+            return None
+        passed = range(start, self.start, -1 if self.is_forward else 1)
+        if not all(self.is_near(frame, keyframes[frame]) for frame in passed if frame in keyframes):
+            return None
+        part = slice(abs(start - self.start), abs(stop - self.start))
+        return Pass(start, stop, self.boxes[part], self.scores[part], self.with_memory)
+
+
+def iou(one: Float64, other: Float64) -> Float64:
+    """Intersection over union of boxes (..., 4); 1 if both are NaN, 0 if one is."""
+    low, high = np.maximum(one[..., :2], other[..., :2]), np.minimum(_ends(one), _ends(other))
+    shared = np.prod(np.maximum(high - low, 0), axis=-1)
+    union = np.prod(one[..., 2:], axis=-1) + np.prod(other[..., 2:], axis=-1) - shared
+    both_absent = np.isnan(one[..., 0]) & np.isnan(other[..., 0])
+    ratios: Float64 = np.where(both_absent, 1.0, np.nan_to_num(shared / union))
+    return ratios
+
+
+def _ends(boxes: Float64) -> Float64:
+    ends: Float64 = boxes[..., :2] + boxes[..., 2:]
+    return ends
 
 
 @one_thread(opencv=True)

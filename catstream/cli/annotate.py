@@ -56,12 +56,13 @@ def annotate(
 
     Each stretch between two keyframes is tracked from both of its ends. A frame
     is checked if the two agree so well that its box is right with a probability
-    of 95 %. The command prints the frame to look at next: add its box, and run
+    of 96 %. The command prints the frame to look at next: add its box, and run
     the command again with --boxes OUTPUT/keyframes.csv --overwrite.
 
     \b
     OUTPUT
-      NAME.ndjson, NAME.csv  the log of the tracks, for catstream export
+      NAME.ndjson, NAME.csv  the log of the tracks, for catstream export; unchecked
+                             boxes are doubtful
       keyframes.csv          all boxes: frame,object,x,y,w,h
       checked.csv            frame,object,checked,probability; checked is
                              keyframe, checked or unchecked
@@ -117,11 +118,14 @@ def _show(bar: Progress, work: str, done: int, total: int | None) -> None:
 
 def _files(annotation: Annotation, video: str, output: Path, *, overwrite: bool) -> RunFiles:
     """The log of the tracks; raise VideoError if it could not be written."""
-    from catstream.sinks.destinations import Origin
+    from catstream.sinks.destinations import Head, Origin
     from catstream.sinks.track_log import RunFiles, places_of
 
-    places = places_of(annotation.frames.name, Results(output=output))
-    files = RunFiles(Origin(video, image_rate=annotation.frames.rate), output, places)
+    frames = annotation.frames
+    changed = tuple(annotation.settings.changed())
+    head = Head(source=video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
+    origin = Origin(video, image_rate=frames.rate, head=head)
+    files = RunFiles(origin, output, places_of(frames.name, Results(output=output)))
     files.check(overwrite=overwrite, earlier=[])
     return files
 
@@ -130,16 +134,14 @@ def _write(annotation: Annotation, files: RunFiles, checked: Path, following: Pa
     """Write the log, and the tables of checked frames and of the frames to look at next."""
     from catstream.sinks.destinations import TrackedFrame
 
+    frames = [*zip(*annotation.tracks.values(), strict=True)]
     with files.opened("") as write:
-        for tracks in zip(*annotation.tracks.values(), strict=True):
+        for tracks in frames:
             write(TrackedFrame(list(tracks)))
-    probabilities, checks = annotation.probabilities, annotation.checked
-    rows = [
-        (frame, name, checks[name][frame], f"{probabilities[name][frame]:.4f}")
-        for frame in range(len(annotation.frames))
-        for name in checks
+    checks = [
+        (track.frame, track.object, track.checked, f"{track.probability:.4f}") for each in frames for track in each
     ]
-    _write_table(checked, ("frame", "object", "checked", "probability"), rows)
+    _write_table(checked, ("frame", "object", "checked", "probability"), checks)
     found = [(frame, name, f"{errors:.1f}") for frame, name, errors in annotation.next_frames()]
     _write_table(following, ("frame", "object", "errors"), found)
 

@@ -37,6 +37,8 @@ from catstream.messages.schema import (
 
 State = Literal["bootstrapping", "present", "absent"]
 
+Check = Literal["", "keyframe", "checked", "unchecked"]
+
 Level = Literal["lost", "redetected", "weak", "confident"]
 
 Verb = Literal["set-box", "search", "forget", "pause", "resume", "save", "stop"]
@@ -289,6 +291,9 @@ class Track:
                    given this name, by a box or a saved model
     doubtful       whether the box should be looked at: the level of belief is "weak" or "redetected"
     source_frame   number of the frame in its file or folder: start + stride * frame; `frame` for a live source
+    checked        of an annotation: "keyframe" with a box that a person drew, "checked" where passes in both directions
+                   agree, else "unchecked"; "" of any other run
+    probability    of an annotation: probability that the box, or its absence, is right; None of any other run
 
     >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
@@ -306,6 +311,8 @@ class Track:
     began: Integer = 0
     doubtful: bool = False
     source_frame: Integer = -1
+    checked: Check = ""
+    probability: Number | None = None
 
     def __post_init__(self) -> None:
         if self.source_frame < 0:
@@ -322,10 +329,12 @@ class Track:
     def to_dict(self) -> dict[str, Any]:
         """The fields by name, of plain types for JSON, as in FILE.ndjson: a box is a list [x, y, w, h], or None.
 
+        `checked` and `probability` are fields of an annotation only.
+
         >>> Track(13, 12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
         True
         """
-        return {
+        fields = {
             "seq": int(self.seq),
             "frame": int(self.frame),
             "time": float(self.time),
@@ -339,6 +348,7 @@ class Track:
             "doubtful": bool(self.doubtful),
             "source_frame": int(self.source_frame),
         }
+        return fields | ({"checked": self.checked, "probability": self.probability} if self.checked else {})
 
 
 @dataclass(frozen=True, slots=True)

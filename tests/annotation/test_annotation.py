@@ -55,14 +55,24 @@ def test_after_one_box_the_rest_is_tracked_unchecked_and_the_last_frame_is_asked
         assert {question.frame for question in annotation.next_frames()} == {0, FRAMES - 1}
 
 
-def test_a_box_that_is_added_changes_only_the_passes_beside_it(demo):
+def test_a_box_that_is_added_is_tracked_from_and_earlier_passes_remain(demo):
     video, truth = demo
     with annotate(video, {0: truth[0], 12: truth[12], FRAMES - 1: truth[-1]}, jobs=1) as annotation:
         before = annotation.passes()
         annotation.add(18, truth[18])
-        after = annotation.passes()
-    assert [one for one in before if one in after] == [one for one in before if one.start + one.stop == 12]
-    assert {(one.start, one.stop) for one in after} == {(0, 12), (12, 0), (12, 18), (18, 12), (18, 23), (23, 18)}
+        added = [one for one in annotation.passes() if one not in before]
+        assert len(annotation.passes()) == len(before) + len(added)
+        assert {(one.start, one.stop) for one in added} == {(18, 12), (18, FRAMES - 1)}
+
+
+def test_a_box_that_is_replaced_drops_what_was_tracked_from_it(demo):
+    video, truth = demo
+    wrong = truth[-1].centred(60, 60)
+    with annotate(video, {0: truth[0], FRAMES - 1: wrong}, jobs=1) as annotation:
+        wrong_passes = annotation.passes()
+        annotation.add(FRAMES - 1, truth[-1])
+        assert not any(one in wrong_passes for one in annotation.passes())
+        assert annotation.share_checked == 1
 
 
 def test_two_processes_give_the_same_tracks_as_one(demo, both_ends):
@@ -92,7 +102,7 @@ def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
 
     def interrupted(*task):
         started.append(task)
-        if len(started) > 1:
+        if len(started) == 2:
             raise KeyboardInterrupt
         return work(*task)
 
@@ -102,6 +112,8 @@ def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
             annotation.track()
         assert len(annotation.passes()) == 1
         assert annotation.tracks[""][5].box is not None
+        annotation.track()
+        assert len(annotation.passes()) == 2
 
 
 def test_the_decoded_frames_are_deleted_with_the_annotation_and_after_an_error(demo):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from catstream.annotation.fusion import fuse, iou
-from catstream.annotation.passes import Pass
+from catstream.annotation.fusion import fuse
+from catstream.annotation.passes import Pass, iou
 from catstream.base.box import Box
 
 LEFT, RIGHT = Box(10, 20, 30, 40), Box(110, 20, 30, 40)
@@ -27,14 +27,13 @@ def fused(*passes, drawn):
 def test_passes_that_agree_give_their_box_with_a_high_probability():
     boxes, probabilities, _ = fused(forward(LEFT), backward(LEFT), drawn={0: LEFT, 10: LEFT})
     assert boxes == pytest.approx(np.array([LEFT] * 9))
-    assert (probabilities > 0.95).all()
+    assert (probabilities > 0.96).all()
 
 
 def test_the_nearer_keyframe_wins_where_neither_pass_arrives():
     boxes, probabilities, _ = fused(forward(LEFT), backward(RIGHT), drawn={0: LEFT, 10: RIGHT})
     assert boxes[:, 0].tolist() == [10.0] * 5 + [110.0] * 4
-    assert (probabilities < 0.95).all()
-    assert probabilities.argmin() == 4
+    assert (probabilities.argmin(), probabilities.min() < 0.8) == (4, True)
 
 
 def test_a_pass_that_arrives_at_the_other_keyframe_wins_beyond_the_middle():
@@ -44,7 +43,7 @@ def test_a_pass_that_arrives_at_the_other_keyframe_wins_beyond_the_middle():
 
 def test_a_frame_that_one_pass_saw_alone_is_not_checked():
     for passes in ([forward(LEFT)], [backward(LEFT)]):
-        assert (fused(*passes, drawn={0: LEFT, 10: LEFT})[1] < 0.95).all()
+        assert (fused(*passes, drawn={0: LEFT, 10: LEFT})[1] < 0.96).all()
 
 
 def test_passes_agree_that_an_object_is_absent():
@@ -69,6 +68,23 @@ def test_frames_without_a_pass_have_no_box_and_no_probability():
     boxes, probabilities, _ = fused(drawn={0: LEFT, 10: LEFT})
     assert np.isnan(boxes).all()
     assert not probabilities.any()
+
+
+def test_a_part_of_a_pass_starts_at_a_later_keyframe():
+    whole = Pass(0, 10, np.arange(40.0).reshape(10, 4), np.arange(10.0))
+    part = whole.part(4, 8, {0: LEFT, 4: Box(*whole.boxes[3]), 10: LEFT})
+    assert (part.start, part.stop, part.scores.tolist()) == (4, 8, [4, 5, 6, 7])
+    assert (part.boxes == whole.boxes[4:8]).all()
+    back = Pass(10, 0, whole.boxes, whole.scores)
+    assert back.part(4, 0, {10: LEFT, 4: Box(*back.boxes[5])}).scores.tolist() == [6, 7, 8, 9]
+    assert back.part(0, 4, {}) is whole.part(8, 12, {}) is None
+
+
+def test_a_pass_that_lost_the_object_before_a_keyframe_has_no_part_after_it():
+    assert forward(LEFT).part(4, 8, {0: LEFT, 4: LEFT}) is not None
+    assert forward(LEFT).part(4, 8, {0: LEFT, 4: RIGHT}) is None
+    assert forward(LEFT).part(4, 8, {0: LEFT, 4: None}) is None
+    assert forward(ABSENT).part(4, 8, {0: LEFT, 4: None}) is not None
 
 
 def test_iou_is_one_if_both_are_absent_and_zero_if_one_is():

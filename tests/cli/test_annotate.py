@@ -34,14 +34,22 @@ def test_annotate_writes_the_log_and_its_tables_and_continues_from_its_boxes(dem
     assert len(rows(out / "keyframes.csv")) == 2
     checked = rows(out / "checked.csv")
     assert [row["checked"] for row in checked] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
-    assert all(0.95 <= float(row["probability"]) <= 1 for row in checked)
+    assert all(0.96 <= float(row["probability"]) <= 1 for row in checked)
 
 
 def test_the_log_of_an_annotation_is_exported_as_that_of_a_run(demo, succeed, tmp_path):
     video, boxes = demo
     succeed("annotate", video, "--box", f"anna@0={boxes[0]}", "--output", tmp_path / "out", "--jobs", 1)
-    succeed("export", tmp_path / "out" / "demo.ndjson", tmp_path / "demo.coco.json", "--size", video)
-    assert len(json.loads((tmp_path / "demo.coco.json").read_text())["annotations"]) == FRAMES
+    head, first, second, *_ = map(json.loads, (tmp_path / "out" / "demo.ndjson").read_text().splitlines())
+    assert (head["frames"], head["size"]) == (FRAMES, [320, 240])
+    assert [(track["checked"], track["doubtful"]) for track in (first, second)] == [
+        ("keyframe", False),
+        ("unchecked", True),
+    ]
+    assert 0 < second["probability"] < first["probability"] == 1
+    succeed("export", tmp_path / "out" / "demo.ndjson", tmp_path / "demo.coco.json")
+    found = json.loads((tmp_path / "demo.coco.json").read_text())["annotations"]
+    assert [box["attributes"]["doubtful"] for box in found] == [False, *[True] * (FRAMES - 1)]
 
 
 @pytest.mark.parametrize(

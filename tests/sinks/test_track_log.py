@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import product
 from math import isnan
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_each_track_is_in_the_files_at_once(tmp_path):
     with ExitStack() as stack:
         objects = [json.loads(line) for line in filled(tmp_path / "t.ndjson", stack).read_text().splitlines()[1:]]
         rows = list(csv.DictReader(filled(tmp_path / "t.csv", stack).read_text().splitlines()))
-    assert objects == [{**asdict(each), "box": each.box and list(each.box)} for each in TRACKS]
+    assert objects == [each.to_dict() for each in TRACKS]
     assert list(rows[0].values()) == ["0", "0.000000", "bootstrapping", "10.0000", "20.0000", "30.5000", "40.0000",
                                       "1.000000", "0", "", "0", "0.000000"]  # fmt: skip
     assert [row["state"] for row in rows] == [each.state for each in TRACKS]
