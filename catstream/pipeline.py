@@ -137,15 +137,16 @@ class Pipeline:
         _check_exclusive(state, resume, box, model)
         start_server()  # it imports while this process opens the source
         text = None if source is None else source_text(source)
-        self._earlier = None if resume is None else Job.load(Path(resume))
-        if self._earlier is None:
+        self._earlier: Job | None = None
+        self._state = None if state is None else Path(state).absolute()
+        if resume is None:
             job = Job.new(text, box, settings, models=model, part=part, results=results, paused=paused)
         else:
+            self._earlier, self._state = Job.load(Path(resume)), Path(resume).absolute()
             job = self._earlier.resumed(text, settings, part=part, results=results, paused=paused)
         self._save_models = job.results.models if save_model is None else _writable(save_model)
         info = probe(job)
         self._job = job = prepared(job, info)
-        self._state = Path(state or resume or "").absolute() if state or resume else None
         if self._earlier is not None and self._state is not None:
             self._earlier.check_fits(job, self._state)
         self.name, self.frames, self.rate, self.size, self.live = info
