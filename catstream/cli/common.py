@@ -57,10 +57,10 @@ class CommandGroup(click.Group):
 
 def table(*heads: str, right: Collection[str] = ()) -> Table:
     """A table without lines, whose columns `right` are aligned to the right."""
-    made = Table(box=None, header_style="bold", pad_edge=False)
+    columns = Table(box=None, header_style="bold", pad_edge=False)
     for head in heads:
-        made.add_column(head, justify="right" if head in right else "left", overflow="fold")
-    return made
+        columns.add_column(head, justify="right" if head in right else "left", overflow="fold")
+    return columns
 
 
 def line_of(console: Console, *columns: ProgressColumn) -> Progress:
@@ -68,9 +68,9 @@ def line_of(console: Console, *columns: ProgressColumn) -> Progress:
 
     columns : by default the description, a bar, and how much of the total is done
     """
-    shown = columns or (text("{task.description}"), BarColumn(24), MofNCompleteColumn())
-    hidden, wide = not console.is_terminal, shown[-1].get_table_column().ratio is not None
-    return Progress(*shown, console=console, transient=True, expand=wide, refresh_per_second=8, disable=hidden)
+    parts = columns or (text("{task.description}"), BarColumn(24), MofNCompleteColumn())
+    hidden, wide = not console.is_terminal, parts[-1].get_table_column().ratio is not None
+    return Progress(*parts, console=console, transient=True, expand=wide, refresh_per_second=8, disable=hidden)
 
 
 def text(form: str, *, last: bool = False) -> TextColumn:

@@ -32,7 +32,7 @@ from catstream.errors import (
     StoreError,
 )
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.store import Claim, Generation, Store
+from catstream.fleet.store import Claim, Snapshot, Store
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
@@ -56,9 +56,9 @@ _LATE = 3.0  # a state that is older than so many intervals is a trouble
 _log = logging.getLogger(__name__)
 
 
-def given_model(stream: str, name: str) -> str:
-    """The name in the store of a saved model that the spec of a stream gives for an object."""
-    return f"given.{sha256(f'{stream}/{name}'.encode()).hexdigest()[:32]}"
+def initial_model(stream: str, name: str) -> str:
+    """The name in the store of the saved model of an object in the spec of a stream."""
+    return f"initial.{sha256(f'{stream}/{name}'.encode()).hexdigest()[:32]}"
 
 
 class Stream:
@@ -156,7 +156,7 @@ class Stream:
                 return
             claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
-            pipeline = stack.enter_context(self._made(claim, stack))
+            pipeline = stack.enter_context(self._open_pipeline(claim, stack))
             with self._lock:
                 self._failure = ""
                 self._began_at, self._stored_at = time.time(), float(facts.get("time", 0.0))
@@ -193,7 +193,7 @@ class Stream:
             if not ended or self._stop.wait(self._every):
                 return
 
-    def _made(self, claim: Claim, stack: ExitStack) -> Pipeline:
+    def _open_pipeline(self, claim: Claim, stack: ExitStack) -> Pipeline:
         """The pipeline, which continues from the state of the claim if there is one."""
         settings = self._spec.settings | self._sockets(stack)
         state = self._folder / "state"
@@ -227,11 +227,11 @@ class Stream:
                     with suppress(CommandRejectedError):  # it was forgotten already
                         controlled.forget(name)
         for name in sorted(self._spec.models.keys() - before):
-            if (model := self._store.model(given_model(self._spec.name, name)).newest()) is None:
+            if (model := self._store.model(initial_model(self._spec.name, name)).newest()) is None:
                 raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
             self._search(pipeline, model, name)
 
-    def _search(self, pipeline: Pipeline, model: Generation, name: str) -> None:
+    def _search(self, pipeline: Pipeline, model: Snapshot, name: str) -> None:
         """Search for an object by a saved model in the store."""
         learned = SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store")
         with self._control(pipeline) as controlled:
@@ -241,13 +241,13 @@ class Stream:
     def _control(pipeline: Pipeline) -> Control:
         return control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
 
-    def _search_merged(self, pipeline: Pipeline, known: dict[str, int]) -> None:
-        """Search for each followed object that is not present by a merged model that is newer than the known one."""
+    def _search_merged(self, pipeline: Pipeline, tokens: dict[str, int]) -> None:
+        """Search for each followed object that is not present by a merged model that is newer than the last one."""
         for name in self._follow:
             if name in self._present:
                 continue
-            if (model := self._store.model(name).newest(known.get(name, 0))) is not None:
-                known[name] = model.token
+            if (model := self._store.model(name).newest(tokens.get(name, 0))) is not None:
+                tokens[name] = model.token
                 self._search(pipeline, model, name)
 
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
@@ -269,14 +269,14 @@ class Stream:
 
     def _keep_storing(self, claim: Claim, pipeline: Pipeline, over: threading.Event) -> None:
         """Store the state every few seconds until the pipeline is over, or another process has claimed the stream."""
-        known: dict[str, int] = {}  # token of the merged model of each object that was searched for
+        tokens: dict[str, int] = {}  # token of the merged model of each object that was searched for
         pause = self._every
         while not over.wait(pause) and not self._superseded:
             began = time.monotonic()
             self._write(claim)
             pause = max(self._every, (time.monotonic() - began) / _STORING_SHARE)
             try:
-                self._search_merged(pipeline, known)
+                self._search_merged(pipeline, tokens)
             except CatstreamError as error:
                 _log.warning("%s does not search by a merged model: %s", self._spec.name, error)
 
@@ -291,13 +291,13 @@ class Stream:
             "ended": ended,
         }
         try:
-            found = {(str(path), path.stat().st_mtime_ns) for path in state.rglob("*.*") if path.is_file()}
-            if found == self._files and not is_last:
+            versions = {(str(path), path.stat().st_mtime_ns) for path in state.rglob("*.*") if path.is_file()}
+            if versions == self._files and not is_last:
                 claim.check()
                 self._stored_at = now
             elif content := files(state):
                 claim.write(content, facts)
-                self._files, self._stored_at = found, now
+                self._files, self._stored_at = versions, now
             else:  # no checkpoint yet
                 claim.check()
         except FencedError as error:
@@ -316,11 +316,11 @@ def free_ports(address: str, stack: ExitStack) -> int:
     """The first of some ports of this node that are free, and that no other stream takes while the stack is open."""
     while True:
         first = random.choice(PORTS)
-        with ExitStack() as tried, suppress(OSError):
-            reserved = tried.enter_context(socket.socket(socket.AF_UNIX))
+        with ExitStack() as block, suppress(OSError):
+            reserved = block.enter_context(socket.socket(socket.AF_UNIX))
             reserved.bind(f"\0catstream-ports-{first}")  # the kernel frees it if this process dies
             with ExitStack() as probes:
                 for port in range(first, first + PORTS.step):
                     probes.enter_context(socket.socket()).bind((address, port))
-            stack.enter_context(tried.pop_all())
+            stack.enter_context(block.pop_all())
             return first

@@ -21,7 +21,7 @@ from typing import Literal
 from catstream.base.addresses import without_password
 from catstream.errors import CatstreamError
 from catstream.fleet import lifecycle
-from catstream.fleet.actor import Stream, given_model
+from catstream.fleet.actor import Stream, initial_model
 from catstream.fleet.lifecycle import Actor, Node
 from catstream.fleet.registry import RegistryServer
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
@@ -78,7 +78,7 @@ class Controller:
         self._phase: Literal["idle", "up", "down"] = "idle"  # before the first change; and while the fleet ends
         self._recent = FleetStatus(name, time.time())
         self._unstored: dict[str, str] = {}  # why the last state of a stream that has stopped is not stored
-        self._asked = float("-inf")  # when a client of the registry has asked last
+        self._last_question = float("-inf")  # when a client of the registry has asked last
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
         self._registry: RegistryServer | None = None
@@ -106,7 +106,8 @@ class Controller:
         def changed(before: FleetSpec) -> FleetSpec:
             for name in names:
                 before.check_stream(name)
-            return replace(before, streams={name: each for name, each in before.streams.items() if name not in names})
+            streams = {name: stream for name, stream in before.streams.items() if name not in names}
+            return replace(before, streams=streams)
 
         return self._change(changed)
 
@@ -135,7 +136,7 @@ class Controller:
         with self._lock:
             self._spec = replace(self._spec, streams={})
             self._recent = self.status()
-        if time.monotonic() - self._asked < _GOODBYE_SECONDS:
+        if time.monotonic() - self._last_question < _GOODBYE_SECONDS:
             time.sleep(_GOODBYE_SECONDS)
         self._over.set()
         for thread in self._threads:
@@ -151,7 +152,7 @@ class Controller:
             spec = change(self._spec)
             spec.check_follows(self._spec)
             for (stream, name), data in (models or {}).items():
-                self._store.model(given_model(stream, name)).put({"model": data}, {})
+                self._store.model(initial_model(stream, name)).put({"model": data}, {})
             self._store.fleet.put({"fleet": to_json(spec)}, {})
             with self._lock:
                 lines = self._spec.changes(spec, self._ended, are_running=self._phase == "up")
@@ -186,7 +187,7 @@ class Controller:
         """Answer the registry, without the store."""
         while self._registry is not None and not self._over.is_set():
             if self._registry.turn(_QUESTION_SECONDS):
-                self._asked = time.monotonic()
+                self._last_question = time.monotonic()
 
     def _run(self) -> None:
         logged = ""
@@ -205,9 +206,9 @@ class Controller:
         """Look at the cluster and the actors, and do what makes them those that should run."""
         import ray
 
-        found, existing = nodes(), actors(self._name)  # without the lock: they ask the head
+        cluster, existing = nodes(), actors(self._name)  # without the lock: they ask the head
         with self._lock:
-            self._nodes = self._marked(found)
+            self._nodes = self._marked(cluster)
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
@@ -228,10 +229,10 @@ class Controller:
                     del self._actors[name]
             self._recent = self.status()
 
-    def _marked(self, found: list[Node]) -> list[Node]:
-        return [replace(node, draining=node.name in self._spec.draining) for node in found]
+    def _marked(self, cluster: list[Node]) -> list[Node]:
+        return [replace(node, draining=node.name in self._spec.draining) for node in cluster]
 
-    def _wanted(self, name: str) -> StreamSpec | None:
+    def _desired(self, name: str) -> StreamSpec | None:
         """The spec of a stream; None if it should not run now."""
         spec = self._spec.streams.get(name) if self._phase == "up" else None
         return None if spec is None or self._ended.get(name) == spec.digest else spec
@@ -289,15 +290,15 @@ class Controller:
         """Do what the table says for what has happened to a stream."""
         import ray
 
-        wanted, now, before = self._wanted(name), time.monotonic(), actor.state
-        happened = lifecycle.event(wanted, actor, self._nodes, now)
+        spec, now, before = self._desired(name), time.monotonic(), actor.state
+        happened = lifecycle.event(spec, actor, self._nodes, now)
         if happened is None or (step := lifecycle.TABLE.get((before, happened))) is None:
             return
         after, action = step
         _log.info("%s: %s, %s: %s %s", name, before, lifecycle.EVENTS[happened], after, action)
         match action:
-            case "start" if wanted is not None:
-                self._start(wanted, actor, now)
+            case "start" if spec is not None:
+                self._start(spec, actor, now)
                 return
             case "stop":
                 actor.call = actor.handle.stop.remote()
@@ -342,7 +343,7 @@ class Controller:
             node = next((node.name for node in self._nodes if node.id == actor.node), "")
             quiet = now - actor.answered
             trouble = f"it has not answered for {quiet:.0f} s" if quiet > QUIET_SECONDS else last.trouble
-            leaves = self._phase == "up" and lifecycle.event(self._wanted(name), actor, self._nodes, now) == "unwanted"
+            leaves = self._phase == "up" and lifecycle.event(self._desired(name), actor, self._nodes, now) == "unwanted"
             return replace(last, node=node, state="moving" if leaves else last.state, trouble=trouble)
         age = None if last.stored_seconds is None else last.stored_seconds + now - actor.answered
         last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age, trouble="")
@@ -372,21 +373,21 @@ def actor_name(fleet: str, *words: str) -> str:
 def named_actors() -> list[str]:
     from ray.util import list_named_actors
 
-    return [each["name"] for each in list_named_actors(all_namespaces=True) if each["namespace"] == NAMESPACE]
+    return [actor["name"] for actor in list_named_actors(all_namespaces=True) if actor["namespace"] == NAMESPACE]
 
 
 def actors(fleet: str) -> dict[str, str]:
     """What the actor of each stream of a fleet was started for, by stream."""
     prefix = actor_name(fleet, "stream") + "/"
-    found = (name.removeprefix(prefix).partition("/") for name in named_actors() if name.startswith(prefix))
-    return {stream: order for stream, _, order in found}
+    parts = (name.removeprefix(prefix).partition("/") for name in named_actors() if name.startswith(prefix))
+    return {stream: order for stream, _, order in parts}
 
 
 def nodes() -> list[Node]:
     """The nodes of the connected cluster by name; a dead one as long as no living node has its name."""
     import ray
 
-    found: dict[str, Node] = {}
+    by_name: dict[str, Node] = {}
     for entry in ray.nodes():
         node = Node(
             entry["NodeName"] or entry["NodeManagerAddress"],
@@ -396,6 +397,6 @@ def nodes() -> list[Node]:
             {key: value for key, value in (entry.get("Labels") or {}).items() if not key.startswith("ray.io/")},
             entry["Alive"],
         )
-        if node.name not in found or node.alive:
-            found[node.name] = node
-    return sorted(found.values(), key=lambda node: node.name)
+        if node.name not in by_name or node.alive:
+            by_name[node.name] = node
+    return sorted(by_name.values(), key=lambda node: node.name)

@@ -37,6 +37,7 @@ from typing import Any
 
 from catstream.base.files import is_locked, lock, state_home, write_atomically
 from catstream.base.names import UNNAMED, check_name
+from catstream.base.text import counted
 from catstream.client.registry import REGISTRY_PORT
 from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
 from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors, nodes
@@ -111,7 +112,8 @@ class Fleet(AbstractContextManager["Fleet"]):
         self._address = address or os.environ.get("RAY_ADDRESS", "")
         self.name = name or (read.name if read is not None else "")
         if not self.name and not self._address:
-            self.name = _only([each.name for each in sorted(_home().glob("*")) if _is_up(each)], "this machine")
+            folders = sorted(_fleets_folder().glob("*"))
+            self.name = _only([folder.name for folder in folders if _is_up(folder)], "this machine")
         self._owned: ExitStack | None = None  # the node of Ray that `up` has started
         self._controller: Any = None
 
@@ -168,12 +170,12 @@ class Fleet(AbstractContextManager["Fleet"]):
         Streams wait if the other nodes have no room for them.
         """
         self._connect()
-        known = [each.name for each in nodes() if each.alive]
-        if node not in known:
-            raise FleetError(f"there is no node {node!r}, or it has died: there are {', '.join(known) or 'none'}")
-        count = sum(each.node == node for each in self.status().streams.values())
+        live = [other.name for other in nodes() if other.alive]
+        if node not in live:
+            raise FleetError(f"no live node named {node!r} (live nodes: {', '.join(live) or 'none'})")
+        count = sum(stream.node == node for stream in self.status().streams.values())
         self._ask("drain", node, undo=undo)
-        return f"{node} takes streams again" if undo else f"{node} is draining; streams that leave it: {count}"
+        return f"{node} takes streams again" if undo else f"{node} is draining: {counted(count, 'stream')} to move"
 
     def status(self) -> FleetStatus:
         """The state of all streams and nodes."""
@@ -208,9 +210,9 @@ class Fleet(AbstractContextManager["Fleet"]):
         Returns a line for each stream whose last state could not be stored.
         """
         deadline = time.monotonic() + DOWN_SECONDS
-        while (left := self._ask("close")) and time.monotonic() < deadline:
+        while (running := self._ask("close")) and time.monotonic() < deadline:
             time.sleep(_LOOK_SECONDS)
-        late = [f"{name}: it did not stop within {DOWN_SECONDS:g} s" for name in left]
+        late = [f"{name}: it did not stop within {DOWN_SECONDS:g} s" for name in running]
         if late and not self.is_owner:  # whose node ends with them
             raise FleetError("\n".join([f"the fleet {self.name} is not down yet, run the command again", *late]))
         unstored: list[str] = late + self._ask("end")
@@ -239,7 +241,7 @@ class Fleet(AbstractContextManager["Fleet"]):
     @property
     def _folder(self) -> Path:
         """The folder of the fleet on this machine."""
-        return _home() / self.name
+        return _fleets_folder() / self.name
 
     def _start_ray(self) -> None:
         """Start a node of Ray on the loopback interface, unless another process has it or is starting it."""
@@ -332,7 +334,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         options: dict[str, Any] = {}
         if self._address:
             registry = spec.registry or f"{_gcs_address().rpartition(':')[0]}:{REGISTRY_PORT}"
-            listen, keys = f"tcp://{registry}", spec.keys or str(_home() / spec.name / "keys")
+            listen, keys = f"tcp://{registry}", spec.keys or str(_fleets_folder() / spec.name / "keys")
             options["resources"] = {f"node:{registry.rpartition(':')[0]}": 0.001}
         else:
             listen, keys = str(self._folder / "registry"), ""  # it stays if Ray starts the controller again
@@ -390,25 +392,26 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
     """Merge what the newest states of streams in a store have learned of an object, and store the model if it is new.
 
     Frames are counted once: of streams that share frames, as they continue from one model, one is merged. If the
-    streams are `named`, each has to know the object; otherwise those that do not are left out.
+    streams are `named`, each has to know the object; otherwise the others are skipped.
     """
     if not name and not named:
         raise FleetError(
             "objects without a name may be different ones: name the object (--object NAME), or the streams that show it"
         )
     store = Store(url)
-    learned = {stream: found for stream in streams if (found := _learned(store, stream, name, named=named)) is not None}
+    models = {stream: _learned(store, stream, name, named=named) for stream in streams}
+    learned = {stream: model for stream, model in models.items() if model is not None}
     if not learned:
         raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
-    rows = {stream: sum(tree.rows_seen for tree in each.trees.values()) for stream, each in learned.items()}
-    chosen = disjoint({stream: (set(each.origins), rows[stream]) for stream, each in learned.items()})
+    rows = {stream: sum(tree.rows_seen for tree in model.trees.values()) for stream, model in learned.items()}
+    chosen = disjoint({stream: (set(model.origins), rows[stream]) for stream, model in learned.items()})
     first, *others = (learned[stream] for stream in chosen)
     # The name says that the object is the same, so its appearances are not compared.
-    model = (merge([first, *others], force=True) if others else first).to_bytes()
-    models = store.model(name)
-    if (before := models.newest()) is None or before.files["model"] != model:  # followers get each new model
-        models.put({"model": model}, {"streams": chosen})
-    return Merged(model, tuple(chosen), tuple(stream for stream in learned if stream not in chosen))
+    content = (merge([first, *others], force=True) if others else first).to_bytes()
+    stored = store.model(name)
+    if (before := stored.newest()) is None or before.files["model"] != content:  # followers get each new model
+        stored.put({"model": content}, {"streams": chosen})
+    return Merged(content, tuple(chosen), tuple(stream for stream in learned if stream not in chosen))
 
 
 def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
@@ -456,7 +459,7 @@ def _disconnect() -> None:
         ray.shutdown()
 
 
-def _home() -> Path:
+def _fleets_folder() -> Path:
     """The folder with one for each fleet of this user."""
     return state_home() / "fleets"
 
@@ -468,10 +471,10 @@ def _is_up(folder: Path) -> bool:
     return False
 
 
-def _only(fleets: Sequence[str], place: str) -> str:
+def _only(fleets: Sequence[str], where: str) -> str:
     if len(fleets) != 1:
         help_ = f"say which (--name), there are {', '.join(fleets)}" if fleets else "start one with catstream fleet up"
-        raise FleetError(f"{len(fleets)} fleets run on {place}: {help_}")
+        raise FleetError(f"{len(fleets)} fleets run on {where}: {help_}")
     return fleets[0]
 
 
@@ -482,9 +485,9 @@ def _about(lines: Iterable[str], names: Collection[str]) -> list[str]:
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:
     """The contents of the saved models that specs name, by stream and object."""
-    found = {}
+    contents = {}
     for stream in streams:
         for name, file in stream.models.items():
             SavedModel.load(file)  # its errors name the file
-            found[stream.name, name] = file.read_bytes()
-    return found
+            contents[stream.name, name] = file.read_bytes()
+    return contents

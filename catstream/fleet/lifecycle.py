@@ -143,7 +143,7 @@ def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: f
         return "gone"
     if (actor.state, actor.happened) == ("working", "interrupted"):
         return "interrupted"  # it cannot be asked to stop
-    if actor.state != "stopping" and not (spec is not None and _is_as_wanted(spec, actor, nodes)):
+    if actor.state != "stopping" and not (spec is not None and matches_spec(spec, actor, nodes)):
         return "unwanted"
     if actor.happened:
         return actor.happened
@@ -151,10 +151,10 @@ def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: f
     return "silent" if actor.state != "pending" and now - last > limit else None
 
 
-def _is_as_wanted(spec: StreamSpec, actor: Actor, nodes: Collection[Node]) -> bool:
-    """Whether an actor was started for what is wanted, and is, or will be placed, where it may be."""
-    wanted = order(spec, nodes)
+def matches_spec(spec: StreamSpec, actor: Actor, nodes: Collection[Node]) -> bool:
+    """Whether an actor was started for this spec, and runs, or will be placed, on a node that suits it."""
+    expected = order(spec, nodes)
     node = next((node for node in nodes if node.id == actor.node and node.alive), None)
     if node is None:
-        return actor.order == wanted
-    return actor.order.rpartition("/")[0] == wanted.rpartition("/")[0] and node.suits(spec)
+        return actor.order == expected
+    return actor.order.rpartition("/")[0] == expected.rpartition("/")[0] and node.suits(spec)

@@ -119,7 +119,7 @@ class StreamSpec:
             if source.strip() and not is_live(source) and "://" not in source:
                 values["source"] = str(folder / source)  # its node has another working folder
             values["boxes"] = boxes_by_name(values["boxes"])
-            values["models"] = {each: folder / file for each, file in by_name(values["models"]).items()}
+            values["models"] = {object: folder / file for object, file in by_name(values["models"]).items()}
             values["settings"] = flat(values.get("settings", {}))
             names = [follow] if isinstance(follow, str) else follow
             values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
@@ -190,7 +190,7 @@ class FleetSpec:
                 "first (catstream fleet down), and copy the state"
             )
         for name in self.streams.keys() & earlier.streams.keys():
-            before, after = (Settings.from_values(each.streams[name].settings) for each in (earlier, self))
+            before, after = (Settings.from_values(spec.streams[name].settings) for spec in (earlier, self))
             if changed := changed_setting(before, after):
                 raise FleetError(
                     f"nothing was changed: {name} was started with {changed}: keep the setting, or first remove the "
@@ -199,8 +199,8 @@ class FleetSpec:
 
     def check_stream(self, name: str) -> None:
         if name not in self.streams:
-            known = ", ".join(self.streams) or "none"
-            raise FleetError(f"there is no stream {name!r} in the fleet {self.name}: there are {known}")
+            streams = ", ".join(self.streams) or "none"
+            raise FleetError(f"no stream named {name!r} in the fleet {self.name} (streams: {streams})")
 
     def changes(self, new: FleetSpec, ended: Collection[str], *, are_running: bool) -> list[str]:
         """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
@@ -246,8 +246,8 @@ def _checked(values: Mapping[str, object], kinds: Mapping[str, tuple[Any, str]])
             checked[key] = msgspec.convert(value, kind)
         except msgspec.ValidationError:
             # A list of sources may contain a password.
-            shown = "a list" if key == "source" and isinstance(value, list) else reprlib.repr(value)
-            raise FleetError(f"{key} must be {meaning}, got {shown}") from None
+            text = "a list" if key == "source" and isinstance(value, list) else reprlib.repr(value)
+            raise FleetError(f"{key} must be {meaning}, got {text}") from None
     return checked
 
 
@@ -261,9 +261,9 @@ def check_fleet_name(name: object, kind: str) -> None:
 
 
 @contextmanager
-def _errors_in(place: str) -> Iterator[None]:
-    """Turn the errors of catstream into one that names the place."""
+def _errors_in(where: str) -> Iterator[None]:
+    """Turn the errors of catstream into one that says where."""
     try:
         yield
     except CatstreamError as error:
-        raise FleetError(f"{place}: {error}") from None
+        raise FleetError(f"{where}: {error}") from None

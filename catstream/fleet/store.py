@@ -59,7 +59,7 @@ _CONNECT_SECONDS = 3.0  # limit to connect to it
 _FOLDERS = ("streams", "models", "fleet")
 _CLAIM = "claim"
 _DIGITS = 8  # of a token and of the number of a state in their names
-_KEPT = 2  # newest states
+_KEEP = 2  # newest states
 _ATTEMPTS = 20  # to claim, or to read the newest state, while other processes change the folder
 _LONGEST_HOLDER = 200
 _NO_NAME = "-"  # folder of the object without a name: no name begins with a dash
@@ -89,17 +89,17 @@ class Store:
         return f"Store({self._url!r})"
 
     @property
-    def fleet(self) -> States:
+    def fleet(self) -> StateStore:
         """The desired states of the fleet, each as the file `fleet`."""
-        return States(self, "fleet")
+        return StateStore(self, "fleet")
 
-    def stream(self, name: str) -> States:
+    def stream(self, name: str) -> StateStore:
         check_fleet_name(name, "stream")
-        return States(self, f"streams/{name}")
+        return StateStore(self, f"streams/{name}")
 
-    def model(self, name: str) -> States:
+    def model(self, name: str) -> StateStore:
         """The merged models of an object, each as the file `model`."""
-        return States(self, f"models/{_NO_NAME if name == UNNAMED else check_name(name)}")
+        return StateStore(self, f"models/{_NO_NAME if name == UNNAMED else check_name(name)}")
 
     def check(self) -> None:
         """Create the folder of the store, and raise StoreError if it cannot be used. A bucket has to exist."""
@@ -122,7 +122,7 @@ class Store:
     def names(self, folder: str) -> list[str]:
         """Return the names of all objects below a folder, without the name of the folder."""
         with self._errors(folder, "listed"):
-            return [each["path"][len(folder) + 1 :] for each in self._store.list(folder).collect()]
+            return [entry["path"][len(folder) + 1 :] for entry in self._store.list(folder).collect()]
 
     def remove(self, name: str) -> None:
         """Remove an object, if it exists, and beside it in a folder the parts that killed processes left."""
@@ -191,8 +191,8 @@ class Store:
             is_about_one = isinstance(error, FileNotFoundError | FileExistsError) and what != "created"
             if is_about_one and "NoSuchBucket" not in str(error):
                 raise type(error)(name) from None
-            place = f"{name} of the store" if name else "the store"
-            raise StoreError(f"{place} {self._url} cannot be {what}: {_trouble(error)}") from None
+            subject = f"{name} of the store" if name else "the store"
+            raise StoreError(f"{subject} {self._url} cannot be {what}: {_trouble(error)}") from None
 
 
 def _credentials() -> Any:
@@ -227,7 +227,7 @@ def _parse(url: str) -> tuple[str, Path | None]:
 def _trouble(error: Exception) -> str:
     """Describe an error and its remedy without the text of the error, which may contain a credential."""
     text = str(error)
-    code = found[1] if (found := _CODE.search(text)) else ""
+    code = match[1] if (match := _CODE.search(text)) else ""
     if code == "NoSuchBucket":
         return "there is no such bucket: create it"
     if code in ("PermanentRedirect", "AuthorizationHeaderMalformed") or "incorrectly configured region" in text:
@@ -238,15 +238,15 @@ def _trouble(error: Exception) -> str:
         return "no credentials were found: set AWS_PROFILE, or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
     if "kind: Timeout" in text:
         return f"no answer within {STORE_SECONDS:g} s: check the network and the server"
-    number = error.errno if isinstance(error, OSError) else int(found[1]) if (found := _NUMBER.search(text)) else None
+    number = error.errno if isinstance(error, OSError) else int(match[1]) if (match := _NUMBER.search(text)) else None
     if number is None:
         return f"{type(error).__name__}: check the network and the server"
     is_full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return f"{os.strerror(number)}: {'free some space there' if is_full else 'check the folder, or the server'}"
 
 
-class _Place(NamedTuple):
-    """The place of a state: the token of its writer, and its number."""
+class _Version(NamedTuple):
+    """The version of a state: the token of its writer, and its number."""
 
     token: int
     number: int
@@ -257,31 +257,31 @@ class Contents:
     """What is below the folder of a stream.
 
     claims  tokens of the claims
-    states  places of the states
+    states  versions of the states
     """
 
     claims: set[int]
-    states: set[_Place]
+    states: set[_Version]
 
     @classmethod
     def of(cls, names: Iterable[str]) -> Contents:
         """The listing of these names, each without the folder; names of other things are passed over.
 
         >>> Contents.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
-        Contents(claims={1}, states={_Place(token=1, number=7)})
+        Contents(claims={1}, states={_Version(token=1, number=7)})
         """
-        claims, states = set[int](), set[_Place]()
+        claims, states = set[int](), set[_Version]()
         for name in names:
             token, _, rest = name.partition("/")
             if token.isdecimal() and rest.isdecimal():
-                states.add(_Place(int(token), int(rest)))
+                states.add(_Version(int(token), int(rest)))
             elif token.isdecimal() and rest == _CLAIM:
                 claims.add(int(token))
         return cls(claims, states)
 
 
 @dataclass(frozen=True, slots=True)
-class Generation:
+class Snapshot:
     """A state of a stream in the store.
 
     token   of the holder that wrote it
@@ -294,27 +294,27 @@ class Generation:
     facts: dict[str, Any]
 
 
-class States:
+class StateStore:
     """The states below a folder of the store. Every method raises StoreError if the store fails; it may be repeated."""
 
     def __init__(self, objects: Store, folder: str) -> None:
         self._objects = objects
         self.folder = folder
 
-    def newest(self, after: int = 0) -> Generation | None:
+    def newest(self, after: int = 0) -> Snapshot | None:
         """Return the newest state of a holder with a token above `after`. If there is none, no state is read."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
-                places = sorted((place for place in self.listed().states if place.token > after), reverse=True)
-                state = next(filter(None, map(self._read, places)), None)
+                versions = sorted((version for version in self.listed().states if version.token > after), reverse=True)
+                state = next(filter(None, map(self._read, versions)), None)
                 return None if state is None or state.facts.get("removed") else state
         raise self._busy("read")
 
     def claim(self, holder: str) -> Claim:
         """Become the only process that may write states; the name of the holder, such as its node, is for messages."""
         for _ in range(_ATTEMPTS):
-            found = self.listed()
-            token = max([0, *found.claims, *(place.token for place in found.states)]) + 1
+            listing = self.listed()
+            token = max([0, *listing.claims, *(version.token for version in listing.states)]) + 1
             with contextlib.suppress(FileExistsError):  # another process claims at this moment
                 self._objects.create(self._name(token, _CLAIM), holder[:_LONGEST_HOLDER].encode())
                 return Claim(self, token, holder, self.newest())
@@ -332,7 +332,7 @@ class States:
         if self.newest() is not None:
             claim = self.claim(_this_process())
             claim.write({}, {"removed": True})
-            self.remove_up_to(claim.token, self.listed(), kept=1)
+            self.remove_up_to(claim.token, self.listed(), keep=1)
 
     def listed(self) -> Contents:
         """What is below the folder now."""
@@ -344,29 +344,30 @@ class States:
             return self._objects.read(self._name(token, _CLAIM)).decode()
         return "another process"
 
-    def create(self, place: _Place, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
+    def create(self, version: _Version, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
-        self._objects.create(self._name(*place), storage.encode(arrays, {"facts": dict(facts)}))
+        self._objects.create(self._name(*version), storage.encode(arrays, {"facts": dict(facts)}))
 
-    def remove_up_to(self, token: int, found: Contents, kept: int) -> None:
+    def remove_up_to(self, token: int, listing: Contents, keep: int) -> None:
         """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
-        before = sorted(place for place in found.states if place.token <= token)
-        stay = before[len(before) - kept :]
-        for place in before[: len(before) - kept]:
-            self._objects.remove(self._name(*place))
-        for old in sorted(found.claims - {place.token for place in stay}):
+        before = sorted(version for version in listing.states if version.token <= token)
+        stay = before[len(before) - keep :]
+        for version in before[: len(before) - keep]:
+            self._objects.remove(self._name(*version))
+        for old in sorted(listing.claims - {version.token for version in stay}):
             if old < token:
                 self._objects.remove(self._name(old, _CLAIM))
 
     def _name(self, token: int, rest: str | int) -> str:
         return f"{self.folder}/{token:0{_DIGITS}}/{rest if isinstance(rest, str) else f'{rest:0{_DIGITS}}'}"
 
-    def _read(self, place: _Place) -> Generation | None:
+    def _read(self, version: _Version) -> Snapshot | None:
         """A state; None if it is damaged."""
-        name = self._name(*place)
+        name = self._name(*version)
         try:
             arrays, header = storage.decode(self._objects.read(name), name)
-            return Generation(place.token, {key: each.tobytes() for key, each in arrays.items()}, dict(header["facts"]))
+            files = {key: array.tobytes() for key, array in arrays.items()}
+            return Snapshot(version.token, files, dict(header["facts"]))
         except (ProtocolError, KeyError, TypeError, ValueError):
             return None
 
@@ -381,7 +382,7 @@ class Claim:
     state    the state to continue from; None if there is none
     """
 
-    def __init__(self, states: States, token: int, holder: str, state: Generation | None) -> None:
+    def __init__(self, states: StateStore, token: int, holder: str, state: Snapshot | None) -> None:
         self.token, self.state = token, state
         self._states, self._holder = states, holder
         self._number = 0
@@ -400,17 +401,17 @@ class Claim:
             raise self._fenced
         self._number += 1  # whatever becomes of this state, its number is not used again
         with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
-            self._states.create(_Place(self.token, self._number), files, facts)
-        found = self.check()
+            self._states.create(_Version(self.token, self._number), files, facts)
+        listing = self.check()
         with contextlib.suppress(StoreError):  # they are removed after the next write
-            self._states.remove_up_to(self.token, found, _KEPT)
+            self._states.remove_up_to(self.token, listing, _KEEP)
 
     def check(self) -> Contents:
         """Raise FencedError if there is a claim with a higher token, or this one was removed."""
-        found = self._states.listed()
-        if self.token in found.claims and max(found.claims) == self.token:
-            return found
-        newer = self._states.holder(max(found.claims, default=0))
+        listing = self._states.listed()
+        if self.token in listing.claims and max(listing.claims) == self.token:
+            return listing
+        newer = self._states.holder(max(listing.claims, default=0))
         self._fenced = FencedError(
             f"{self._states.folder} was claimed by {newer} after {self._holder} (token {self.token}): "
             f"{self._holder} may not write it any more, and has to stop"

@@ -157,28 +157,28 @@ class Site:
 
     async def _updates(self, feed: Feed) -> AsyncIterator[str]:
         """Yield the parts of a page that have changed, as server-sent events."""
-        seen: dict[str, int] = {}
+        revisions: dict[str, int] = {}
         last_sent = monotonic()
         with feed.viewed():
             yield f"retry: {1000 * RETRY_SECONDS:.0f}\n\n"
             while not self._closed:
-                if parts := feed.dashboard.updates(seen):
+                if parts := feed.dashboard.updates(revisions):
                     last_sent = monotonic()
                     yield _event(parts)
                 elif monotonic() - last_sent > COMMENT_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)
-            yield _event({**feed.dashboard.updates(seen), "closed": True})
+            yield _event({**feed.dashboard.updates(revisions), "closed": True})
 
     async def _annotated_pictures(self, feed: PipelineFeed) -> AsyncIterator[bytes]:
-        shown = None
+        last = None
         with feed.viewed():
             yield b"--picture\r\n"
             while not self._closed:
                 newest = feed.dashboard.newest
-                if newest is not None and newest != shown:
-                    shown = newest
+                if newest is not None and newest != last:
+                    last = newest
                     jpeg = await run_in_threadpool(draw_preview, *newest, feed.dashboard.colours)
                     # The boundary after the picture is sent with it: many clients show a picture only after it.
                     head = b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)

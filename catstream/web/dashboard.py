@@ -55,10 +55,10 @@ class Parts:
         self.reason = ""  #: of the end or the silence
         self._mark_changed(*parts)
 
-    def updates(self, seen: dict[str, int]) -> dict[str, object]:
+    def updates(self, revisions: dict[str, int]) -> dict[str, object]:
         """Return the parts that have changed since the last call with these revisions; they are empty at first."""
-        news = {name: self._revisions[name] - seen.get(name, 0) for name in self._parts}
-        seen.update(self._revisions)
+        news = {name: self._revisions[name] - revisions.get(name, 0) for name in self._parts}
+        revisions.update(self._revisions)
         return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
 
     def mark_silent(self, reason: str, now: float) -> None:  # noqa: ARG002  # a fleet keeps its age
@@ -74,7 +74,7 @@ class Parts:
 
 
 @dataclass(slots=True)
-class ShownObject:
+class TrackedObject:
     """One of the objects that a pipeline tracks.
 
     colour         colour of its box, #rrggbb
@@ -123,7 +123,7 @@ class Dashboard(Parts):
         """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
         self.reason = self.source = ""
-        self.objects: dict[str, ShownObject] = {}  #: in the order in which they began
+        self.objects: dict[str, TrackedObject] = {}  #: in the order in which they began
         self.colours = Colours()
         self.health: dict[str, Health] = {}  #: the last report of each process
         self.last_reports: dict[str, float] = {}  #: times of their arrivals
@@ -215,10 +215,10 @@ class Dashboard(Parts):
         self._seq = track.seq
         name, before = track.object, self.objects.get(track.object)
         if before is None or before.began not in (None, track.began):  # another object of this name begins
-            self.objects[name] = ShownObject(self.colours.of(name))
-        each = self.objects[name]
-        each.state, each.score, each.version, each.seq = track.state, track.score, track.model_version, track.seq
-        each.began = track.began
+            self.objects[name] = TrackedObject(self.colours.of(name))
+        tracked = self.objects[name]
+        tracked.state, tracked.score, tracked.version = track.state, track.score, track.model_version
+        tracked.seq, tracked.began = track.seq, track.began
         if self._frame is None or track.frame != self._frame[0]:
             self._frame = track.frame, track.time
             _remember(self._tracks, track.frame, {}, _TRACKS)
@@ -229,12 +229,12 @@ class Dashboard(Parts):
 
     def _add_model(self, model: Model, now: float) -> None:
         """Measure the latency of a new model of a shown object; not of another object that had the name before."""
-        each, arrived = self.objects.get(model.object), self._arrivals.get(model.frame)
-        if each is None or each.began != model.began or each.trained == model.version:
+        tracked, arrived = self.objects.get(model.object), self._arrivals.get(model.frame)
+        if tracked is None or tracked.began != model.began or tracked.trained == model.version:
             return
-        each.trained = model.version
+        tracked.trained = model.version
         if arrived is not None:
-            each.model_latency = round(now - arrived, 3)
+            tracked.model_latency = round(now - arrived, 3)
 
     def _add_health(self, health: Health, now: float) -> None:
         self.health[health.process] = health
@@ -254,10 +254,11 @@ class Dashboard(Parts):
             if name not in self.objects:
                 version = int(counters.get("model_version", 0))
                 state: State = "absent" if not counters.get("present") else "present" if version else "bootstrapping"
-                self.objects[name] = ShownObject(self.colours.of(name), state, counters.get("score", 0.0), version)
+                self.objects[name] = TrackedObject(self.colours.of(name), state, counters.get("score", 0.0), version)
         sent = health.counters.get("sent", 0)  # a track after this one may be of an object that began later
-        for name in [name for name, each in self.objects.items() if name not in health.objects and each.seq <= sent]:
-            del self.objects[name]
+        for name, tracked in list(self.objects.items()):
+            if name not in health.objects and tracked.seq <= sent:
+                del self.objects[name]
         self.colours.keep(self.objects)
 
     def _add_point(self, now: float) -> None:
@@ -265,8 +266,8 @@ class Dashboard(Parts):
             return
         self._last_point = now
         objects = {
-            name: (round(each.score, 3), each.model_latency, each.version, each.state != "absent")
-            for name, each in ({} if self._holds else self.objects).items()
+            name: (round(tracked.score, 3), tracked.model_latency, tracked.version, tracked.state != "absent")
+            for name, tracked in ({} if self._holds else self.objects).items()
         }
         self._points.append((round(now, 3), self.rate(now), objects))
         self._mark_changed("points")
@@ -284,9 +285,9 @@ class Dashboard(Parts):
     def _tracks_part(self, _: int) -> dict[str, object]:
         frame, time = self._frame or (None, None)
         objects = [
-            {"name": name, "colour": each.colour, "version": each.version}
-            | {"state": None if self._holds else each.state, "score": None if self._holds else each.score}
-            for name, each in self.objects.items()
+            {"name": name, "colour": tracked.colour, "version": tracked.version}
+            | {"state": None if self._holds else tracked.state, "score": None if self._holds else tracked.score}
+            for name, tracked in self.objects.items()
         ]
         return {"frame": frame, "time": time, "objects": objects}
 
@@ -326,10 +327,10 @@ class FleetDashboard(Parts):
                     "name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age),
                 },
                 "streams": lambda _: {  # JSON objects of a browser have numbers first
-                    name: _shown(each) | {"models": list(each.models.items())}
-                    for name, each in self.status.streams.items()
+                    name: _public(stream) | {"models": list(stream.models.items())}
+                    for name, stream in self.status.streams.items()
                 },
-                "nodes": lambda _: {name: _shown(each) for name, each in self.status.nodes.items()},
+                "nodes": lambda _: {name: _public(node) for name, node in self.status.nodes.items()},
             }
         )  # fmt: skip
         self.status = FleetStatus("", 0.0)
@@ -347,7 +348,7 @@ class FleetDashboard(Parts):
             self.age = now - self._arrived
 
 
-def _shown(status: StreamStatus | NodeStatus) -> dict[str, Any]:
+def _public(status: StreamStatus | NodeStatus) -> dict[str, Any]:
     """Return what the page shows of a stream or a node: neither the address nor a key of a pipeline."""
     hidden = ("name", "endpoint", "server", "token")
     return {field.name: getattr(status, field.name) for field in fields(status) if field.name not in hidden}

@@ -179,14 +179,16 @@ class Guard:
         cookie = f"catstream-{self._token_digest[:8]}"  # browsers send a cookie to all ports of a host
         in_url = request.query_params.get("token")
         kind, _, in_header = request.headers.get("authorization", "").partition(" ")
-        given = in_url or (in_header if kind.lower() == "bearer" else None)
-        shown = request.cookies.get(cookie, "") if given is None else _digest(given.strip())
-        if hmac.compare_digest(shown.encode(), self._token_digest.encode()):
-            return _enter(request, cookie, shown) if in_url and path.endswith("/") and request.method == "GET" else None
-        if path.endswith("/") and given is None:
+        token = in_url or (in_header if kind.lower() == "bearer" else None)
+        digest = request.cookies.get(cookie, "") if token is None else _digest(token.strip())
+        if hmac.compare_digest(digest.encode(), self._token_digest.encode()):
+            return (
+                _enter(request, cookie, digest) if in_url and path.endswith("/") and request.method == "GET" else None
+            )
+        if path.endswith("/") and token is None:
             return FileResponse(_LOGIN_PAGE, 401)
         expected = "a token is needed: Authorization: Bearer TOKEN, or ?token=TOKEN"
-        return PlainTextResponse(f"{expected}\n" if given is None else "this is not the token of this page\n", 401)
+        return PlainTextResponse(f"{expected}\n" if token is None else "this is not the token of this page\n", 401)
 
 
 def _reject_foreign(request: Request) -> Response | None:

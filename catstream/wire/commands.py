@@ -136,11 +136,11 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         if (answer := self._answers.get(question.id)) is not None:
             self._send(peer, answer)
             return False
-        known = question.id in self._waiting
+        is_waiting = question.id in self._waiting
         stops = isinstance(question, Command) and question.verb == "stop"
-        if known or len(self._waiting) < (2 if stops else 1) * _MAX_QUESTIONS:
+        if is_waiting or len(self._waiting) < (2 if stops else 1) * _MAX_QUESTIONS:
             self._waiting[question.id] = peer
-            return not known
+            return not is_waiting
         if isinstance(question, Command):
             full = f"{_MAX_QUESTIONS} commands wait for the next frame: try again later"
             self._send(peer, self._encode(CommandAnswer(question.id, False, full)))

@@ -105,8 +105,8 @@ class Endpoint:
     def listening(self, channel: Channel[object], sender: str | None = None) -> str:
         """The address to listen on; the name of a host is resolved."""
         address = self.address(channel, sender)
-        protocol, _, place = address.partition("://")
-        host, _, port = place.rpartition(":")
+        protocol, _, rest = address.partition("://")
+        host, _, port = rest.rpartition(":")
         if protocol == "ipc" or not (numbers := _resolved(host)):
             return address  # ZeroMQ reports what is wrong with it
         number = numbers.get(socket.AF_INET) or f"[{numbers[socket.AF_INET6]}]"

@@ -82,8 +82,8 @@ class Keys:
 
     def client(self, public: str) -> tuple[str, Role] | None:
         """Current name and role of the client with this public key; None if it is not allowed to connect."""
-        known = clients(self.folder)
-        return next(((name, client.role) for name, client in known.items() if client.public == public), None)
+        allowed = clients(self.folder)
+        return next(((name, client.role) for name, client in allowed.items() if client.public == public), None)
 
 
 def create(folder: Path) -> None:
@@ -102,10 +102,10 @@ def ensure(folder: Path) -> None:
 
 def allow(folder: Path, name: str, role: Role, output: Path | None = None, public: str | None = None) -> None:
     """Add a client, which may connect from now on: with keys in the new folder `output`, or with its own public key."""
-    known, server = clients(folder), public_key(folder)
-    if _named(name) in known:
+    others, server = clients(folder), public_key(folder)
+    if _named(name) in others:
         raise ServiceError(f"there is a client {name} already: take another name, or `catstream keys revoke` it first")
-    for other, client in known.items():
+    for other, client in others.items():
         if client.public == public:
             raise ServiceError(f"this key is that of {other}, a {client.role} client: `catstream keys revoke` it first")
     if public is not None:
@@ -120,9 +120,9 @@ def allow(folder: Path, name: str, role: Role, output: Path | None = None, publi
 
 def revoke(folder: Path, name: str) -> None:
     """Remove a client, also one whose file is damaged: it cannot connect any more."""
-    known = [path.name for path in _listed(folder)]
-    if name not in known:
-        raise ServiceError(f"there is no client {name!r}: there are {', '.join(known)}")
+    names = [path.name for path in _listed(folder)]
+    if name not in names:
+        raise ServiceError(f"no client named {name!r} (clients: {', '.join(names)})")
     if name == _OWN:
         raise ServiceError(f"{name!r} is the key of the pipeline itself: to replace it, make keys in another folder")
     with writing(folder / _CLIENTS):
@@ -134,40 +134,40 @@ def allowed(folder: Path) -> dict[str, Client]:
     return {_FLEET if name == _OWN else name: client for name, client in clients(folder).items()}
 
 
-def synchronise(folder: Path, wanted: Mapping[str, Client]) -> None:
+def synchronise(folder: Path, desired: Mapping[str, Client]) -> None:
     """Allow these clients and no others, besides the pipeline's own processes; all others are revoked.
 
     A client that stays is allowed at any time. A connection that is open stays open.
     """
     texts = {
         _named(name): _text(role=client.role, public=_checked(client.public))
-        for name, client in wanted.items()
+        for name, client in desired.items()
         if name != _OWN
     }
-    known = {path.name for path in _listed(folder)} - {_OWN}
+    present = {path.name for path in _listed(folder)} - {_OWN}
     with writing(folder / _CLIENTS):
-        for name in known - texts.keys():
+        for name in present - texts.keys():
             (folder / _CLIENTS / name).unlink(missing_ok=True)
         for name, text in texts.items():
             path = folder / _CLIENTS / name
-            if name not in known or path.read_bytes() != text:
+            if name not in present or path.read_bytes() != text:
                 write_atomically(path, text, mode=0o600)
 
 
 def clients(folder: Path) -> dict[str, Client]:
     """The clients that may connect, by name."""
-    found = {}
+    by_name = {}
     for path in _listed(folder):
         try:
             if (role := _read(path).get("role")) not in ROLES:
                 raise ServiceError(
                     f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, and allow it again"
                 )
-            found[path.name] = Client(role, _key(path, "public"))
+            by_name[path.name] = Client(role, _key(path, "public"))
         except ServiceError:
             if path.exists():  # otherwise it was revoked meanwhile
                 raise
-    return found
+    return by_name
 
 
 def public_key(folder: Path) -> str:
@@ -226,7 +226,7 @@ def _key(path: Path, name: str) -> str:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What a file holds; only its owner may write it, and read it if it holds a secret key."""
+    """The content of a file; only its owner may write it, and read it if it holds a secret key."""
     try:
         with path.open("rb") as file:
             facts = os.fstat(file.fileno())

@@ -135,7 +135,7 @@ class Subscriber(ChannelSocket[Message]):
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
         self._arrived: dict[Topic, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
-        self._last: dict[tuple[Topic, str], object] = {}  # what the last message of each object or process is known by
+        self._last: dict[tuple[Topic, str], object] = {}  # identity of the last message of each object or process
         self._socket.subscribe(b"" if only is None else opening(only, about))
         self._connect()
 
@@ -169,19 +169,19 @@ class Subscriber(ChannelSocket[Message]):
     def _is_repeat(self, message: Message, data: memoryview) -> bool:
         """Whether a message is the same as the last one of its object or process, which is sent again now and then.
 
-        It is known by its version. One that has none is small, and known by all of its bytes.
+        It is identified by its version. One that has none is small, and identified by all of its bytes.
         """
         if not self._newest:
             return False
         about = message.process if isinstance(message, Health) else getattr(message, "object", "")
         source = Topic(type(message).__name__, about), self.run
         version = getattr(message, "version", None)
-        known = hash(bytes(data)) if version is None else (version, getattr(message, "began", 0))
+        identity = hash(bytes(data)) if version is None else (version, getattr(message, "began", 0))
         before = self._last.pop(source, None)
-        self._last[source] = known
+        self._last[source] = identity
         if len(self._last) > _MOST_TOPICS:
             del self._last[next(iter(self._last))]
-        return before == known
+        return before == identity
 
 
 class GapCounter:

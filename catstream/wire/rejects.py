@@ -28,11 +28,11 @@ def reject(channel: str, cause: str, text: str) -> None:
     """Count a message or a connection that was rejected on a channel, and log it unless its cause was logged before."""
     with _lock:
         _counts["rejected"] += 1
-        known = (channel, cause) in _logged
+        was_logged = (channel, cause) in _logged
         if len(_logged) >= _MOST_CAUSES:
             _logged.clear()
         _logged.add((channel, cause))
-    if not known:
+    if not was_logged:
         _log.warning("%s: %s", channel, text)
 
 

@@ -62,9 +62,9 @@ _ZAP = ZapHandler()  # libzmq asks one for each context
 @cache
 def context() -> zmq.Context[zmq.Socket[bytes]]:
     """The ZeroMQ context of catstream in this process; only the limit of open files limits its number of sockets."""
-    made = zmq.Context()
-    made.set(zmq.MAX_SOCKETS, made.get(zmq.SOCKET_LIMIT))
-    return made
+    context = zmq.Context()
+    context.set(zmq.MAX_SOCKETS, context.get(zmq.SOCKET_LIMIT))
+    return context
 
 
 def _begin_copy() -> None:

@@ -16,7 +16,7 @@ from catstream.fleet import lifecycle
 from catstream.fleet.controller import Controller
 from catstream.fleet.lifecycle import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
-from catstream.fleet.store import States, Store
+from catstream.fleet.store import StateStore, Store
 from catstream.messages.kinds import StreamStatus
 from catstream.wire.keys import allow
 
@@ -242,7 +242,7 @@ def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, r
 def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, spec):
     store = Store(spec.store)
     store.stream("gate").claim("n1").write({"a": b""}, {"ended": False})
-    with pytest.raises(FleetError, match="there is no stream 'cam-8' in the fleet site: there are gate, roof"):
+    with pytest.raises(FleetError, match=r"no stream named 'cam-8' in the fleet site \\(streams: gate, roof\\)"):
         site.remove(("cam-8",))
     assert site.remove(("gate",)) == ["gate: is removed", "roof: is unchanged"]
     store.stream("gate").clear()
@@ -274,7 +274,7 @@ def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatc
         raise StoreError("the store cannot be reached")
 
     with monkeypatch.context() as patch:
-        patch.setattr(States, "put", fails)
+        patch.setattr(StateStore, "put", fails)
         for change in (
             lambda: site.add(replace(GATE, name="new"), {}),
             lambda: site.drain("n1", undo=False),
@@ -293,7 +293,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
         hangs.set()
         goes_on.wait(60)
 
-    monkeypatch.setattr(States, "put", put)
+    monkeypatch.setattr(StateStore, "put", put)
     change = threading.Thread(target=site.drain, args=("n1",), kwargs={"undo": False})
     change.start()
     try:
@@ -315,7 +315,7 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
     before.end()
     ray.has_restarted = True
     with monkeypatch.context() as patch:
-        patch.setattr(States, "newest", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
+        patch.setattr(StateStore, "newest", lambda _: (_ for _ in ()).throw(StoreError("the store cannot be reached")))
         again = made()
         for call in (again.ready, lambda: again.apply(spec, {})):
             with pytest.raises(StoreError, match="cannot be reached"):

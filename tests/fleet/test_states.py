@@ -16,7 +16,7 @@ from hypothesis.stateful import (
 )
 
 from catstream.errors import FencedError, StoreError
-from catstream.fleet.store import Claim, States
+from catstream.fleet.store import Claim, StateStore
 
 FOLDER = "streams/cam-7"
 PROCESSES = st.integers(0, 2)
@@ -88,7 +88,7 @@ class Process:
 
     def _run(self):
         try:
-            self.result = self.task(States(self, FOLDER))
+            self.result = self.task(StateStore(self, FOLDER))
         except (StoreError, FencedError) as error:
             self.result = error
         except Killed:
@@ -259,7 +259,7 @@ class Fencing(RuleBasedStateMachine):
 
     @invariant()
     def the_newest_state_has_all_durable_writes_and_continues_the_last_of_them(self):
-        newest = chain(States(self.memory, FOLDER).newest())
+        newest = chain(StateStore(self.memory, FOLDER).newest())
         assert self.durable <= set(newest)
         assert newest[: len(self.written)] == self.written
 
@@ -283,7 +283,7 @@ def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_fr
 
 def test_a_late_write_does_not_bring_a_removed_stream_back():
     memory = Memory()
-    states = States(memory, FOLDER)
+    states = StateStore(memory, FOLDER)
     claim = states.claim("old")
     claim.write({}, {})
     memory.late.append((f"{FOLDER}/00000001/00000002", memory.read(f"{FOLDER}/00000001/00000001")))
