@@ -164,7 +164,7 @@ def test_a_moved_first_box_is_found_again_and_a_different_one_is_not(tmp_path, s
 @pytest.mark.parametrize(
     ("count", "trackers", "message"),
     [
-        (1, ["catstream", "kfc"], "no tracker 'kfc'"),
+        (1, ["catstream", "kfc"], "unknown tracker 'kfc'"),
         (2, ["catstream"], "two sequences are named 'walk'"),
         (1, [], "missing tracker"),
     ],
