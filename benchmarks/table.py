@@ -48,9 +48,7 @@ class Table:
 def command(about: str | None) -> argparse.ArgumentParser:
     """Return a parser with the options of all benchmarks."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--data", type=Path, default=_DATA, help="folder of annotated sequences (default: $TRACKING_DATA or data)"
-    )
+    parser.add_argument("--data", type=Path, default=_DATA, help="folder of sequences (default: $TRACKING_DATA, data)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures and their provenance to a file")
     parser.add_argument("--quick", action="store_true", help="a few rendered frames, to test that the benchmark runs")
     return parser
