@@ -21,7 +21,7 @@ from catstream.base.files import write_atomically, writing
 from catstream.base.text import cause_of
 from catstream.errors import SettingsError, VideoError, require_extra
 from catstream.features.layout import CELL, EDGE, STRIDE, WINDOW
-from catstream.features.network import ENERGY, MOST_CHANNELS, Network, by_onnxruntime
+from catstream.features.network import ENERGY, MAX_CHANNELS, Network, by_onnxruntime
 from catstream.features.pyramid import Pyramid
 from catstream.features.vectors import VectorMap
 from catstream.video.images import IMAGES, ImageReader, natural_order, pages_of
@@ -69,8 +69,8 @@ def prepare(
     vectors = np.concatenate([_inner_vectors(run, crop, layer) for crop in crops])
     centre = vectors.mean(axis=0)
     variances, directions = np.linalg.eigh((vectors - centre).T @ (vectors - centre) / len(vectors))
-    explained = variances[-MOST_CHANNELS:].sum()
-    basis = directions[:, -MOST_CHANNELS:].T[::-1] * np.sqrt(ENERGY / explained)
+    explained = variances[-MAX_CHANNELS:].sum()
+    basis = directions[:, -MAX_CHANNELS:].T[::-1] * np.sqrt(ENERGY / explained)
     _append(model, basis, -basis @ centre)
     onnx.helper.set_model_props(model, {_EXPLAINED: f"{explained / variances.sum():.4f}"})
     with writing(output):

@@ -1,8 +1,8 @@
 """Several objects in one process: detectors, compressors and trainer, one after the other.
 
-The paper's three components in the order of its system figure: in each frame every object is searched with its last
-model, its training rows are added to its coreset trees, and a model is trained whenever these have grown.
-`catstream.pipeline` runs the same as three processes side by side.
+These are the three components of the paper in the order of its system figure: in every frame, the objects are searched
+with their newest models, their training rows are inserted into their coreset trees, and a model is trained whenever
+these have grown. `catstream.pipeline` runs the same components as three processes.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from catstream.video.frames import as_bgr
 
 
 class MultiTracker:
-    """Follows several objects, frame by frame.
+    """Tracks several objects, frame by frame.
 
-    The same frames and settings give the same boxes, bit for bit; they are those of a `catstream.Pipeline` in lockstep.
-    While a call computes, linear algebra in this process runs on one thread; what was set before holds again once it
-    returns. One thread at a time may call it; trackers in several threads do not affect one another.
+    The same frames and settings give the same boxes, bit for bit, as a `catstream.Pipeline` in lockstep. During a call,
+    linear algebra in this process runs on one thread; the previous number is restored when it returns. One thread at a
+    time may call a tracker; trackers in several threads are independent.
 
     A frame is an array as `catstream.Tracker` takes it.
 
@@ -57,7 +57,7 @@ class MultiTracker:
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
-        descriptor_of(self.settings)  # loads the network, if there is one: an error comes before the first frame
+        descriptor_of(self.settings)  # loads the network, if there is one, so that an error is raised here
         self._tracks: dict[str, Track] | None = None
 
     def __repr__(self) -> str:
@@ -103,15 +103,15 @@ class MultiTracker:
         """
         image, boxes, time = as_bgr(frame), boxes_by_name(boxes), _seconds(time)
         if not boxes:
-            raise ObjectError("there is no object to follow: give a box for at least one name")
+            raise ObjectError("no object to track: pass a box for at least one name")
         check_count(len(boxes), self.settings.run.max_objects)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
         with one_thread():
             pyramid = detectors.pyramid(image)
-            given = detectors.begin_all(boxes, pyramid, time)
-            # If a box was refused, nothing has changed.
+            results = detectors.begin_all(boxes, pyramid, time)
+            # After an error, the tracker is unchanged.
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
-            self._learn(*detectors.step(pyramid, time, given))
+            self._train(*detectors.step(pyramid, time, results))
 
     def update(
         self,
@@ -121,18 +121,18 @@ class MultiTracker:
         begin: Boxes | None = None,
         search: Mapping[str, SavedModel | str | os.PathLike[str]] | None = None,
     ) -> dict[str, Track]:
-        """Find the objects in the next frame, and learn from it.
+        """Track the objects in the next frame, and train their models on it.
 
         Parameters
         ----------
         time : float
             Seconds since the start of the video.
         begin : mapping of str to boxes
-            The boxes of objects that begin in this frame. An object of the same name is forgotten. If one box is
-            refused, no object begins, and the frame counts as not seen.
+            The boxes of objects that begin in this frame. An object of the same name is forgotten. After an error
+            in one box, no object has begun, and the frame is not counted.
         search : mapping of str to SavedModel or path
-            Saved models of objects that are searched for from this frame on, by name. Each is absent until it is found,
-            and learning continues from its saved model. An object of the same name is forgotten.
+            Saved models of objects to search for from this frame on, by name. An object is absent until its first
+            detection, and training continues from its saved model. An object of the same name is forgotten.
 
         Returns
         -------
@@ -143,46 +143,46 @@ class MultiTracker:
         BoxError
             Before `init`, or for a box as there.
         FrameError
-            For an array that is not a frame, or is of another size than those before, or a time that is not finite.
+            For an array that is not a frame, a frame of another size than the first one, or a time that is not finite.
         ObjectError
             For a name as in `init`, or one that has both a box and a saved model.
         SettingsError
-            If the settings do not suit a saved model.
+            If the settings differ from those of a saved model.
         ServiceError, ProtocolError
             If the file of a saved model cannot be read, or is not one.
         """
         _ = self.tracks
         image, boxes, time = as_bgr(frame), boxes_by_name({} if begin is None else begin), _seconds(time)
         models = {
-            name: each if isinstance(each, SavedModel) else SavedModel.load(each)
-            for name, each in by_name(search or {}).items()
+            name: model if isinstance(model, SavedModel) else SavedModel.load(model)
+            for name, model in by_name(search or {}).items()
         }
         compressors = self._continued(models, boxes)
         if image.shape[:2] != self._size:
             (height, width), (first_height, first_width) = image.shape[:2], self._size
             raise FrameError(
-                f"this frame is {width}x{height} pixels, those before it {first_width}x{first_height}: "
+                f"this frame is {width}x{height} pixels, the first one {first_width}x{first_height}: "
                 "resize it, or call init to start again"
             )
-        self.detectors.seq = self.forest.seq  # a frame whose update was interrupted, as by Ctrl-C, counts as not seen
+        self.detectors.seq = self.forest.seq  # repeats a frame whose update was interrupted, for example by Ctrl-C
         with one_thread():
             pyramid = self.detectors.pyramid(image)
-            given = self.detectors.begin_all(boxes, pyramid, time)
-            for name, learned in models.items():
-                self.detectors.seek(name, learned.model, learned.box, learned.similarity())
-            self._learn(*self.detectors.step(pyramid, time, given), compressors)
+            results = self.detectors.begin_all(boxes, pyramid, time)
+            for name, saved in models.items():
+                self.detectors.seek(name, saved.model, saved.box, saved.similarity())
+            self._train(*self.detectors.step(pyramid, time, results), compressors)
         return self.tracks
 
     def _continued(self, models: Mapping[str, SavedModel], boxes: Mapping[str, Box]) -> dict[str, Compressor]:
-        """The compressors of the objects of saved models; an error if one of the objects cannot begin."""
+        """The compressors of the objects of saved models; raises an error if one of the objects cannot begin."""
         if both := models.keys() & boxes.keys():
-            raise ObjectError(f"{listed(sorted(both))}: a box and a saved model for one object: give one of them")
+            raise ObjectError(f"{listed(sorted(both))}: a box and a saved model of one object are mutually exclusive")
         check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.max_objects)
         network = self.detectors.network
-        return {name: learned.compressor(self.settings, network, name) for name, learned in models.items()}
+        return {name: saved.compressor(self.settings, network, name) for name, saved in models.items()}
 
     def forget(self, name: str) -> None:
-        """Stop tracking an object; everything learned of it is dropped with the next frame.
+        """Stop tracking an object; its trees are dropped with the next frame.
 
         Raises
         ------
@@ -195,7 +195,7 @@ class MultiTracker:
         self.detectors.forget(check_name(name))
 
     def saved_model(self, name: str = UNNAMED) -> SavedModel:
-        """Everything that was learned of an object: save it as a model, and use it in another video.
+        """The saved model of an object, to be used in another video.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class MultiTracker:
         ObjectError
             If there is no object of this name.
         ServiceError
-            If too few frames were learned from.
+            If there are too few training frames.
         """
         _ = self.tracks
         name = check_name(name)
@@ -212,16 +212,16 @@ class MultiTracker:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
         return SavedModel.of(self.forest.compressors[name], self.settings)
 
-    def _learn(
-        self, tracks: Tracks, features: Features, learned: Mapping[str, Compressor] = MappingProxyType({})
+    def _train(
+        self, tracks: Tracks, features: Features, continued: Mapping[str, Compressor] = MappingProxyType({})
     ) -> None:
         self._tracks = tracks.tracks
-        for sample in self.forest.take(features, learned):
+        for sample in self.forest.take(features, continued):
             self.detectors.adopt(self.trainer.train(sample))
 
 
 def _seconds(time: float) -> float:
-    """The time of a frame as a number of Python."""
+    """The time of a frame as a Python float."""
     try:
         seconds = float(time)
     except (TypeError, ValueError):

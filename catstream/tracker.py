@@ -1,4 +1,4 @@
-"""The tracker of one object in one process; `catstream.multi` follows several."""
+"""The tracker of one object in one process; `catstream.multi` tracks several."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from catstream.multi import MultiTracker
 
 
 class Tracker:
-    """Follows one object, frame by frame; used like a `cv2.Tracker`. It is a `MultiTracker` of one object.
+    """Tracks one object, frame by frame, with the interface of `cv2.Tracker`. It is a `MultiTracker` of one object.
 
     A frame is an array of shape (h, w, 3) in the order of OpenCV (blue, green, red), (h, w, 4) with transparency
     last (BGRA), or (h, w) or (h, w, 1) in grey; of uint8, uint16, or float from 0 to 1. All frames of an object have
@@ -49,7 +49,7 @@ class Tracker:
         return self._objects.tracks[UNNAMED]
 
     def init(self, frame: np.ndarray, box: str | Iterable[float], time: float = 0.0) -> None:
-        """Start on a box, and forget all before.
+        """Start with the box of an object; a previous object is forgotten.
 
         Parameters
         ----------
@@ -70,18 +70,18 @@ class Tracker:
         self._objects.init(frame, {UNNAMED: box}, time)
 
     def update(self, frame: np.ndarray, time: float = 0.0) -> tuple[bool, Box | None]:
-        """Find the object in the next frame, and learn from it; errors as those of `MultiTracker.update`.
+        """Track the object in the next frame, and train its model on it. Raises the errors of `MultiTracker.update`.
 
         Returns
         -------
         found : bool
-            Whether the object is there.
+            Whether the object is present.
         box : Box or None
-            Where, x, y, w, h in pixels; None while it is absent.
+            Its box, x, y, w, h in pixels; None while it is absent.
         """
         track = self._objects.update(frame, time=time)[UNNAMED]
         return track.box is not None, track.box
 
     def saved_model(self) -> SavedModel:
-        """Everything that was learned of the object, as `MultiTracker.learned`."""
+        """The saved model of the object: see `MultiTracker.saved_model`."""
         return self._objects.saved_model()

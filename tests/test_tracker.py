@@ -112,7 +112,7 @@ def test_an_invalid_frame_is_rejected_and_the_tracker_continues(video, bad):
 
 
 def test_a_frame_of_another_size_is_rejected(video):
-    said = "this frame is 160x240 pixels, those before it 320x240: resize it, or call init"
+    said = "this frame is 160x240 pixels, the first one 320x240: resize it, or call init"
     with pytest.raises(FrameError, match=said):
         started(video).update(video[0][1][:, :160])
 

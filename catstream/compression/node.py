@@ -17,7 +17,7 @@ import numpy as np
 
 from catstream.compression.reduce import energy, products, reduce
 
-_NOTHING = np.empty((0, 0), np.float32)
+_EMPTY = np.empty((0, 0), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,25 +46,27 @@ class Node:
 
     @property
     def dropped(self) -> float:
-        """c of the paper, the energy that all reductions below it lost: ||A||^2 = ||C||^2 + c."""
+        """c of the paper, the energy that all reductions below it dropped: ||A||^2 = ||C||^2 + c."""
         return self.energy - energy(self.rows)
 
     @cached_property
     def products(self) -> np.ndarray:
-        """The products of all pairs of its rows, float32 (n, n), as those of `catstream.compression.reduce`."""
-        # Those of orthogonal rows are not computed: they are zero, up to rounding.
+        """The Gram matrix of its rows, float32 (n, n), as `catstream.compression.reduce.products` returns it."""
+        # Products of orthogonal rows are not computed: they are zero, up to rounding.
         return np.diag(np.einsum("ij,ij->i", self.rows, self.rows)) if self.level else products(self.rows)
 
     def products_with(self, newer: Node) -> np.ndarray:
-        """The products of all pairs of its rows above those of a newer node, float32 (2n, 2n)."""
+        """The Gram matrix of its rows stacked on those of a newer node, float32 (2n, 2n)."""
         n = len(self.rows)
         gram = np.zeros((2 * n, 2 * n), np.float32)
-        gram[:n, :n], gram[n:, n:], gram[n:, :n] = self.products, newer.products, newer.rows @ self.rows.T
+        gram[:n, :n] = self.products
+        gram[n:, n:] = newer.products
+        gram[n:, :n] = newer.rows @ self.rows.T
         return gram
 
     def directions(self, count: int) -> np.ndarray:
-        """Its rows rotated so that they are orthogonal, strongest first: so many of them, float32 (count, d)."""
-        # Leaves are rotated only if a sample is made of them: most are merged before.
+        """The `count` strongest of its rows after a rotation that makes them orthogonal, float32 (count, d)."""
+        # Leaves are rotated only if they are sampled: most of them are merged before.
         return self.rows[:count] if self.level else reduce(self.rows, count, self.sum, self.products)
 
     def merged(self, newer: Node) -> Node:
@@ -83,26 +85,27 @@ def share(level: int, top: int, size: int) -> int:
     return size >> (top - level)
 
 
-def sample(nodes: Sequence[Node], size: int, sampled: Sequence[Node] = (), known: np.ndarray = _NOTHING) -> np.ndarray:
-    """The first n w rows of each node, reflected and rescaled so that each has the weight of one original row.
+def sample(
+    nodes: Sequence[Node], size: int, last_nodes: Sequence[Node] = (), last_rows: np.ndarray = _EMPTY
+) -> np.ndarray:
+    """The first n w rows of every node, reflected and rescaled so that they have the weight of one original row.
 
-    The nodes are oldest first, with strictly falling levels. The rows of those that an earlier sample begins with are
-    not computed again: `sampled` are its nodes, and `known` its rows. Returns float32 (r, d), r <= 2n; (0, 0) for no
-    nodes.
+    The nodes are oldest first, with strictly decreasing levels. With the nodes and the rows of the last sample, the
+    rows of the nodes with which both begin are reused. Returns float32 (r, d), r <= 2n; (0, 0) without nodes.
     """
     if not nodes:
-        return _NOTHING
+        return _EMPTY
     counts = [share(node.level, nodes[0].level, size) for node in nodes]
-    # If the oldest node is the same, as many rows are taken of each of the others that are.
-    same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], zip(nodes, sampled, strict=False)))
-    drawn = known[: sum(counts[:same])]
+    # If the oldest node is the same, so are the counts of all nodes that are.
+    same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], zip(nodes, last_nodes, strict=False)))
+    reused = last_rows[: sum(counts[:same])]
     if same == len(nodes):
-        return drawn
-    new = [_drawn(node, count) for node, count in zip(nodes[same:], counts[same:], strict=True) if count]
-    return np.concatenate([drawn, *new] if same else new)
+        return reused
+    new = [_sample_node(node, count) for node, count in zip(nodes[same:], counts[same:], strict=True) if count]
+    return np.concatenate([reused, *new] if same else new)
 
 
-def _drawn(node: Node, count: int) -> np.ndarray:
+def _sample_node(node: Node, count: int) -> np.ndarray:
     """The first rows of a node, reflected and rescaled."""
     rows: np.ndarray = node.directions(count) * np.float32(np.sqrt(count / node.count))
     spread(rows)

@@ -1,6 +1,6 @@
 """Reduction of many rows to few, by the singular value decomposition A = U S V'.
 
-The first n rows of S V' are optimal: no other n rows keep more of ||A||^2, the sum of squares.
+The first n rows of S V' are optimal: no other n rows retain more of ||A||^2, the sum of squares.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from scipy.linalg.lapack import ssyevd
 
 from catstream.base.arrays import Float32
 
-_TINY = np.float32(1e-30)  # in place of an energy of 0, which nothing can be divided by
+_TINY = np.float32(1e-30)  # divisor in place of an energy of 0
 
 
 def energy(rows: np.ndarray) -> float:
@@ -25,7 +25,7 @@ def energy(rows: np.ndarray) -> float:
 
 
 def products(rows: np.ndarray) -> np.ndarray:
-    """The products of all pairs of rows, float32 (m, m); above the diagonal are zeros.
+    """The lower triangle of the Gram matrix of rows, float32 (m, m).
 
     >>> products(np.array([[2, 0], [3, 1]], np.float32))
     array([[ 4.,  0.],
@@ -38,7 +38,7 @@ def products(rows: np.ndarray) -> np.ndarray:
 def reduce(
     rows: np.ndarray, size: int, towards: np.ndarray | None = None, gram: np.ndarray | None = None
 ) -> np.ndarray:
-    """Shrink rows to at most `size`, keeping the strongest directions.
+    """Reduce rows to at most `size`, along the strongest singular vectors.
 
     For every orthonormal Y, ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2 with
     c = ||A||^2 - ||C||^2 (paper, "Coresets"). Costs one triangle of the Gram
@@ -47,10 +47,10 @@ def reduce(
     Parameters
     ----------
     rows : float32 (m, d)
-    size : rows to keep (n in the paper), at least 1
-    towards : float (d,), each row gets the sign with which its product with this vector is not negative, because the
-        sign of a singular vector is arbitrary; None: the sum of the rows
-    gram : `products` of the rows, if they are known
+    size : number of rows of the result (n in the paper), at least 1
+    towards : float (d,), a vector whose products with the rows of the result are not negative, because the sign of a
+        singular vector is arbitrary; None: the sum of the rows
+    gram : `products` of the rows, if they were computed before
 
     Returns
     -------
@@ -59,14 +59,14 @@ def reduce(
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
     """
-    _, kept = _strongest(rows, size, towards, gram)
-    return kept
+    _, strongest = _strongest(rows, size, towards, gram)
+    return strongest
 
 
 def shrink(
     rows: np.ndarray, size: int, towards: np.ndarray | None = None, gram: np.ndarray | None = None
 ) -> np.ndarray:
-    """Shrink rows to `size` by frequent directions (Liberty 2013): each loses the energy of the strongest dropped one.
+    """Shrink rows to `size` by frequent directions (Liberty 2013): all lose the energy of the strongest dropped row.
 
     With s_i the singular values, strongest first, row i has the energy max(s_i^2 - s_(size + 1)^2, 0). For every unit
     vector y, 0 <= ||A y||^2 - ||C y||^2 <= s_(size + 1)^2 <= (||A||^2 - ||C||^2) / (size + 1). Costs the same as
@@ -79,24 +79,24 @@ def shrink(
     >>> (shrink(np.diag([3.0, 2, 1]).astype(np.float32), size=2) ** 2).round().tolist()
     [[8.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
     """
-    energies, kept = _strongest(rows, size + 1, towards, gram)
+    energies, strongest = _strongest(rows, size + 1, towards, gram)
     scale = np.sqrt(1 - energies[size] / np.maximum(energies[:size], _TINY))
-    shrunk: Float32 = kept[:size] * scale[:, None]
+    shrunk: Float32 = strongest[:size] * scale[:, None]
     return shrunk
 
 
 def _strongest(
     rows: np.ndarray, count: int, towards: np.ndarray | None, gram: np.ndarray | None
 ) -> tuple[Float32, Float32]:
-    """Energies and rows s_i v_i of the `count` strongest directions, all of them if there are fewer rows."""
-    keep = min(count, len(rows))
+    """Energies and rows s_i v_i of the `count` strongest singular vectors, or of all if there are fewer rows."""
+    count = min(count, len(rows))
     # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
     energies, vectors, failed = ssyevd(products(rows) if gram is None else gram, lower=1)
     if failed:
-        raise np.linalg.LinAlgError(f"no eigenvectors of the products of {len(rows)} rows were found")
+        raise np.linalg.LinAlgError(f"the eigenvectors of the Gram matrix of {len(rows)} rows did not converge")
     # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.
-    strongest = vectors.T[: -keep - 1 : -1].copy()
+    strongest = vectors.T[: -count - 1 : -1].copy()
     target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
-    with np.errstate(invalid="ignore"):  # OpenBLAS may set the flag for what lies beside the rows
+    with np.errstate(invalid="ignore"):  # OpenBLAS may set the flag for memory beyond the rows
         strongest[strongest @ (rows @ target) < 0] *= -1
-    return energies[: -keep - 1 : -1].clip(min=0), strongest @ rows
+    return energies[: -count - 1 : -1].clip(min=0), strongest @ rows

@@ -3,10 +3,10 @@
 Each cell of 8 x 8 pixels has 31 HOG channels (18 signed and 9 unsigned orientations, 4 texture energies; Felzenszwalb
 et al. 2010), of the colour channel with the strongest gradient, then its mean colour in Lab. A window is 8 x 8 cells.
 
-HOG and mean colours say what is where. An object that bends or turns moves both between the cells, but keeps its
-colours: 288 shades of Lab, 8 of lightness by 6 x 6 of a and b. So a window's row also holds a histogram of the shades
-in its middle 6 x 6 cells, which are mostly object, of 4 x 4 shades each. The square root of each share is a feature, so
-that distances are Hellinger's.
+HOG and mean colours depend on the position in the window. An object that deforms or rotates changes both, but not its
+colours: 288 shades of Lab, 8 of lightness by 6 x 6 of a and b. So a window's row also contains a histogram of the
+shades in its middle 6 x 6 cells, which are mostly object, with 4 x 4 shades per cell. The features are the square roots
+of the shares, so that Euclidean distances are Hellinger distances.
 
 If there is a descriptor, the row ends with its vectors at 4 x 4 places of the window.
 """
@@ -27,8 +27,8 @@ from catstream.features.vectors import VectorMap
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _MEAN_COLOUR = slice(CHANNELS - 3, CHANNELS)
-#: The most that differs by the noise of a camera: of a mean colour (9 levels of lightness, 3 of a and b) in all cells
-#: but one of a hundred, and of the squares of all features. Noise of 2 levels in each pixel changes 6 levels and 0.08.
+#: Limits of a change by the noise of a camera: of a mean colour (9 levels of lightness, 3 of a and b) in all cells but
+#: one in a hundred, and of the squares of all features. Noise of 2 levels in the pixels changes 6 levels and 0.08.
 _NOISE_OF_COLOUR, _CHANGED, _NOISE = 9 * 1.5 / 255, 0.01, 0.1
 _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with infinity
 
@@ -55,7 +55,7 @@ class Cells:
 
     @classmethod
     def within(cls, planes: np.ndarray, vectors: np.ndarray | None = None, margin: int = MARGIN) -> Cells:
-        """Cells of a patch, uint8 (3, h, w), without the margin, whose features depend on pixels beyond it."""
+        """Cells of a patch, uint8 (3, h, w), without its margin, where features depend on pixels beyond the patch."""
         edge = margin * CELL
         return cls(grid(planes, margin), shades(planes[:, edge:-edge, edge:-edge]), vectors)
 
@@ -66,16 +66,16 @@ class Cells:
         return rows, columns
 
     def differs_by_noise(self, other: Cells) -> bool:
-        """Whether this shows what another image of the same size showed, but for the noise of a camera.
+        """Whether this differs from another image of the same size only by the noise of a camera.
 
-        That changes gradients everywhere, and hardly the mean colour of a cell; what moves changes the colours.
+        Noise changes the gradients everywhere, but hardly the mean colour of a cell; motion changes the colours.
         """
         if self.shape != other.shape:
             return False
-        change, energy = (self.grid - other.grid).reshape(-1, CHANNELS), other.grid.ravel()
-        changed = np.abs(change[:, _MEAN_COLOUR]).max(axis=1) > _NOISE_OF_COLOUR
-        away = change.ravel()
-        return bool(changed.mean() <= _CHANGED and away @ away < _NOISE * (energy @ energy))
+        change = (self.grid - other.grid).reshape(-1, CHANNELS)
+        is_changed = np.abs(change[:, _MEAN_COLOUR]).max(axis=1) > _NOISE_OF_COLOUR
+        difference, reference = change.ravel(), other.grid.ravel()
+        return bool(is_changed.mean() <= _CHANGED and difference @ difference < _NOISE * (reference @ reference))
 
     def row(self, row: int, column: int) -> np.ndarray:
         """Feature row of the window whose first cell is (row, column), float32 (d,)."""
@@ -95,29 +95,29 @@ class Cells:
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
         """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7).
 
-        Without vectors, it is the part of the score that HOG and colours have.
+        Without vectors, it is the part of the score that depends on HOG and colours.
         """
-        scores = self._places(weights, bias)
+        scores = self._cell_scores(weights, bias)
         add_colour_scores(self.shades, weights[COLOURS], scores)
         if self.vectors is not None:
             of_vectors = writable(weights[COLOURS.stop :]).reshape(PLACES**2, -1)
             kernels.add_vector_scores(self.vectors, of_vectors, scores)
         return scores
 
-    def respond_above(self, weights: np.ndarray, bias: float, least: float) -> np.ndarray:
-        """The same scores, but -inf for every window whose score is below `least`.
+    def respond_above(self, weights: np.ndarray, bias: float, threshold: float) -> np.ndarray:
+        """The same scores, with -inf for every window whose score is below a threshold.
 
-        The colours of a window are not counted if its score would be below `least` with any histogram of colours: this
-        takes three quarters of the time of `respond` if few windows score that high.
+        The colours of a window are not counted if its score would be below the threshold with any histogram of colours:
+        this takes three quarters of the time of `respond` if few windows score that high.
         """
-        reach = least - highest_colour_score(weights[COLOURS])
-        scores = self._places(weights, bias)
-        hopeless = scores < reach
-        add_colour_scores(self.shades, weights[COLOURS], scores, reach)
-        scores[hopeless | (scores < least)] = -np.inf
+        colour_threshold = threshold - highest_colour_score(weights[COLOURS])
+        scores = self._cell_scores(weights, bias)
+        hopeless = scores < colour_threshold
+        add_colour_scores(self.shades, weights[COLOURS], scores, colour_threshold)
+        scores[hopeless | (scores < threshold)] = -np.inf
         return scores
 
-    def _places(self, weights: np.ndarray, bias: float) -> np.ndarray:
+    def _cell_scores(self, weights: np.ndarray, bias: float) -> np.ndarray:
         """Score of every window without its histogram of colours."""
         rows, columns = self.shape
         scores = np.empty((rows - WINDOW + 1, columns - WINDOW + 1), np.float32)
@@ -128,7 +128,7 @@ class Cells:
 
 
 def window_rows(patches: Sequence[np.ndarray], vectors: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """Feature rows of windows, each in the middle of a patch, with the vectors of each if there is a descriptor.
+    """Feature rows of the windows in the middle of patches, with their vectors if there is a descriptor.
 
     The patches are uint8 (3, 96, 96). Returns float32 (k, d).
     """
@@ -164,7 +164,7 @@ def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:
 
 
 def _shares() -> np.ndarray:
-    """Share of each pixel between the centres of four cells in each of these, float32 (8, 8, 4): row by row."""
+    """Weights of bilinear interpolation between four cells, of the pixels between their centres, float32 (8, 8, 4)."""
     far = (np.arange(CELL) + 0.5) / CELL
     near = 1 - far
     shares = [np.outer(down, across) for down in (near, far) for across in (near, far)]
@@ -175,34 +175,34 @@ _SHARES = _shares()
 
 
 def shades(planes: np.ndarray) -> np.ndarray:
-    """The shade, uint16 below `SHADES`, of every 2 x 2 pixels of planes of even size, whose mean is taken.
+    """The shade, uint16 below `SHADES`, of the mean of every 2 x 2 pixels of planes of even size.
 
     >>> len(set(shades(np.array([[0, 0, 90, 90], [0, 0, 90, 90]], np.uint8)[None].repeat(3, axis=0)).ravel()))
     2
     """
-    found = np.empty((planes.shape[1] // 2, planes.shape[2] // 2), np.uint16)
-    kernels.look_up_shades(planes, _SHADES_OF, found)
-    return found
+    table = np.empty((planes.shape[1] // 2, planes.shape[2] // 2), np.uint16)
+    kernels.look_up_shades(planes, _SHADES_OF, table)
+    return table
 
 
-def add_colour_scores(found: np.ndarray, weights: np.ndarray, scores: np.ndarray, least: float = _LOWEST) -> None:
-    """Add the score of the histogram of each window, in constant time a window.
+def add_colour_scores(colours: np.ndarray, weights: np.ndarray, scores: np.ndarray, threshold: float = _LOWEST) -> None:
+    """Add the scores of the histograms of all windows, in constant time per window.
 
     Parameters
     ----------
-    found : uint16, as `shades` gives them
+    colours : uint16, from `shades`
     weights : float32 (SHADES,)
-    scores : float32 (rows - 7, columns - 7), of the window whose first cell is there
-    least : windows with a lower score are left out, and their score stays as it is
+    scores : float32 (rows - 7, columns - 7), of the window whose first cell has the same index
+    threshold : the score of a window with a lower score is not changed
     """
-    kernels.add_colour_scores(found, writable(weights), least, scores)
+    kernels.add_colour_scores(colours, writable(weights), threshold, scores)
 
 
 def highest_colour_score(weights: np.ndarray) -> float:
-    """The highest score that the histogram of any window can have.
+    """Upper bound of the score of a histogram.
 
-    A histogram has no negative features and a constant length, so this is the length times that of the positive weights
-    (Cauchy-Schwarz).
+    The features of a histogram are not negative, and its norm is constant. So the bound is its norm times the norm of
+    the positive weights (Cauchy-Schwarz).
     """
     return kernels.COLOUR_LENGTH * float(np.linalg.norm(np.maximum(weights, 0)))
 
@@ -221,12 +221,12 @@ def lab(colours: np.ndarray) -> np.ndarray:
 
 
 def _shade_table() -> np.ndarray:
-    """Shade of every BGR colour of 5 bits each, blue first."""
+    """Shade of every BGR colour with 5 bits per channel, blue first."""
     levels = np.arange(4, 256, 8, dtype=np.uint8)
     colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
-    found = lab(colours.reshape(-1, 3)).astype(int)
-    light = found[:, 0] * LIGHT // 256
-    chroma = ((found[:, 1:] - 128) // _CHROMA_STEP + CHROMA // 2).clip(0, CHROMA - 1)
+    values = lab(colours.reshape(-1, 3)).astype(int)
+    light = values[:, 0] * LIGHT // 256
+    chroma = ((values[:, 1:] - 128) // _CHROMA_STEP + CHROMA // 2).clip(0, CHROMA - 1)
     bins: np.ndarray = ((light * CHROMA + chroma[:, 0]) * CHROMA + chroma[:, 1]).astype(np.uint16)
     return bins
 

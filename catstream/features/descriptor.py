@@ -1,6 +1,6 @@
-"""Descriptors: what computes the vectors of an image that a row holds beside HOG and colours.
+"""Descriptors: functions of an image whose vectors a row contains beside HOG and colours.
 
-A descriptor of another kind is a class beside `catstream.features.network.Network`, and a case of `descriptor_of`.
+To add another kind, write a class beside `catstream.features.network.Network` and a case in `descriptor_of`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from catstream.errors import SettingsError
 
 
 class Descriptor(Protocol):
-    """A function of an image: the same image gives the same vectors, also in several threads at once.
+    """A function of an image, deterministic and safe to call from several threads.
 
     channels  length of a vector
     digest    identifies the function: rows of different ones cannot be compared
@@ -26,32 +26,32 @@ class Descriptor(Protocol):
     digest: str
 
     def __call__(self, planes: np.ndarray) -> np.ndarray:
-        """Vectors of an image, one for each 16 x 16 pixels: uint8 (3, h, w) to float32 (h / 16, w / 16, channels).
+        """Vectors of an image, one per 16 x 16 pixels: uint8 (3, h, w) to float32 (h / 16, w / 16, channels).
 
-        Blue, green and red; both sides are multiples of 16. Over many images the mean vector is 0, and the mean square
-        length `catstream.features.network.ENERGY`, as the features of a cell vary.
+        The planes are blue, green and red; both sides are multiples of 16. Over many images, the mean vector is 0 and
+        the mean squared norm `catstream.features.network.ENERGY`, the variance of the features of a cell.
         """
 
 
 def descriptor_of(settings: Settings, digest: str = "") -> Descriptor | None:
-    """The descriptor that the settings name, None if they name none.
+    """The descriptor of the setting `features.network`, None if that is empty.
 
-    SettingsError if its file cannot be used, or its digest is not the one that is given; MissingExtraError if it needs
-    a package that is not installed.
+    SettingsError if its file cannot be used, or if `digest` is not empty and differs from its own; MissingExtraError if
+    it needs a package that is not installed.
     """
     path = Path(settings.features.network)
     try:
-        found = _opened(path, path.stat().st_mtime_ns) if settings.features.network else None
+        descriptor = _load(path, path.stat().st_mtime_ns) if settings.features.network else None
     except OSError as error:
         raise SettingsError(
-            f"cannot read features.network={str(path)!r} ({error.strerror}): give one of `catstream network prepare`"
+            f"cannot read features.network={str(path)!r} ({error.strerror}): pass a file of `catstream network prepare`"
         ) from None
-    if digest and digest != digest_of(found):
+    if digest and digest != digest_of(descriptor):
         raise SettingsError(
             f"the run was started with a network of digest {digest}, features.network={settings.features.network!r} "
-            f"now has {digest_of(found) or 'none'}: continue with the same file"
+            f"now has {digest_of(descriptor) or 'none'}: continue with the same file"
         )
-    return found
+    return descriptor
 
 
 def digest_of(descriptor: Descriptor | None) -> str:
@@ -60,8 +60,8 @@ def digest_of(descriptor: Descriptor | None) -> str:
 
 
 @lru_cache(maxsize=2)
-def _opened(path: Path, _: int) -> Descriptor:
-    """The network in a file that was modified at a time."""
+def _load(path: Path, _: int) -> Descriptor:
+    """Load a network from a file; the second argument, its modification time, invalidates the cache."""
     from catstream.features.network import Network
 
     return Network(path)

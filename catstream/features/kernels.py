@@ -1,11 +1,11 @@
 """Kernels: loops over pixels and cells, compiled by numba when this module is imported, and cached from then on.
 
-numba's cache notices a change of this file only. So all kernels are here, with what they call and the numbers that they
-read; `catstream.features.layout` has some of these numbers, too, and a test compares them.
+numba's cache is invalidated by changes of this file only. So all kernels are here, with the functions that they call
+and the constants that they read; `catstream.features.layout` repeats some of these constants, and a test compares them.
 
-A kernel writes into an array that it is given. Arithmetic may be reordered and nothing is checked: no index beyond
-the end, no division by 0. Other threads run during a call. An array of another type than in the signature is a
-TypeError, and so is one that cannot be written.
+A kernel writes into an output array of its caller. Arithmetic may be reordered, and neither bounds nor divisions by 0
+are checked. A call releases the GIL. An array of another type than in the signature, or a read-only one, is a
+TypeError.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _announce() -> None:
 _ORIENTATIONS = 9
 _SIGNED = 2 * _ORIENTATIONS
 _HALF = CELL // 2
-_CLIP = float32(0.2)  # a normalised bin is cut here (Dalal and Triggs 2005)
+_CLIP = float32(0.2)  # upper limit of a normalised bin (Dalal and Triggs 2005)
 _TEXTURE = float32(0.2357)  # 1 / sqrt(18), as published
 _COLOUR_WEIGHT = 1.5
 _LIGHT_SCALE = float32(_COLOUR_WEIGHT / 255)
@@ -90,9 +90,9 @@ _TAN_10, _TAN_30, _TAN_50, _TAN_70 = np.tan(np.deg2rad([10, 30, 50, 70])).astype
 
 COLOUR_LENGTH = 3.0  #: length of a histogram of colours as features; that of a window's HOG is about 9
 COUNTED = WINDOW - 2  #: cells along a side of the middle of a window, whose shades are counted
-_ROOT = float32(COLOUR_LENGTH / (COUNTED * SIDE))  # what a count adds up to as a feature is its root times this
+_ROOT = float32(COLOUR_LENGTH / (COUNTED * SIDE))  # factor of the root of a count, as a feature
 
-_LINEAR_BITS, _ROOT_BITS, _SHARE_BITS = 3, 15, 12  # of the fractions of whole numbers
+_LINEAR_BITS, _ROOT_BITS, _SHARE_BITS = 3, 15, 12  # fractional bits of fixed-point numbers
 
 
 def _linear() -> np.ndarray:
@@ -115,7 +115,7 @@ _LINEAR, _ROOTS = _linear(), _roots()
 #: Shares of red, green and blue in X, Y and Z, which are 1 for the white of D65.
 _XYZ = [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 _XYZ_SHARES = np.rint(np.divide(_XYZ, [[0.950456], [1.0], [1.088754]]) * (1 << _SHARE_BITS)).astype(np.int32)
-_ZERO_LIGHT = (16 * 255 * (1 << _ROOT_BITS) + 50) // 100  # what 116 roots are above the lightness
+_ZERO_LIGHT = (16 * 255 * (1 << _ROOT_BITS) + 50) // 100  # 116 roots less the lightness
 
 
 @_part
@@ -163,17 +163,17 @@ def _gradients(
     blue_below, green_below, red_below = below[0], below[1], below[2]
     for x in range(len(magnitude)):
         dx, dy = blue[x + 2] - blue[x], blue_below[x + 1] - blue_above[x + 1]
-        most = dx * dx + dy * dy
+        largest = dx * dx + dy * dy
         other_x, other_y = green[x + 2] - green[x], green_below[x + 1] - green_above[x + 1]
         strength = other_x * other_x + other_y * other_y
-        if strength > most:
-            most, dx, dy = strength, other_x, other_y
+        if strength > largest:
+            largest, dx, dy = strength, other_x, other_y
         other_x, other_y = red[x + 2] - red[x], red_below[x + 1] - red_above[x + 1]
         strength = other_x * other_x + other_y * other_y
-        if strength > most:
-            most, dx, dy = strength, other_x, other_y
+        if strength > largest:
+            largest, dx, dy = strength, other_x, other_y
         across[x], down[x] = dx, dy
-        magnitude[x] = np.sqrt(most)
+        magnitude[x] = np.sqrt(largest)
 
 
 @_part
@@ -327,33 +327,33 @@ def describe_cells(planes: UInt8, margin: int, shares: Float32, cells: Float32) 
 
 
 @_kernel("void(uint8[:,:,:], uint16[::1], uint16[:,::1])")
-def look_up_shades(planes: UInt8, table: UInt16, found: UInt16) -> None:
+def look_up_shades(planes: UInt8, table: UInt16, shades: UInt16) -> None:
     """The shade of every 2 x 2 pixels of the planes blue, green and red, by a table of BGR colours of 5 bits each."""
-    for y in range(found.shape[0]):
-        for x in range(found.shape[1]):
+    for y in range(shades.shape[0]):
+        for x in range(shades.shape[1]):
             place = 0  # the first 5 bits of each channel's mean, one after the other
             for channel in range(3):
                 above = np.int64(planes[channel, 2 * y, 2 * x]) + planes[channel, 2 * y, 2 * x + 1]
                 below = np.int64(planes[channel, 2 * y + 1, 2 * x]) + planes[channel, 2 * y + 1, 2 * x + 1]
                 mean = (above + below + 2) >> 2
                 place = place << 5 | mean >> 3
-            found[y, x] = table[place]
+            shades[y, x] = table[place]
 
 
 @_part
-def _count_shades(found: UInt16, row: int, column: int, features: Float32) -> None:
+def _count_shades(shades: UInt16, row: int, column: int, features: Float32) -> None:
     """Features of the window whose first cell is (row, column), into float32 (SHADES,)."""
     for shade in range(len(features)):
         features[shade] = 0
     for y in range((row + 1) * SIDE, (row + 1 + COUNTED) * SIDE):
         for x in range((column + 1) * SIDE, (column + 1 + COUNTED) * SIDE):
-            features[found[y, x]] += 1
+            features[shades[y, x]] += 1
     for shade in range(len(features)):
         features[shade] = _ROOT * np.sqrt(features[shade])
 
 
 @_kernel("void(uint16[:,::1], float32[::1], float32, float32[:,::1])")
-def add_colour_scores(found: UInt16, weights: Float32, least: float, scores: Float32) -> None:
+def add_colour_scores(shades: UInt16, weights: Float32, threshold: float, scores: Float32) -> None:
     """Add the score of the histogram of each window.
 
     A strip is the histogram of the cells of a column that the windows of a row count. From one row of windows to the
@@ -368,13 +368,13 @@ def add_colour_scores(found: UInt16, weights: Float32, least: float, scores: Flo
             if row:
                 for y in range(top - SIDE, top):
                     for x in range(left, left + SIDE):
-                        strip[found[y, x]] -= 1
+                        strip[shades[y, x]] -= 1
             else:
                 for shade in range(len(strip)):
                     strip[shade] = 0
             for y in range(top + (COUNTED - 1) * SIDE if row else top, top + COUNTED * SIDE):
                 for x in range(left, left + SIDE):
-                    strip[found[y, x]] += 1
+                    strip[shades[y, x]] += 1
         for shade in range(len(counts)):
             counts[shade] = 0
             for column in range(COUNTED - 1):
@@ -383,7 +383,7 @@ def add_colour_scores(found: UInt16, weights: Float32, least: float, scores: Flo
             enters, leaves = strips[column + COUNTED - 1], strips[column]
             for shade in range(len(counts)):
                 counts[shade] += enters[shade]
-            if scores[row, column] >= least:
+            if scores[row, column] >= threshold:
                 total = float32(0)
                 for shade in range(len(counts)):
                     total += weights[shade] * np.sqrt(float32(counts[shade]))
@@ -408,12 +408,13 @@ def cut_rows(grid: Float32, shades: UInt16, places: Int64, features: Float32) ->
 @_kernel("void(uint8[:,:,:,::1], int64, float32[:,:,::1], uint16[::1], float32[:,::1])")
 def describe_windows(patches: UInt8, margin: int, shares: Float32, table: UInt16, features: Float32) -> None:
     """Feature rows of patches, each of which is a window and its margin."""
-    cells, found = np.empty((WINDOW, WINDOW, CHANNELS), np.float32), np.empty((WINDOW * SIDE, WINDOW * SIDE), np.uint16)
+    cells = np.empty((WINDOW, WINDOW, CHANNELS), np.float32)
+    shades = np.empty((WINDOW * SIDE, WINDOW * SIDE), np.uint16)
     first, inner = np.zeros((1, 2), np.int64), slice(margin * CELL, (margin + WINDOW) * CELL)
     for k in range(len(patches)):
         describe_cells(patches[k], margin, shares, cells)
-        look_up_shades(patches[k][:, inner, inner], table, found)
-        cut_rows(cells.reshape(WINDOW, -1), found, first, features[k : k + 1])
+        look_up_shades(patches[k][:, inner, inner], table, shades)
+        cut_rows(cells.reshape(WINDOW, -1), shades, first, features[k : k + 1])
 
 
 @_kernel("void(float32[:,::1], float32[:,::1], float32[:,::1])")
@@ -453,17 +454,17 @@ def _spline(offset: float, weights: Float32) -> None:
 
 
 @_kernel("void(float32[:,:,::1], float64[:,::1], float32[:,:,::1])")
-def sample_vectors(vectors: Float32, places: Float64, found: Float32) -> None:
+def sample_vectors(vectors: Float32, places: Float64, output: Float32) -> None:
     """Cubic B-spline of vectors: at the first of three places, then in steps to the right, and to the row below."""
     across, down = np.empty(4, np.float32), np.empty(4, np.float32)
     rows, columns = vectors.shape[0], vectors.shape[1]
-    for row in range(found.shape[0]):
-        for column in range(found.shape[1]):
+    for row in range(output.shape[0]):
+        for column in range(output.shape[1]):
             x = places[0, 0] + column * places[1, 0] + row * places[2, 0]
             y = places[0, 1] + column * places[1, 1] + row * places[2, 1]
             _spline(x - np.floor(x), across)
             _spline(y - np.floor(y), down)
-            total = found[row, column]
+            total = output[row, column]
             for channel in range(len(total)):
                 total[channel] = 0
             for i in range(4):
@@ -475,14 +476,14 @@ def sample_vectors(vectors: Float32, places: Float64, found: Float32) -> None:
 
 
 @_kernel("void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1])")
-def sample(image: UInt8, left: float, top: float, across: float, down: float, found: UInt8) -> None:
+def sample(image: UInt8, left: float, top: float, across: float, down: float, output: UInt8) -> None:
     """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""
-    channels, rows, columns = found.shape
+    channels, rows, columns = output.shape
     height, width = image.shape[0], image.shape[1] // channels
     begin = min(max(int(np.floor(left)), 0), width - 1)
     end = min(max(int(np.floor(left + (columns - 1) * across)) + 2, begin + 1), width)
     line = np.empty(image.shape[1], np.float32)
-    # Of each pixel found: where in the line the two pixels are that it lies between, and the share of the second one.
+    # For every output pixel: the indices in the line of its two neighbours, and the weight of the second one.
     first, second, share = np.empty(columns, np.uint32), np.empty(columns, np.uint32), np.empty(columns, np.float32)
     for i in range(columns):
         x = left + i * across
@@ -500,35 +501,35 @@ def sample(image: UInt8, left: float, top: float, across: float, down: float, fo
             value = float32(above[i])
             line[i] = value + part * (float32(below[i]) - value) + float32(0.5)  # half, to round
         for channel in range(channels):
-            values, line_found = line[channel:], found[channel, row]
+            values, output_line = line[channel:], output[channel, row]
             for i in range(columns):
                 value = values[first[i]]
-                line_found[i] = np.uint8(value + share[i] * (values[second[i]] - value))
+                output_line[i] = np.uint8(value + share[i] * (values[second[i]] - value))
 
 
 @_kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")
 def sparse_codes(gains: Float64, gram: Float64, codes: Float32) -> None:
     """Non-negative sparse codes, by active sets (Lawson and Hanson).
 
-    The atom that gains most comes in, those that turn negative go.
+    The atom with the highest gain enters the active set; atoms whose code becomes negative leave it.
 
-    `gains` are those at code 0. The set's Gram matrix is kept as a Cholesky factor whose diagonal is inverted, with the
-    solution of its forward substitution: an atom that comes in adds one row to both.
+    `gains` are those at code 0. The Gram matrix of the set is stored as a Cholesky factor with an inverted diagonal,
+    with the solution of its forward substitution: an atom that enters adds one row to both.
     """
     count = len(gram)
-    code, wanted, forward, gain = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    code, solution, forward, gain = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     active, factor = np.empty(count, np.int64), np.empty((count, count))
     for row in range(len(codes)):
         start, size = gains[row], 0
         for atom in range(count):
             gain[atom] = start[atom]
         for _ in range(3 * count):
-            most, best = gain[0], 0
+            highest, best = gain[0], 0
             for atom in range(1, count):
-                most = max(most, gain[atom])
-            if most <= 1e-6:
+                highest = max(highest, gain[atom])
+            if highest <= 1e-6:
                 break
-            while gain[best] < most:
+            while gain[best] < highest:
                 best += 1
             active[size], code[size] = best, 0.0
             valid, size = size, size + 1
@@ -547,20 +548,20 @@ def sparse_codes(gains: Float64, gram: Float64, codes: Float32) -> None:
                     factor[i, i] = 1 / np.sqrt(max(total, 1e-9))
                     forward[i] = ahead * factor[i, i]
                 for i in range(size):
-                    wanted[i] = forward[i]
+                    solution[i] = forward[i]
                 for i in range(size - 1, -1, -1):
-                    wanted[i] *= factor[i, i]
+                    solution[i] *= factor[i, i]
                     for k in range(i):
-                        wanted[k] -= factor[i, k] * wanted[i]
+                        solution[k] -= factor[i, k] * solution[i]
                 way, out = 1.0, -1
                 for i in range(size):
-                    if wanted[i] <= 0:
+                    if solution[i] <= 0:
                         now = code[i]
-                        part = now / (now - wanted[i]) if now > 0 else 0.0
+                        part = now / (now - solution[i]) if now > 0 else 0.0
                         if part < way:
                             way, out = part, i
                 for i in range(size):
-                    code[i] += way * (wanted[i] - code[i])
+                    code[i] += way * (solution[i] - code[i])
                 if out < 0:
                     break
                 size -= 1

@@ -17,22 +17,22 @@ from catstream.base.threads import one_at_a_time
 from catstream.errors import MissingExtraError, SettingsError, install_command
 from catstream.features.layout import CELL, STRIDE
 
-#: Mean square length of a vector: so much does the HOG of a cell vary.
+#: Mean squared norm of a vector: the variance of the HOG of a cell.
 ENERGY = 0.39
-#: Channels of a vector at most.
-MOST_CHANNELS = 32
+#: Maximum number of channels of a vector.
+MAX_CHANNELS = 32
 
-_FACTOR = 16  # between the mean square length in the test image and `ENERGY`, at most
+_FACTOR = 16  # largest ratio between `ENERGY` and the mean squared norm in the test image
 _TEST_SIZES = ((224, 224), (96, 160))  # of images, height and width
 
 _Run = Callable[[np.ndarray], np.ndarray]
 
 
 class Network:
-    """A network of which each call is a function of its input; it runs on one thread.
+    """A network that runs on one thread and has no state between calls.
 
-    SettingsError if the file is none of the kind above; OSError if it cannot be read; MissingExtraError if neither
-    onnxruntime is installed nor OpenCV reads the file.
+    SettingsError if the file is not of the kind above; OSError if it cannot be read; MissingExtraError if onnxruntime
+    is not installed and OpenCV cannot read the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,52 +47,53 @@ class Network:
 
 
 def _checked(path: Path, run: _Run, height: int, width: int) -> int:
-    """Number of channels; SettingsError unless the vectors of an image have the right shape, and about the length."""
+    """Number of channels; SettingsError unless the vectors of an image have the right shape and norm."""
     try:
-        found = run(_test_image(height, width))
+        output = run(_test_image(height, width))
     except Exception as error:  # of onnxruntime or of OpenCV
-        raise _misfit(path, f"it cannot take a float32 (1, 3, {height}, {width}) ({_first_line(error)})") from None
-    channels, sides = found.shape[1] if found.ndim == 4 else 0, (height // STRIDE, width // STRIDE)
-    if found.dtype != np.float32 or found.shape != (1, channels, *sides) or not 0 < channels <= MOST_CHANNELS:
-        what = f"for an image of {height} x {width} its output is {found.dtype} {found.shape}, expected float32"
-        raise _misfit(path, f"{what} (1, 1 to {MOST_CHANNELS}, {sides[0]}, {sides[1]})")
-    length = float((found**2).sum(axis=1).mean())
-    if not ENERGY / _FACTOR < length < ENERGY * _FACTOR:
-        raise _misfit(path, f"the mean square length of its vectors is {length:.3g}, expected about {ENERGY}")
+        raise _invalid(path, f"it rejects a float32 (1, 3, {height}, {width}) ({_first_line(error)})") from None
+    channels = output.shape[1] if output.ndim == 4 else 0
+    rows, columns = height // STRIDE, width // STRIDE
+    if output.dtype != np.float32 or output.shape != (1, channels, rows, columns) or not 0 < channels <= MAX_CHANNELS:
+        problem = f"for an image of {height} x {width} its output is {output.dtype} {output.shape}"
+        raise _invalid(path, f"{problem}, expected float32 (1, 1 to {MAX_CHANNELS}, {rows}, {columns})")
+    energy = float((output**2).sum(axis=1).mean())
+    if not ENERGY / _FACTOR < energy < ENERGY * _FACTOR:
+        raise _invalid(path, f"the mean squared norm of its vectors is {energy:.3g}, expected about {ENERGY}")
     return channels
 
 
-def _misfit(path: Path, why: str) -> SettingsError:
+def _invalid(path: Path, problem: str) -> SettingsError:
     return SettingsError(
-        f"features.network={str(path)!r} is no network that catstream can use: {why}. Make one with "
-        "`catstream network prepare`"
+        f"features.network={str(path)!r} cannot be used: {problem}; make a network with `catstream network prepare`"
     )
 
 
 def _first_line(error: Exception) -> str:
-    """The first line of what a runtime says."""
+    """The first line of the error of a runtime."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
 def by_onnxruntime(path: Path, data: bytes) -> _Run:
-    """What a model computes of a batch of images; `path` is for the error if it cannot be read."""
+    """Return a function that runs a model on a batch of images; `path` is for errors."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # an error is raised, too
+    options.log_severity_level = 4  # errors are raised anyway
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # it has a class for each kind, all of them private
-        raise _misfit(path, f"onnxruntime cannot read it ({_first_line(error)})") from None
-    inputs, outputs = ([each.name for each in ends] for ends in (session.get_inputs(), session.get_outputs()))
+    except Exception as error:  # of several private classes
+        raise _invalid(path, f"onnxruntime cannot read it ({_first_line(error)})") from None
+    inputs = [node.name for node in session.get_inputs()]
+    outputs = [node.name for node in session.get_outputs()]
     if len(inputs) != 1 or len(outputs) != 1:
-        raise _misfit(path, f"it has {len(inputs)} inputs and {len(outputs)} outputs, expected one each")
+        raise _invalid(path, f"it has {len(inputs)} inputs and {len(outputs)} outputs, expected one each")
     return lambda images: np.asarray(session.run(outputs, {inputs[0]: images})[0])
 
 
 def _by_opencv(path: Path, data: bytes) -> _Run:
-    """The same by the runtime of OpenCV, which takes twice the time, and does not read every file."""
+    """The same by the runtime of OpenCV, which takes twice the time and cannot read every file."""
     import cv2
 
     def run(images: np.ndarray) -> np.ndarray:

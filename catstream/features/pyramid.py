@@ -1,4 +1,4 @@
-"""The pyramid of a frame: what is cut from it for a large object is cut from a smaller copy, which all cuts share."""
+"""The image pyramid of a frame: patches of a large object are cut from a smaller copy, which all of them share."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from catstream.features.descriptor import Descriptor
 from catstream.features.kernels import sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
 
-_MOST_CELLS = 62_500  # of the region around a tiny window, which bounds the cost of a large frame
-_OVERLAP = WINDOW + 2 * MARGIN  # cells that adjacent parts of a region share, at least: a window and its margin
+_MAX_CELLS = 62_500  # of the region around a tiny window: bounds the cost of a large frame
+_OVERLAP = WINDOW + 2 * MARGIN  # minimum overlap of adjacent parts of a region, in cells: a window and its margin
 
 
 class Region(NamedTuple):
@@ -29,8 +29,8 @@ class Region(NamedTuple):
         """Number of cells of the region if a window in it has 8 x 8."""
         return (self.width / window.w * WINDOW) * (self.height / window.h * WINDOW)
 
-    def split(self, window: Window, most: int) -> list[Region]:
-        """Parts of at most `most` cells, a few more by rounding; each window lies in one of them, with its margin.
+    def split(self, window: Window, max_cells: int) -> list[Region]:
+        """Split into parts of at most `max_cells` cells, up to rounding; every window lies in a part, with its margin.
 
         >>> Region(0, 0, 640, 480).split(Window(0, 0, 64, 64), 5000)
         [Region(left=0, top=0, width=640, height=480)]
@@ -40,7 +40,7 @@ class Region(NamedTuple):
         share_x, share_y = window.w / WINDOW * _OVERLAP, window.h / WINDOW * _OVERLAP
         across = down = 1
         width, height = float(self.width), float(self.height)
-        while width / window.w * height / window.h * WINDOW**2 > most:
+        while width / window.w * height / window.h * WINDOW**2 > max_cells:
             if width / window.w >= height / window.h:
                 across += 1
                 width = (self.width + (across - 1) * share_x) / across
@@ -54,13 +54,13 @@ class Region(NamedTuple):
 
 
 class Pyramid:
-    """A frame, and the same at a half, a quarter ... of its size, each made when it is first asked for.
+    """A frame at full, half, quarter ... size; the levels are computed at their first use.
 
     Several threads may cut from it at the same time.
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) BGR, or (h, w) grey, which cuts are then, too
+    image : uint8 (h, w, 3) BGR, or (h, w) grey; patches have the same channels
     descriptor : computes a part of the features of a window, None for HOG and colours alone
     """
 
@@ -75,9 +75,9 @@ class Pyramid:
         return width, height
 
     def near(self, scale: float) -> tuple[np.ndarray, int]:
-        """The smallest image whose pixels are at most `scale` pixels of the frame wide, and how wide: 1, 2, 4 ...
+        """The smallest level whose pixels are at most `scale` pixels of the frame wide, and their width: 1, 2, 4 ...
 
-        So linear interpolation skips none of the frame's pixels, or few. An odd last row or column is left out.
+        So linear interpolation skips none of the frame's pixels, or few. An odd last row or column is dropped.
 
         >>> image, wide = Pyramid(np.zeros((90, 121, 3), np.uint8)).near(5.9)
         >>> image.shape, wide
@@ -86,15 +86,15 @@ class Pyramid:
         level = 0
         while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
             level += 1
-            if level not in self._halves:  # two threads may make the same one: it has the same pixels
+            if level not in self._halves:  # two threads may compute the same level, with the same pixels
                 self._halves[level] = _half(self._halves[level - 1])
         return self._halves[level], 1 << level
 
     def around(self, window: Window, side: int, margin: int = MARGIN) -> np.ndarray:
-        """A patch of `side` x `side` cells around a window and a margin, as `cut`; the window has 64 x 64 pixels."""
+        """Cut `side` x `side` cells and a margin around a window, which then has 64 x 64 pixels: see `cut`."""
         x, y = window.centre
-        step = window.w / WINDOW, window.h / WINDOW
-        return self.cut(x, y, step[0] / CELL, step[1] / CELL, (side + 2 * margin) * CELL)
+        step_x, step_y = window.w / WINDOW, window.h / WINDOW
+        return self.cut(x, y, step_x / CELL, step_y / CELL, (side + 2 * margin) * CELL)
 
     @property
     def region(self) -> Region:
@@ -104,7 +104,7 @@ class Pyramid:
     def region_around(self, window: Window) -> Region:
         """All of the frame, or, if that has more than 62,500 cells, a part around the window with that many."""
         width, height = self.size
-        reach = math.sqrt(_MOST_CELLS / self.region.cells(window))
+        reach = math.sqrt(_MAX_CELLS / self.region.cells(window))
         if reach >= 1:
             return self.region
         x, y = window.centre
@@ -118,10 +118,10 @@ class Pyramid:
         return Pyramid(self.image[region.top :, region.left :][: region.height, : region.width])
 
     def resized(self, window: Window, *, averaged: bool = True) -> tuple[np.ndarray, tuple[float, float]]:
-        """The frame, resized until a window is 64 x 64 pixels; also width and height of a cell in pixels of the frame.
+        """Resize the frame so that a window is 64 x 64 pixels; also returns the size of a cell in pixels of the frame.
 
-        Of the window, only the size counts. If `averaged`, the pixels of a frame that is reduced are averaged;
-        otherwise they are interpolated as in `cut`, in a fifth of the time.
+        Only the size of the window matters. If `averaged`, a frame is reduced by averaging its pixels; otherwise by
+        interpolation as in `cut`, in a fifth of the time.
         """
         width, height = self.size
         columns = max(WINDOW, round(width / window.w * WINDOW))
@@ -134,19 +134,19 @@ class Pyramid:
         return resized, (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
     def cut(self, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
-        """A square of `size` pixels, centred at (x, y) and rotated by `turn` radians; beyond the edge the last repeats.
+        """Cut a square of `size` pixels, centred at (x, y) and rotated by `turn` radians; the border is replicated.
 
-        A pixel of the cut is `across` pixels of the frame wide and `down` high. Returns uint8 (3, size, size), blue,
+        A pixel of the patch is `across` pixels of the frame wide and `down` high. Returns uint8 (3, size, size), blue,
         green and red, or (1, size, size) of a grey frame.
         """
         image, wide = self.near(min(across, down))
         x, y, across, down = x / wide - 0.5, y / wide - 0.5, across / wide, down / wide
         middle = (size - 1) / 2
         if not turn:
-            found = np.empty((1 if image.ndim == 2 else 3, size, size), np.uint8)
+            patch = np.empty((1 if image.ndim == 2 else 3, size, size), np.uint8)
             lines = image.reshape(len(image), -1)
-            sample(lines, x - middle * across, y - middle * down, across, down, found)
-            return found
+            sample(lines, x - middle * across, y - middle * down, across, down, patch)
+            return patch
         cos, sin = math.cos(turn), math.sin(turn)
         right, below = (across * cos, across * sin), (-down * sin, down * cos)
         corner = x - (right[0] + below[0]) * middle, y - (right[1] + below[1]) * middle
@@ -156,11 +156,11 @@ class Pyramid:
 
 
 def planes_of(image: np.ndarray) -> np.ndarray:
-    """The channels of an image, uint8 (h, w, 3) or (h, w), one after the other: uint8 (3, h, w) or (1, h, w)."""
+    """The planes of an image, uint8 (h, w, 3) or (h, w), as uint8 (3, h, w) or (1, h, w)."""
     if image.ndim == 2:
         return image[None]
     planes = np.empty((3, *image.shape[:2]), np.uint8)
-    cv2.split(image, list(planes))  # into these
+    cv2.split(image, list(planes))
     return planes
 
 

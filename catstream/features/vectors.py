@@ -1,4 +1,4 @@
-"""Vectors: what a descriptor computes of the surroundings of an object, once a frame, sampled for all windows there."""
+"""Vectors of a descriptor around an object, computed once per frame and sampled for all windows there."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ class VectorMap:
         Returns float32 (side - 1, side - 1, channels); a window has every second of them.
         """
         rows, columns, channels = self.vectors.shape
-        found = np.empty((side - 1, side - 1, channels), np.float32)
+        output = np.empty((side - 1, side - 1, channels), np.float32)
         (x, y), (middle_x, middle_y) = window.centre, self.window.centre
         step_x, step_y = self.window.w / PLACES, self.window.h / PLACES  # of the vectors, in pixels of the frame
         w, h, cos, sin = window.w / WINDOW, window.h / WINDOW, math.cos(turn), math.sin(turn)
         right, below = (w * cos / step_x, w * sin / step_y), (-h * sin / step_x, h * cos / step_y)
         left = (columns - 1 - (side - 2) * (right[0] + below[0])) / 2 + (x - middle_x) / step_x
         top = (rows - 1 - (side - 2) * (right[1] + below[1])) / 2 + (y - middle_y) / step_y
-        kernels.sample_vectors(self.vectors, np.array([(left, top), right, below]), found)
-        return found
+        kernels.sample_vectors(self.vectors, np.array([(left, top), right, below]), output)
+        return output
 
     @staticmethod
     def between_cells(descriptor: Descriptor, planes: np.ndarray) -> np.ndarray:
@@ -61,10 +61,10 @@ class VectorMap:
         edge = EDGE * CELL
         sides = (edge, edge + -height % STRIDE), (edge, edge + -width % STRIDE)
         vectors = descriptor(np.pad(planes, ((0, 0), *sides), "edge")) * _WEIGHT
-        found = np.empty((height // CELL - 1, width // CELL - 1, descriptor.channels), np.float32)
+        output = np.empty((height // CELL - 1, width // CELL - 1, descriptor.channels), np.float32)
         first, half = edge / STRIDE, CELL / STRIDE
-        kernels.sample_vectors(vectors, np.array([(first, first), (half, 0.0), (0.0, half)]), found)
-        return found
+        kernels.sample_vectors(vectors, np.array([(first, first), (half, 0.0), (0.0, half)]), output)
+        return output
 
     def row(self, window: Window, turn: float = 0.0) -> np.ndarray:
         """The 4 x 4 vectors of a window that is rotated by `turn` radians, float32 (16 * channels,)."""

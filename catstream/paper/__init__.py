@@ -1,1 +1,1 @@
-"""The parts that only the paper has, for comparison: its first tracker and its classifier."""
+"""The parts of the paper that are not used by default, for comparison: its first tracker and its classifier."""

@@ -1,8 +1,8 @@
 """The paper's classifier: a one-class linear support vector machine (paper, "Training").
 
-It finds the direction in which all but a share of the object's rows lie farthest
-from the origin. HOG rows are never negative, so that around the true origin it
-would only learn "has edges": the origin is put at the mean of the background.
+It separates all but a share of the object's rows from the origin by the hyperplane with the largest margin. HOG rows
+are never negative, so that from the true origin it would only learn "has edges". The origin is the mean of the
+background.
 """
 
 from __future__ import annotations
@@ -14,26 +14,25 @@ from catstream.errors import ProtocolError
 
 
 def one_class(rows: np.ndarray, origin: np.ndarray, nu: float = 0.5) -> np.ndarray:
-    """Find the direction that holds the rows farthest from an origin.
+    """Return the normal of the hyperplane that separates rows from an origin with the largest margin.
 
-    At least `1 - nu` of the rows lie beyond the hyperplane across it. The same rows
-    give the same bits. Costs the Gram matrix, O(r^2 d), of which only a solver of
-    r unknowns sees more; several times faster than solving in d dimensions.
+    At least `1 - nu` of the rows lie beyond the hyperplane. The same rows give the same bits. Costs the Gram matrix,
+    O(r^2 d), and a solver of r unknowns: several times faster than solving in d dimensions.
 
     Parameters
     ----------
-    rows : float32 (r, d), a sample of the object's coreset tree: spread, each weighing one
+    rows : float32 (r, d), a sample of the object's coreset tree, in which all rows have the weight 1
     origin : float32 (d,), mean of the background
     nu : share of rows that may be outliers, above 0 and below 1
 
     Returns
     -------
-    float32 (d,), of any length: scaling the score is left to the caller
+    float32 (d,), not normalised
 
     Raises
     ------
     ProtocolError
-        Where there are no rows, or none differs from the origin.
+        If there are no rows, or none differs from the origin.
 
     >>> direction = one_class(np.array([[3, 1], [3, 2], [3, 0]], np.float32), np.array([1, 1], np.float32))
     >>> (direction / direction[0]).round(3)

@@ -1,13 +1,14 @@
 """The sparse collaborative model: the tracker that the paper starts with (paper, "System Implementation").
 
 W. Zhong, H. Lu, M.-H. Yang: Robust Object Tracking via Sparsity-based Collaborative Model, CVPR 2012. A particle
-filter scores each particle twice, and the product decides ("Collaborative Model"):
+filter scores the particles by a product ("Collaborative Model"):
 
-- H, by a classifier of the whole picture against the background, which changes: `_Discriminative`;
-- L, by a histogram of the object's patches, which tells where it is covered: `_Generative`.
+- H, of an adaptive classifier of the whole template against the background: `_Discriminative`;
+- L, of a histogram of the object's patches, which detects occlusion: `_Generative`.
 
-Numbers and notation are theirs. What differs: their particles are spread by pixels, ours by the size of the object;
-shear is left out, as a box cannot show it; and L is not found for particles whose H alone says that they cannot win.
+Numbers and notation are theirs. There are three differences: the particles are spread in proportion to the size of the
+object, not in pixels; there is no shear, which a box cannot represent; and L is not computed for particles that cannot
+have the highest product, by their H.
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ _EVERY = 5  # frames from one update to the next
 
 
 class SparseCollaborativeModel:
-    """Follows one object from a box in the first frame, without a trainer.
+    """Tracks one object from a box in the first frame, without a trainer.
 
-    The same images, box and generator give the same boxes. A frame costs at most in
-    proportion to the particles. The object is always said to be somewhere.
+    The same images, box and generator give the same boxes. The cost of a frame is at most proportional to the number of
+    particles. The object is never absent.
 
     Parameters
     ----------
     image : uint8 (h, w, 3) BGR, or (h, w) grey: the first frame
     box : the object in it, in pixels
-    rng : where templates and particles come from
-    particles : boxes that are tried in a frame
+    rng : generator of templates and particles
+    particles : number of boxes that are scored in a frame
     """
 
     def __init__(self, image: np.ndarray, box: Box, rng: np.random.Generator, particles: int = 300) -> None:
@@ -59,12 +60,12 @@ class SparseCollaborativeModel:
         self._generative = _Generative.from_template(template[0], int(rng.integers(2**31)))
 
     def follow(self, image: np.ndarray) -> tuple[float, Box]:
-        """Find the object in the next frame, of the size of the first.
+        """Track the object in the next frame, of the size of the first one.
 
         Returns
         -------
-        score, 0 to 1, above 0.5 where the object's templates rebuild what was found better than the
-        background's; and the box, without its rotation
+        score, 0 to 1, above 0.5 if the templates of the object reconstruct the box better than those of the background;
+        and the box, without its rotation
         """
         grey = _grey(image)
         size = math.sqrt(self._box.area)
@@ -90,28 +91,28 @@ class SparseCollaborativeModel:
     def _most_likely(self, cuts: np.ndarray) -> tuple[int, float]:
         """The candidate with the highest H L ("Collaborative Model"), and its H."""
         confidences = self._discriminative.confidences(cuts)
-        best, most = 0, 0.0
-        for some in np.array_split(np.argsort(-confidences, kind="stable"), max(len(cuts) // 20, 1)):
-            if confidences[some[0]] <= most:
-                break  # L is at most 1: no other can win
-            likelihoods = confidences[some] * self._generative.similarities(cuts[some])
-            if likelihoods.max() > most:
-                best, most = int(some[likelihoods.argmax()]), float(likelihoods.max())
+        best, highest = 0, 0.0
+        for batch in np.array_split(np.argsort(-confidences, kind="stable"), max(len(cuts) // 20, 1)):
+            if confidences[batch[0]] <= highest:
+                break  # L is at most 1, so no other product is higher
+            likelihoods = confidences[batch] * self._generative.similarities(cuts[batch])
+            if likelihoods.max() > highest:
+                best, highest = int(batch[likelihoods.argmax()]), float(likelihoods.max())
         return best, float(confidences[best])
 
     def _background(self, grey: Pyramid) -> np.ndarray:
-        """Negative templates: an annulus, the object's edge included ("Templates")."""
+        """Negative templates, from an annulus that includes the object's edge ("Templates")."""
         return self._cuts(grey, self._beside(_NEGATIVES, 0.25, 0.5))
 
-    def _beside(self, count: int, least: float, deviation: float) -> np.ndarray:
-        """States shifted from the present one by more than a share of the box along x or along y."""
+    def _beside(self, count: int, min_shift: float, deviation: float) -> np.ndarray:
+        """States shifted from the current one by more than a share of the box along x or along y."""
         shifts = self._rng.normal(scale=deviation, size=(8 * count, 2))
         states = np.tile(self._state, (count, 1))
-        states[:, :2] += shifts[(abs(shifts) >= least).any(axis=1)][:count] * self._box[2:]
+        states[:, :2] += shifts[(abs(shifts) >= min_shift).any(axis=1)][:count] * self._box[2:]
         return states
 
     def _cuts(self, grey: Pyramid, states: np.ndarray) -> np.ndarray:
-        """The frame as each state sees it, uint8 (count, 32, 32)."""
+        """The patches of the frame at states, uint8 (count, 32, 32)."""
         across = self._first.w / _SIDE * np.exp(states[:, 2] + states[:, 3])
         down = self._first.h / _SIDE * np.exp(states[:, 2] - states[:, 3])
         places = zip(states[:, 0], states[:, 1], across, down, states[:, 4], strict=True)
@@ -130,18 +131,18 @@ class _Discriminative:
 
     @classmethod
     def trained(cls, positives: np.ndarray, negatives: np.ndarray) -> _Discriminative:
-        """Learn which pixels tell them apart."""
+        """Select the pixels that discriminate positives from negatives."""
         templates = _unit(np.concatenate([positives, negatives]).reshape(-1, _SIDE * _SIDE))
         labels = np.repeat([1.0, -1.0], [len(positives), len(negatives)])
-        # Pixels are selected by a sparse regression of the labels ("Feature Selection").
+        # By a sparse regression of the labels ("Feature Selection").
         regression = Lasso(cls._SELECTION / len(labels), fit_intercept=False)
         with FILTERS, warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # a thousand sweeps select well enough
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a thousand sweeps are enough
             weights = regression.fit(templates, labels).coef_
         return cls(positives, templates, np.flatnonzero(weights) if weights.any() else np.arange(_SIDE * _SIDE))
 
     def confidences(self, cuts: np.ndarray) -> np.ndarray:
-        """H of each candidate: how much better the object's templates rebuild it than the background's."""
+        """H of the candidates: the ratio of the reconstruction errors by background and object."""
         rows = _unit(cuts.reshape(-1, _SIDE * _SIDE))[:, self.selected]
         codes = _codes(rows, self._templates)
         half = len(self.positives)
@@ -155,15 +156,16 @@ class _Generative:
     """A histogram of sparse codes, patch by patch ("Sparsity-based Generative Model")."""
 
     _PATCH, _STRIDE, _ATOMS = 6, 2, 50
-    _COVERED = 0.04  # a patch rebuilt worse than this is covered
-    _LEARNS, _KEEPS = 0.8, 0.95  # share of covered patches from which nothing is learned; share of the first histogram
+    _OCCLUDED = 0.04  # reconstruction error from which a patch is occluded
+    _MAX_OCCLUSION = 0.8  # share of occluded patches from which the histogram is not updated
+    _FIRST_SHARE = 0.95  # share of the first histogram
 
     def __init__(self, atoms: np.ndarray, first: np.ndarray, histogram: np.ndarray) -> None:
         self.atoms, self.first, self.histogram = atoms, first, histogram
 
     @classmethod
     def from_template(cls, template: np.ndarray, seed: int) -> _Generative:
-        """Learn the object's patches."""
+        """Cluster the patches of the object."""
         patches = cls._patches(template[None])
         with FILTERS, warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # a plain object has fewer than 50 different patches
@@ -173,26 +175,26 @@ class _Generative:
         return self
 
     def similarities(self, cuts: np.ndarray) -> np.ndarray:
-        """L of each candidate: intersection with the object's histogram, where it is not covered."""
-        codes, covered = self._coded(cuts)
-        codes[covered] = 0
+        """L of the candidates: the intersection with the object's histogram, without occluded patches."""
+        codes, is_occluded = self._coded(cuts)
+        codes[is_occluded] = 0
         shared = np.minimum(codes, self.histogram).sum(axis=(1, 2))
         shares: np.ndarray = shared / max(self.histogram.sum(), 1e-6)
         return shares
 
-    def update(self, found: np.ndarray) -> None:
-        """Learn the new look, unless it is covered; the first is never forgotten ("Update Scheme")."""
-        codes, covered = self._coded(found[None])
-        if covered.mean() < self._LEARNS:
-            codes[covered] = 0
-            self.histogram = self._KEEPS * self.first + (1 - self._KEEPS) * codes[0]
+    def update(self, patch: np.ndarray) -> None:
+        """Update the histogram, unless the object is occluded; the first one stays a part of it ("Update Scheme")."""
+        codes, is_occluded = self._coded(patch[None])
+        if is_occluded.mean() < self._MAX_OCCLUSION:
+            codes[is_occluded] = 0
+            self.histogram = self._FIRST_SHARE * self.first + (1 - self._FIRST_SHARE) * codes[0]
 
     def _coded(self, cuts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Codes (count, 196, 50) of all patches, and which of them are covered (count, 196)."""
+        """Codes (count, 196, 50) of all patches, and a mask of the occluded ones (count, 196)."""
         patches = self._patches(cuts)
         codes = _codes(patches, self.atoms)
-        covered = _squares(patches - codes @ self.atoms) >= self._COVERED
-        return codes.reshape(len(cuts), -1, self._ATOMS), covered.reshape(len(cuts), -1)
+        is_occluded = _squares(patches - codes @ self.atoms) >= self._OCCLUDED
+        return codes.reshape(len(cuts), -1, self._ATOMS), is_occluded.reshape(len(cuts), -1)
 
     @classmethod
     def _patches(cls, cuts: np.ndarray) -> np.ndarray:
@@ -211,7 +213,7 @@ def _squares(rows: np.ndarray) -> np.ndarray:
 
 
 def _unit(rows: np.ndarray) -> np.ndarray:
-    """Rows of length 1, float32; a black one stays black."""
+    """Normalise rows to length 1, float32; a row of zeros stays zero."""
     rows = rows.astype(np.float32)
     unit: np.ndarray = rows / np.maximum(np.sqrt(_squares(rows)), 1e-6)[:, None]
     return unit
@@ -220,8 +222,8 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 def _codes(rows: np.ndarray, atoms: np.ndarray) -> np.ndarray:
     """Non-negative sparse codes: minimise |row - code atoms|^2 / 2 + lambda |code|_1.
 
-    `sklearn.decomposition.sparse_encode` finds the same, but takes a call of 0.2 ms for each of the
-    58,800 patches of a frame; and patches are so alike that coordinate descent needs 500 sweeps.
+    `sklearn.decomposition.sparse_encode` computes the same, but needs a call of 0.2 ms for each of the 58,800 patches
+    of a frame; and patches are so similar that coordinate descent needs 500 sweeps.
 
     Returns
     -------

@@ -64,13 +64,13 @@ def _start(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, Motion]:
 def _smooth(
     centres: np.ndarray, mean: np.ndarray, covariance: np.ndarray, motion: Motion
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Expectation: states (m, 4) given all centres, their covariances (m, 4, 4), and those of each with the next.
+    """Expectation: smoothed states (m, 4), their covariances (m, 4, 4), and the lagged covariances (m - 1, 4, 4).
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
     kalman = constant_velocity(mean, covariance, motion.process, motion.observation)
     kalman.inv = _inverse
-    measured = [centre if seen else None for centre, seen in zip(centres, _present(centres), strict=True)]
+    measured = [centre if present else None for centre, present in zip(centres, _present(centres), strict=True)]
     states, covariances, _, predicted = kalman.batch_filter(measured, update_first=True)
     # The smoother asks for the inverse of each predicted covariance, the newest first: one call for all is faster.
     inverses = iter(np.linalg.inv(predicted[-2::-1]))
@@ -85,9 +85,9 @@ def _refit(centres: np.ndarray, states: np.ndarray, covariances: np.ndarray, lag
     spread = covariances[1:].sum(axis=0) + TRANSITION @ covariances[:-1].sum(axis=0) @ TRANSITION.T
     process = (push.T @ push + spread - together - together.T) / len(push)
 
-    seen = _present(centres)
-    error = centres[seen] - states[seen] @ OBSERVATION.T
-    observation = error.T @ error / len(error) + OBSERVATION @ covariances[seen].mean(axis=0) @ OBSERVATION.T
+    present = _present(centres)
+    error = centres[present] - states[present] @ OBSERVATION.T
+    observation = error.T @ error / len(error) + OBSERVATION @ covariances[present].mean(axis=0) @ OBSERVATION.T
     return Motion(_floored(process, PROCESS_FLOOR), _floored(observation, OBSERVATION_FLOOR))
 
 

@@ -95,22 +95,22 @@ class Source(ABC):
 
 
 def read_ahead(source: Source) -> Generator[Frame]:
-    """Yield the frames of a source, and read the next one in a thread meanwhile: FFmpeg decodes without the GIL.
+    """Yield the frames of a source, and prefetch the next one in a thread: FFmpeg decodes without the GIL.
 
-    It is not for live sources, because the frame that was read ahead would be out of date. Errors of the source are
-    raised in order, after the frames before them. Close the generator before the source.
+    It is not for live sources, because a prefetched frame would be out of date. Errors of the source are raised in
+    order, after the frames before them. Close the generator before the source.
     """
     with ThreadPoolExecutor(1, "reader") as reader:
-        coming = reader.submit(next, source, None)
-        while (frame := coming.result()) is not None:
-            coming = reader.submit(next, source, None)
+        prefetched = reader.submit(next, source, None)
+        while (frame := prefetched.result()) is not None:
+            prefetched = reader.submit(next, source, None)
             yield frame
 
 
 class UprightConverter:
-    """Converts frames that PyAV decoded to BGR arrays, and turns and mirrors them as their metadata say.
+    """Converts frames of PyAV to BGR arrays, rotated and flipped by their display matrix.
 
-    Create one for each source: setting up the conversion costs more than the conversion of a frame.
+    Create one per source: setting up the conversion costs more than the conversion of a frame.
     """
 
     def __init__(self) -> None:
@@ -130,9 +130,9 @@ class UprightConverter:
 
 
 def _displayed(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Turn and mirror an image by a display matrix, whose rows are the directions on the screen of the image's axes.
+    """Rotate and flip an image by a display matrix, whose rows are the directions on the screen of the image's axes.
 
-    An angle between the multiples of 90 degrees is that of the nearest one; without directions, nothing is changed.
+    An angle is rounded to a multiple of 90 degrees; a matrix of zeros changes nothing.
     """
     (right, _), (_, down) = matrix
     if abs(right) < abs(matrix[0, 1]):
@@ -141,7 +141,7 @@ def _displayed(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def open_video(text: str, hwaccel: str, **options: Any) -> InputContainer:
-    """Open a video or a stream with PyAV, to be decoded by a device of the kind `hwaccel` if that is not empty.
+    """Open a video or a stream with PyAV, with a hardware decoder of the kind `hwaccel` if that is not empty.
 
     Raises PyAV's errors, and VideoError if there is no such device, or it cannot decode this video.
     """
@@ -163,7 +163,7 @@ def open_video(text: str, hwaccel: str, **options: Any) -> InputContainer:
 
 
 def video_stream(container: InputContainer) -> Any:
-    """Return the stream of the video, not that of a cover picture beside it; None if there is no video."""
+    """Return the video stream, not the stream of a cover picture; None if there is no video."""
     from av.stream import Disposition
 
     streams = [container.streams.best("video"), *container.streams.video]

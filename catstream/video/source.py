@@ -16,10 +16,9 @@ The text is one of these:
     a live demo         demo:1; it needs no camera, see `catstream.video.live_demo`
     a file:// address   file:///home/me/walk.mp4
 
-Files and images are read to the last frame, and no frame is skipped. If FFmpeg
-cannot decode a place in a file, the frames before it are returned and then
-`VideoError` is raised; with `run.skip_damaged`, reading continues at the next
-key frame. The others are live: see `catstream.video.live`.
+Files and images are read to the last frame, and no frame is skipped. If FFmpeg cannot decode a part of a file, the
+frames before it are returned and then `VideoError` is raised; with `run.skip_damaged`, reading continues at the next
+key frame. The other sources are live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
 #: All frames of a source.
 ALL_FRAMES = slice(None)
 
-#: Suffixes of the files in a folder that are read as videos. A file that is named may have any that FFmpeg reads.
+#: Suffixes of the files in a folder that are read as videos. FFmpeg reads a single file whatever its suffix is.
 _VIDEOS = (
     "264 265 266 3g2 3gp amv apng asf av1 avc avi avs2 avs3 cavs dav dif divx drc dv dvd dvr-ms f4v flc fli flv gif "
     "gxf h261 h263 h264 h265 h266 h26l hevc imx ismv ivf k3g lvf m1v m2p m2t m2ts m2v m4v mj2 mjpeg mjpg mk3d mkv mod "
@@ -63,7 +62,7 @@ VIDEOS = {f".{suffix}" for suffix in _VIDEOS.split()}
 _FOLDERS = ("img", "imgs", "color", "rgb")
 _LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|demo:.*|(?!(?i:file):)[a-zA-Z][\w+.-]+://.+", re.DOTALL)
 
-#: After so many errors of the container without a packet between them, a file is treated as ended.
+#: Number of errors of the container without a packet between them after which a file is treated as ended.
 _MAX_FAILURES = 3
 
 #: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
@@ -75,15 +74,15 @@ class _FileSource(Source):
 
     def __init__(self, name: str, reader: _Images | _Video, part: slice, start: int) -> None:
         self._reader, self._part = reader, part
-        wanted = range(sys.maxsize)[part]
-        self._frames = reader.frames(wanted, start)
+        numbers = range(sys.maxsize)[part]
+        self._frames = reader.frames(numbers, start)
         self._first: Frame | None = next(self._frames, None)
-        if self._first is None and wanted[start:].start == 0:
+        if self._first is None and numbers[start:].start == 0:
             raise VideoError(f"no frame of {name} can be decoded, as if it began after its only key frame: {EXPECTED}")
         if self._first is None:
             raise VideoError(
                 f"{name} has {reader.count() or 'no'} frames, numbered from 0, and none from frame "
-                f"{wanted[start:].start} on: give an earlier first frame, or another source"
+                f"{numbers[start:].start} on: choose an earlier first frame, or another source"
             )
         height, width = self._first.image.shape[:2]
         super().__init__(name, reader.rate / (part.step or 1), (width, height))
@@ -96,8 +95,8 @@ class _FileSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`damaged`: number of packets, which is that of their frames, that were left out; `scaled`: frames of another
-        size than the first one, which were scaled to it."""
+        """`damaged`: number of skipped packets, which is that of their frames; `scaled`: number of frames that were
+        scaled to the size of the first one."""
         counts = {"damaged": self._reader.damaged, "scaled": self._reader.scaled}
         return {name: count for name, count in counts.items() if count}
 
@@ -133,53 +132,53 @@ def open_source(
 ) -> Source:
     """Open the source that `text` names; the docstring of the module lists the kinds.
 
-    start     number of the first frame to return, counted within the part. The frames before it in a file are decoded
+    start     number of the first frame to return, counted within the part. In a file, the frames before it are decoded
               and dropped; a live source numbers its first frame `start`
     part      the frames of a file or folder that are read, for example `slice(100, 200, 2)` for 100, 102 ... 198
     since     zero of the time stamps of a live source, as `time.monotonic` gives it; None for its first frame
-    idle      is called ten times a second while a live source gives no frame; if it returns True, iteration ends. With
-              it, opening a live source never fails: iteration waits for the first frame for any length of time, and the
-              size is known with that frame
+    idle      is called ten times a second while a live source has no frame; if it returns True, iteration ends. With
+              it, opening a live source never fails: iteration waits for the first frame without a timeout, and the size
+              is unknown until then
     settings  the settings of a run, of which `image_rate`, `hwaccel`, `skip_damaged` and `resize` are used
-    single    single ones of them by name, in the place of those in `settings`
+    single    values by name that replace those in `settings`
 
-    VideoError if the source does not exist or cannot be read; from the iterator at what cannot be decoded, after the
-    frames before it.
+    VideoError if the source does not exist or cannot be read; from the iterator where it cannot be decoded, after the
+    frames before.
     """
     settings = replace(settings or RunSettings(), **single)
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if part.stop is not None and part.stop <= (part.start or 0):
-        raise VideoError(f"no frame is from {part.start or 0} on and before {part.stop}: give an end after the start")
+        raise VideoError(f"the end ({part.stop}) must be greater than the start ({part.start or 0})")
     if is_live(text):
         if part != ALL_FRAMES:
-            raise VideoError("a live source gives only its newest frame: leave out start, end and stride")
-        # Imported here because files do not need threads, or the rendering of the demo.
+            raise VideoError("a live source has no start, end or stride: its newest frame is tracked; omit them")
+        # Imported here because files need neither threads nor the rendering of the demo.
         from catstream.video.live import LiveSource
         from catstream.video.live_demo import PREFIX, LiveDemo
 
         if str(text).startswith(PREFIX):
             return LiveDemo(str(text), start, settings.image_rate, since=since, idle=idle)
         return LiveSource(str(text), start, settings, since=since, idle=idle)
-    shown = without_password(str(text))
+    redacted = without_password(str(text))
     if re.match(r"\w+:/[^/]", str(text)) and not Path(text).exists():
-        raise VideoError(f"the address of {shown!r} has one slash: write two of them after its protocol")
+        raise VideoError(f"the address {redacted!r} has one slash after its protocol: write two")
     if str(text) == "-":
         raise VideoError(
             "standard input is not a source, because a restarted process cannot read it again: "
             "write the video to a file, or serve it as a stream"
         )
     try:
-        name, reader = _opened(Path(source_text(text)), settings)
+        name, reader = _open_reader(Path(source_text(text)), settings)
     except OSError as error:
-        raise VideoError(f"cannot open {shown!r} ({error.strerror}): {EXPECTED}") from None
+        raise VideoError(f"cannot open {redacted!r} ({error.strerror}): {EXPECTED}") from None
     return _FileSource(name, reader, part, start)
 
 
-def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
-    """Open a file, a folder or a pattern; return its name for results, and what reads it."""
+def _open_reader(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
+    """Open a file, a folder or a pattern; return its name for results, and its reader."""
     if path.is_dir():
-        name = _named(path)
+        name = _folder_name(path)
         for folder in (*(path / inner for inner in _FOLDERS), path):
             if folder.is_dir() and visible(folder, IMAGES):
                 return name, _Images(first_pages(image_files(folder)), settings)
@@ -192,23 +191,23 @@ def _opened(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
         pages = pages_of(path)
         return path.stem, _Images(pages, settings) if pages else _Video(path, settings)
     if re.search(r"%0?\d*d|[*?\[]", path.name):
-        return _named(path.parent), _Images(first_pages(image_files(path)), settings)
+        return _folder_name(path.parent), _Images(first_pages(image_files(path)), settings)
     if path.exists():
         raise VideoError(
-            f"{str(path)!r} is a pipe or a device, and a restarted process cannot read its frames again: "
+            f"{str(path)!r} is a pipe or a device, whose frames a restarted process cannot read again: "
             "write the video to a file, or serve it as a stream"
         )
     raise VideoError(f"there is no video or folder {without_password(str(path))!r}: {EXPECTED}")
 
 
-def _named(folder: Path) -> str:
-    """The name of a folder of images for results; of the folder of images in a sequence, that of the sequence."""
+def _folder_name(folder: Path) -> str:
+    """The name of a folder of images for results; for the folder of images in a sequence, that of the sequence."""
     folder = folder.resolve()
     return (folder.name in _FOLDERS and folder.parent.name) or folder.name
 
 
 def source_text(source: object) -> str:
-    """The text of a source that a program has given; of a file:// address of this machine its path.
+    """The text of a source in a program; of a file:// address of this machine its path.
 
     >>> source_text("file:///videos/a%20walk.mp4"), source_text(Path("walk.mp4")), source_text(0)
     ('/videos/a walk.mp4', 'walk.mp4', '0')
@@ -216,19 +215,19 @@ def source_text(source: object) -> str:
     if not isinstance(source, (str, int, os.PathLike)):
         raise VideoError(
             f"a source is a path, an address or the number of a camera, got {type(source).__name__}: "
-            "for frames in memory, call catstream.Tracker.update with each of them"
+            "pass frames in memory to catstream.Tracker.update"
         )
     text = str(source)
     if not text.startswith("file://"):
         return text
     address = urlsplit(text)
     if address.netloc not in ("", "localhost"):
-        raise VideoError(f"{text!r} names a file on another machine: copy it here, or give file:///PATH")
+        raise VideoError(f"{text!r} names a file on another machine: copy it here, or pass file:///PATH")
     return unquote(address.path)
 
 
 class _Images:
-    """Images that are read as frames. `scaled` is the number of those that had another size than the first."""
+    """Images that are read as frames. `scaled` is the number of images that had another size than the first one."""
 
     damaged, pixel_aspect = 0, Fraction(1)
 
@@ -241,10 +240,11 @@ class _Images:
     def count(self) -> int:
         return len(self._read_image.pages)
 
-    def frames(self, wanted: range, start: int) -> Generator[Frame]:
-        """Yield the frames with these numbers, from the one at index `start` on."""
-        numbers, resize = range(self.count())[wanted.start : wanted.stop : wanted.step], self.settings.resize
-        # The size is that of the first image of the run, if it is resumed too.
+    def frames(self, numbers: range, start: int) -> Generator[Frame]:
+        """Yield the frames with these numbers, from index `start` on."""
+        numbers = range(self.count())[numbers.start : numbers.stop : numbers.step]
+        resize = self.settings.resize
+        # The size is that of the first image of the run, even if the run is resumed.
         shape = self._read(numbers[0]).shape if resize and start and numbers else None
         for index, number in enumerate(numbers[start:], start):
             image = self._read(number)
@@ -265,7 +265,7 @@ class _Images:
 
 
 def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: Path, number: int) -> np.ndarray:
-    """Return an image in the size of the first one. Raises VideoError if it has another, unless it is to be scaled."""
+    """Return an image in the size of the first one. Raises VideoError if it has another size, unless `resize`."""
     if image.shape == shape:
         return image
     if resize:
@@ -277,13 +277,13 @@ def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: 
 
 
 def prepare() -> None:
-    """Import what reading a video needs."""
+    """Import the modules that read a video."""
     import av.video.reformatter  # noqa: F401
 
 
 class _Video:
-    """A video file that is read once. `damaged` is the number of packets that were left out, `scaled` that of frames
-    which had another size than the first."""
+    """A video file that is read once. `damaged` is the number of skipped packets, `scaled` the number of frames that
+    had another size than the first one."""
 
     images: Sequence[Path] = ()
 

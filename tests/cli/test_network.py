@@ -51,4 +51,4 @@ def test_a_network_that_cannot_be_used_is_an_error_before_a_run(said, demo_video
     setting = f"features.network={tmp_path / 'net.onnx'}"
     code, _, errors = said("track", path, "--box", str(boxes[0]), "--set", setting, "--output", tmp_path / "out")
     assert (code, errors.count("\n")) == (1, 1)
-    assert "no network that catstream can use" in errors
+    assert f"{str(tmp_path / 'net.onnx')!r} cannot be used" in errors

@@ -195,7 +195,7 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
     assert "the results so far are kept" in errors
 
 
-REJECTED = {"omit lockstep": ["--lockstep"], "leave out start, end and stride": ["--start=9"], "connection refused": []}
+REJECTED = {"omit lockstep": ["--lockstep"], "has no start, end or stride": ["--start=9"], "connection refused": []}
 
 
 @pytest.mark.parametrize(("words", "options"), REJECTED.items(), ids=REJECTED)

@@ -46,10 +46,10 @@ def convolution(channels, stride, gain, height=None):
     ("write", "found"),
     [
         (lambda path: path.write_bytes(b"no network"), "onnxruntime cannot read it"),
-        (convolution(8, 16, 0.001, height=64), r"cannot take a float32 \(1, 3, 224, 224\)"),
+        (convolution(8, 16, 0.001, height=64), r"it rejects a float32 \(1, 3, 224, 224\)"),
         (convolution(8, 8, 0.001), r"its output is float32 \(1, 8, 28, 28\), expected float32 \(1, 1 to 32, 14, 14\)"),
         (convolution(33, 16, 0.001), r"its output is float32 \(1, 33, 14, 14\)"),
-        (convolution(8, 16, 1.0), r"the mean square length of its vectors is \S+, expected about 0.39"),
+        (convolution(8, 16, 1.0), r"the mean squared norm of its vectors is \S+, expected about 0.39"),
         (lambda _: None, "cannot read features.network=.* No such file"),
     ],
     ids=["no ONNX", "one size", "stride", "channels", "length", "none"],
