@@ -3,7 +3,7 @@
 Cold: the kernels have to be compiled first. Warm: they are in the cache, as from the second start on.
 """
 
-from __future__ import annotations
+from __future__ import csv
 
 import argparse
 import os
@@ -76,8 +76,8 @@ def wait(process: subprocess.Popen[bytes], output: Path, version: int, begin: fl
 
 def versions(tracks: Path) -> list[int]:
     """Return the model version of each complete row."""
-    lines = tracks.read_text().split("\n")[1:-1] if tracks.exists() else []
-    return [int(line.rsplit(",", 3)[1]) for line in lines]
+    complete = tracks.read_text().rpartition("\n")[0] if tracks.exists() else ""
+    return [int(row["model_version"]) for row in csv.DictReader(complete.splitlines())]
 
 
 if __name__ == "__main__":

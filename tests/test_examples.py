@@ -266,7 +266,7 @@ def test_the_zone_counter_counts_beside_a_run(demo_video):
     source, boxes = demo_video(60)
     with ExitStack() as stack:
         pipeline = stack.enter_context(Pipeline(str(source), boxes[0], {"run.unstored_frames": 1}))
-        words = [*command("zone_counter.py"), pipeline.endpoint, "all=0,0 320,0 320,240 0,240", "none=0,0 1,0 1,1"]
+        words = [*command("zone_counter.py"), pipeline.endpoint, "all=0,0 320,0 320,240 0,240", "none=0,0 3,0 3,3"]
         counter = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
         stack.callback(counter.kill)
         counts = []

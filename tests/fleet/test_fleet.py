@@ -148,7 +148,7 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
     assert fleet.drain(before.node, undo=True) == f"{before.node} takes streams again"
     until(lambda: (found := fleet.status().streams["gate"]).node == before.node and found.state == "running")
     fleet.drain(other, undo=True)
-    with pytest.raises(FleetError, match=r"no live node named 'west' \\(live nodes: north, south\\)"):
+    with pytest.raises(FleetError, match=r"no live node named 'west' \(live nodes: north, south\)"):
         fleet.drain("west")
 
 

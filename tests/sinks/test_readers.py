@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from catstream.client.control import control
+from catstream import control
 from catstream.video.source import open_source
 
 pytestmark = pytest.mark.slow
