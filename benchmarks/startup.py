@@ -3,9 +3,10 @@
 Cold: the kernels have to be compiled first. Warm: they are in the cache, as from the second start on.
 """
 
-from __future__ import csv
+from __future__ import annotations
 
 import argparse
+import csv
 import os
 import subprocess
 import sys
