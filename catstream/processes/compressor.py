@@ -17,7 +17,7 @@ from catstream.messages.kinds import End, Features, ModelFile, Position
 from catstream.processes.decisions import checkpoint_is_due, stored, with_end
 from catstream.processes.process import MESSAGE_SECONDS, Process
 from catstream.wire.acknowledged import Receiver
-from catstream.wire.channels import ACKNOWLEDGED_FEATURES, SAMPLES, SAVED_MODELS
+from catstream.wire.channels import ALL_FEATURES, SAMPLES, SAVED_MODELS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 
@@ -58,9 +58,7 @@ class CompressorLoop:
         self._position = Position(seq, seq, versions=self._forest.versions)
         self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was written, and for how long
         check, states, window = self._check, self._forest.states_at, settings.run.unstored_frames
-        self._features = stack.enter_context(
-            Receiver(ACKNOWLEDGED_FEATURES, endpoint, self._position, window, check, states)
-        )
+        self._features = stack.enter_context(Receiver(ALL_FEATURES, endpoint, self._position, window, check, states))
         self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
         for sample in self._forest.last_samples:
             self._samples.send(sample)

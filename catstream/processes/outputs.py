@@ -14,7 +14,7 @@ from catstream.processes.process import TURN_SECONDS, Process
 from catstream.video.frames import Frame, jpeg
 from catstream.video.source import is_live
 from catstream.wire.acknowledged import Sender
-from catstream.wire.channels import ACKNOWLEDGED_FEATURES, FEATURES, PREVIEWS, TRACKS
+from catstream.wire.channels import ALL_FEATURES, FEATURES, PREVIEWS, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
 from catstream.wire.results import ResultsSender
@@ -44,7 +44,7 @@ class Outputs(AbstractContextManager["Outputs"]):
         self._process, self._turn, endpoint = process, turn, process.endpoint
         with ExitStack() as stack:
             window = process.settings.run.unstored_frames
-            self.features = stack.enter_context(Sender(ACKNOWLEDGED_FEATURES, endpoint, window, replied))
+            self.features = stack.enter_context(Sender(ALL_FEATURES, endpoint, window, replied))
             self._owner = stack.enter_context(ResultsSender(endpoint)) if process.owner is not None else None
             self._tracks = stack.enter_context(Publisher(TRACKS, endpoint))
             self._copies = stack.enter_context(Publisher(FEATURES, endpoint))

@@ -1,7 +1,6 @@
 """The channels between the processes: their messages, their two ends, and their behaviour with slow readers.
 
-    acknowledged-features
-               the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
+    all-features   the training rows of each frame; every message is delivered exactly once: it is acknowledged, and
                retransmitted to a restarted receiver
     samples    only the newest of each object counts; a late joiner gets the last ones at once
     models     as samples
@@ -95,8 +94,8 @@ class Channel(Generic[Message]):
 _ALL = ("detector", "compressor", "trainer")
 _FEATURES = 512  # MiB: an object takes 4.3 MB in its first frame, there are at most 64, and their saved models
 
-ACKNOWLEDGED_FEATURES: Channel[Features | End] = Channel(
-    "acknowledged-features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
+ALL_FEATURES: Channel[Features | End] = Channel(
+    "all-features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
 )
 SAMPLES: Channel[Sample | End] = Channel(
     "samples", (Sample, End), ("compressor",), None, "newest", 1, 512, "watch", True, high_water_mark=16
@@ -124,7 +123,7 @@ SAVED_MODELS: Channel[ModelFile] = Channel(
 CHANNELS: dict[str, Channel[object]] = {
     channel.name: channel
     for channel in (
-        ACKNOWLEDGED_FEATURES,
+        ALL_FEATURES,
         SAMPLES,
         MODELS,
         TRACKS,

@@ -49,8 +49,8 @@ _OPTIONS = {
     zmq.RECONNECT_IVL_MAX: round(RECONNECT_MOST_SECONDS * 1000),
 }
 
-_FAILURES = 3  # failed handshakes in a row, after which a client asks whether its keys are those of another pipeline
-_PROBE_SECONDS = 1.0  # between two such questions
+_FAILURES = 3  # failed handshakes in a row with a listener that has keys: they are those of another pipeline
+_PROBE_SECONDS = 0.4  # from one check of the listener to the next
 
 Message = TypeVar("Message")
 Kind = TypeVar("Kind")
@@ -121,7 +121,7 @@ class ChannelSocket(Generic[Message]):
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
         self._generation = generation()
-        self._failures, self._probe_at = 0, 0.0  # failed handshakes since the last connection
+        self._failures, self._probe_at = 0, 0.0  # see `_FAILURES`
         try:
             self._socket: zmq.Socket[bytes] = context().socket(kind)
         except zmq.ZMQError as error:
@@ -281,7 +281,6 @@ class ChannelSocket(Generic[Message]):
     def _handshake_failed(self, event: Event) -> None:
         """Count a peer that failed; a key that was denied is counted by the ZAP handler already. Or raise the cause."""
         if not self._listens:
-            self._failures += 1
             if (problem := self._denial(event)) is not None:
                 raise ServiceError(problem)
         elif event is not Event.DENIED:
@@ -307,10 +306,12 @@ class ChannelSocket(Generic[Message]):
         if event is Event.OTHER_MECHANISM:
             return f"the pipeline at {endpoint} has no keys: connect without keys (omit --keys)"
         now = monotonic()
-        if self._failures < _FAILURES or now < self._probe_at or keys.server != public_key(keys.folder).encode():
+        if now < self._probe_at or keys.server != public_key(keys.folder).encode():
             return None  # a stream of a fleet has another key wherever it runs next
         self._probe_at = now + _PROBE_SECONDS
-        if not any(has_keys(endpoint.address(self.channel, sender)) for sender in self.channel.senders):
+        has_listener = any(has_keys(endpoint.address(self.channel, sender)) for sender in self.channel.senders)
+        self._failures = self._failures + 1 if has_listener else 0
+        if self._failures < _FAILURES:  # fewer may be from before the listener was there
             return None
         return (
             f"the keys in {keys.folder} belong to another pipeline or fleet (the one at {endpoint} does not have the "

@@ -123,7 +123,7 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
     [
         *((channel, "anna", "about all objects: subscribe to samples, models") for channel in ("features", "health")),
         ("tracks", "an na", "'an na' is not a name"),
-        *((channel, None, "unknown channel") for channel in ("acknowledged-features", "results", "frames")),
+        *((channel, None, "unknown channel") for channel in ("all-features", "results", "frames")),
     ],
 )
 def test_what_cannot_be_subscribed_to_is_an_error(endpoint, channel, name, words):

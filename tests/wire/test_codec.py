@@ -170,7 +170,7 @@ def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
     pyramid = Pyramid(image)
     _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
     largest = describe()["run.max_objects"].bounds["le"] * len(encode(features)) + LARGEST_GIVEN_MODELS
-    assert largest < CHANNELS["acknowledged-features"].limit == CHANNELS["features"].limit
+    assert largest < CHANNELS["all-features"].limit == CHANNELS["features"].limit
 
 
 def test_a_field_of_a_later_version_is_ignored():

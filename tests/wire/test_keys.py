@@ -12,7 +12,7 @@ import catstream
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Answer, Command, End, Features, Position
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import ACKNOWLEDGED_FEATURES, CHANNELS, CONTROL, MODELS, TRACKS
+from catstream.wire.channels import ALL_FEATURES, CHANNELS, CONTROL, MODELS, TRACKS
 from catstream.wire.codec import encode
 from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
@@ -61,8 +61,8 @@ def listener(place, message_of):
     with ExitStack() as stack:
 
         def listen(name):
-            if name == "acknowledged-features":
-                receiver = stack.enter_context(Receiver(ACKNOWLEDGED_FEATURES, place(), Position(), WINDOW))
+            if name == "all-features":
+                receiver = stack.enter_context(Receiver(ALL_FEATURES, place(), Position(), WINDOW))
                 return lambda: receiver.receive(0.02)
             if name == "results":
                 owner = stack.enter_context(ResultsReceiver(place(), WINDOW, 0))
@@ -82,7 +82,7 @@ def stranger():
     with ExitStack() as stack:
 
         def connect(name, endpoint):
-            kind = {"acknowledged-features": zmq.DEALER, "control": zmq.DEALER, "results": zmq.PUSH}.get(name, zmq.SUB)
+            kind = {"all-features": zmq.DEALER, "control": zmq.DEALER, "results": zmq.PUSH}.get(name, zmq.SUB)
             socket = stack.enter_context(zmq.Context.instance().socket(kind))
             socket.linger = 0
             if endpoint.keys is not None:
@@ -186,8 +186,8 @@ def test_a_client_that_may_send_commands_receives_answers(place, until):
 def test_an_acknowledged_channel_works_with_the_keys_of_the_pipeline(place, until):
     taken = []
     with (
-        Receiver(ACKNOWLEDGED_FEATURES, place(), Position(), WINDOW) as receiver,
-        Sender(ACKNOWLEDGED_FEATURES, place(), WINDOW) as sender,
+        Receiver(ALL_FEATURES, place(), Position(), WINDOW) as receiver,
+        Sender(ALL_FEATURES, place(), WINDOW) as sender,
     ):
 
         def turn():
@@ -222,11 +222,11 @@ def test_a_client_without_permission_receives_nothing_and_is_counted_and_logged_
         assert who in told[0] if reason == "role" else Keys.load(keys.parent / who).public.decode() in told[0]
 
 
-@pytest.mark.parametrize("name", ["acknowledged-features", "results", "control"])
+@pytest.mark.parametrize("name", ["all-features", "results", "control"])
 def test_a_client_that_may_only_watch_gets_an_error_if_it_sends(name, place, listener, until):
     turn, watcher = listener(name), place("watcher")
     clients = {
-        "acknowledged-features": lambda: Sender(ACKNOWLEDGED_FEATURES, watcher, WINDOW),
+        "all-features": lambda: Sender(ALL_FEATURES, watcher, WINDOW),
         "results": lambda: ResultsSender(watcher),
         "control": lambda: Requester(CONTROL, watcher),
     }

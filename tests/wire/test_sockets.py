@@ -19,7 +19,7 @@ import catstream
 from catstream.errors import ServiceError
 from catstream.messages.kinds import End, Position, Sample, Summary, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import ACKNOWLEDGED_FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
+from catstream.wire.channels import ALL_FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
@@ -183,11 +183,11 @@ import sys
 import numpy as np
 from catstream.messages.kinds import Features, ObjectFeatures, Position, TrainingRows
 from catstream.wire.acknowledged import Sender
-from catstream.wire.channels import ACKNOWLEDGED_FEATURES
+from catstream.wire.channels import ALL_FEATURES
 from catstream.wire.endpoint import Endpoint
 
 rows = TrainingRows.labelled(np.ones((10, 100_000), np.float32), 1)
-with Sender(ACKNOWLEDGED_FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
+with Sender(ALL_FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
     features.ask_position(0)
     features.window.resume(0, Position())
     for seq in range(1, 33):
@@ -200,7 +200,7 @@ def test_a_process_that_ends_with_queued_messages_ends_normally(folder):
     with zmq.Context.instance().socket(zmq.ROUTER) as receiver:
         receiver.set(zmq.LINGER, 0)
         receiver.set(zmq.RCVHWM, 1)
-        receiver.bind(place.listening(ACKNOWLEDGED_FEATURES))
+        receiver.bind(place.listening(ALL_FEATURES))
         with subprocess.Popen([sys.executable, "-c", SENDER, str(folder)], stderr=subprocess.PIPE) as sender:
             while sender.poll() is None:
                 time.sleep(0.02)

@@ -9,7 +9,7 @@ from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, Position, TrainingRows
 from catstream.wire.acknowledged import Receiver, Sender
-from catstream.wire.channels import ACKNOWLEDGED_FEATURES, CHANNELS, RESULTS
+from catstream.wire.channels import ALL_FEATURES, CHANNELS, RESULTS
 from catstream.wire.codec import VERSION, encode
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejects
@@ -40,8 +40,8 @@ WRONG = {
 def test_an_invalid_message_is_counted_and_does_not_affect_the_legitimate_sender(what, endpoint, stranger, until):
     forest, before, taken = Forest(Settings(coreset={"size": 2})), rejected(), []
     with (
-        Receiver(ACKNOWLEDGED_FEATURES, endpoint, Position(), WINDOW, check=forest.check_features) as receiver,
-        Sender(ACKNOWLEDGED_FEATURES, endpoint, WINDOW) as sender,
+        Receiver(ALL_FEATURES, endpoint, Position(), WINDOW, check=forest.check_features) as receiver,
+        Sender(ALL_FEATURES, endpoint, WINDOW) as sender,
     ):
 
         def turn():
@@ -52,7 +52,7 @@ def test_an_invalid_message_is_counted_and_does_not_affect_the_legitimate_sender
                 receiver.acknowledge(Position(message.seq))
 
         until(lambda: sender.window.stored >= 1, turn)
-        stranger(zmq.DEALER, "acknowledged-features").send_multipart(WRONG[what])
+        stranger(zmq.DEALER, "all-features").send_multipart(WRONG[what])
         until(lambda: rejected() == before + 1, turn)
         until(lambda: sender.window.stored > 5, turn)
     assert taken == list(range(1, len(taken) + 1)), "each once, in order"
