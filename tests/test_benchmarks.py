@@ -28,6 +28,7 @@ def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(script), "--quick", "--json", str(figures)])
     monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])  # as Python has it for a script
+    monkeypatch.delitem(sys.modules, "shared", raising=False)  # it adds the folder of the benchmarks to the path
     runpy.run_path(str(script), run_name="__main__")
     assert_finite(figures)
 
