@@ -416,8 +416,8 @@ class Camera:
             if self.sends.wait(0.02):
                 jpeg = cv2.imencode(".jpg", self._image(self.sent))[1].tobytes()
                 head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                self.sent += 1  # before a reader can have it
                 file.write(head.encode() + jpeg + b"\r\n")
-                self.sent += 1
                 time.sleep(0.025)
 
     def leave(self) -> None:

@@ -194,7 +194,7 @@ def test_a_box_outside_the_first_frame_or_a_missing_source_is_rejected_before_an
 
 @pytest.mark.parametrize("frames", [[np.zeros((9, 9, 3), np.uint8)], iter(()), np.zeros((9, 9, 3), np.uint8)])
 def test_frames_in_memory_are_rejected_with_the_way_to_go(frames):
-    said = r"the number of a camera, got \w+: for frames in memory, call catstream.Tracker"
+    said = r"the number of a camera, got \w+: pass frames in memory to catstream.Tracker"
     with pytest.raises(VideoError, match=said):
         Pipeline(frames, (0, 0, 10, 10))
 
