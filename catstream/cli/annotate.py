@@ -142,8 +142,8 @@ def _write(annotation: Annotation, files: RunFiles, checked: Path, following: Pa
         (track.frame, track.object, track.checked, f"{track.probability:.4f}") for each in frames for track in each
     ]
     _write_table(checked, ("frame", "object", "checked", "probability"), checks)
-    found = [(frame, name, f"{errors:.1f}") for frame, name, errors in annotation.next_frames()]
-    _write_table(following, ("frame", "object", "errors"), found)
+    rows = [(frame, name, f"{errors:.1f}") for frame, name, errors in annotation.next_frames()]
+    _write_table(following, ("frame", "object", "errors"), rows)
 
 
 def _write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
