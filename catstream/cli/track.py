@@ -308,13 +308,14 @@ class _Run:
     def _run(self, pipeline: Pipeline, files: RunFiles, progress: RunProgress, console: Console) -> bool:
         """Run the pipeline, with the web page if there is one; return whether Ctrl-C or a signal ended it."""
         try:
-            # The files are closed after the processes, which would track on meanwhile, for none of them.
-            with ExitStack() as closed_last, pipeline, ExitStack() as stack:
+            # The files are closed after the processes, which would track on meanwhile, for none of them; the page is
+            # served until it shows the end.
+            with ExitStack() as closed_last, pipeline:
                 files.make_folder()
                 if self.continues and self.resume is not None:
                     console.print(f"the run in {self.resume} continues with the objects that it had")
                 if self.view is not None:
-                    self._serve(pipeline, self.view, stack, console)
+                    self._serve(pipeline, self.view, closed_last, console)
                 with progress.line(console) as line:
                     self._write_tracks(pipeline, files, progress, line, closed_last)
         except KeyboardInterrupt:
@@ -323,12 +324,14 @@ class _Run:
 
     def _serve(self, pipeline: Pipeline, view: HostPort, stack: ExitStack, console: Console) -> None:
         """Serve the web page of the pipeline until the stack is left."""
-        from catstream.web.app import pipeline_site
+        from catstream.web.app import Site
+        from catstream.web.feed import PipelineFeed
         from catstream.web.server import Server
 
-        site = pipeline_site(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
-        server = Server(site, host=view.host, port=view.port, token=self.token)
+        feed = PipelineFeed(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
+        server = Server(Site(feed), host=view.host, port=view.port, token=self.token)
         stack.enter_context(server.in_background())
+        stack.callback(feed.wait_for_end)
         for url in server.urls:
             console.print(f"page: {url}")
 

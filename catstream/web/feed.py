@@ -124,6 +124,7 @@ class PipelineFeed(Feed):
         super().__init__()
         self._address = address
         self._endpoint: Endpoint | None = None  # of the current connection, with its keys
+        self._has_end = threading.Event()
         self.dashboard = Dashboard()
 
     def problem_of(self, stream: str = "") -> str:  # noqa: ARG002  # there is one
@@ -136,6 +137,10 @@ class PipelineFeed(Feed):
 
     def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
         return self
+
+    def wait_for_end(self) -> None:
+        """Wait until the end of the pipeline has arrived, but not for long; called before the server is stopped."""
+        self._has_end.wait(DRAIN_SECONDS)
 
     def execute(self, **command: Any) -> Answer:
         """Send a command, by its fields, to the pipeline, and wait for its answer."""
@@ -177,6 +182,7 @@ class PipelineFeed(Feed):
                 if isinstance(message, End):
                     # The last health report, with the final size of the trees, and the last picture may follow.
                     deadline = min(deadline, now + DRAIN_SECONDS)
+                    self._has_end.set()
                     subscriptions.pop(channel).close()
             if deadline == inf and monotonic() - last_report > SILENCE_SECONDS:
                 if has_reported:
