@@ -70,7 +70,7 @@ def published(service):
         yield from ((address, port) for port in range(int(first), int(last or first) + 1))
 
 
-def test_there_is_a_service_for_each_process_one_for_the_page_and_one_for_the_network():
+def test_there_is_a_service_for_each_process_for_the_page_and_for_the_network():
     assert set(SERVICES) == {*NAMES, "view", "network"}
     assert {service["image"] for service in SERVICES.values()} == {"catstream"}
     assert all("build" in service for service in SERVICES.values()), "each of them may be the first that is run"
@@ -83,7 +83,7 @@ def test_each_process_accepts_its_command_line(name):
     assert f"COPY services {PLACE}" in IMAGE
 
 
-def test_all_meet_on_the_loopback_of_their_own_network_and_the_page_alone_is_published_on_this_host_alone():
+def test_services_share_a_network_of_their_own_and_only_the_page_is_published():
     (endpoint,) = {settings(name).run.endpoint for name in NAMES}
     assert Endpoint.parse(endpoint).host == "127.0.0.1"
     assert {SERVICES[name]["network_mode"] for name in (*NAMES, "view")} == {"service:network"}

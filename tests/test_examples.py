@@ -160,7 +160,7 @@ def test_the_example_of_several_objects_prints_when_two_meet_and_part(demo_video
     assert re.fullmatch(r"sky: present in \d+ of 60 frames", sky)
 
 
-def test_the_images_that_represent_a_folder_keep_a_share_of_the_energy_within_the_bounds(demo_video, tmp_path):
+def test_the_images_that_represent_a_folder_keep_the_energy_within_the_bounds(demo_video, tmp_path):
     example = runpy.run_path(str(EXAMPLES / "summarise_images.py"))
     summary, rows = example["Summary"](size=8), {}
     with open_source(demo_video(60)[0]) as frames:
@@ -281,7 +281,7 @@ def test_the_zone_counter_counts_beside_a_run(demo_video):
     assert nowhere == "none: 0 visits, 0.0 s in all"
 
 
-def test_the_collector_stores_the_tracks_of_two_pipelines_and_survives_one_that_does_not_run(demo_video, tmp_path):
+def test_the_collector_stores_the_tracks_of_two_pipelines_although_one_is_missing(demo_video, tmp_path):
     source, boxes = demo_video(60)
     with ExitStack() as stack:
         settings = {"run.unstored_frames": 1}
@@ -305,7 +305,7 @@ def test_the_collector_stores_the_tracks_of_two_pipelines_and_survives_one_that_
             assert max(stored) == 59
 
 
-def test_the_function_for_cvat_follows_shapes_by_their_states_and_begins_again_if_a_tracker_is_gone(demo_video):
+def test_the_cvat_function_tracks_shapes_by_their_states_and_restarts_lost_trackers(demo_video):
     function = runpy.run_path(str(EXAMPLES / "cvat_function" / "main.py"))
     context = SimpleNamespace(user_data=SimpleNamespace(), Response=lambda **fields: SimpleNamespace(**fields))
     function["init_context"](context)

@@ -167,7 +167,7 @@ def cleo(frames):
     return tracker.saved_model("cleo")
 
 
-def test_an_object_of_a_saved_model_is_found_beside_the_others_which_it_does_not_affect(frames, cleo, tmp_path):
+def test_an_object_of_a_saved_model_is_detected_and_does_not_affect_the_others(frames, cleo, tmp_path):
     cleo.save(tmp_path / "cleo")
     tracker, other = (started(frames, settings={"coreset.size": 8}) for _ in range(2))
     for number, frame in enumerate(frames[1:], start=1):

@@ -11,7 +11,7 @@ from catstream.wire.commands import Requester
 from catstream.wire.endpoint import Endpoint
 
 
-def test_a_clock_counts_the_time_between_calls_but_not_that_in_which_the_process_was_stopped(monkeypatch):
+def test_a_clock_does_not_count_the_time_in_which_the_process_was_stopped(monkeypatch):
     moments = iter([1000.0, 1000.2, 1000.4, 4000.0, 4000.1])
     monkeypatch.setattr(clock, "monotonic", lambda: next(moments))
     running = clock.RunningClock()

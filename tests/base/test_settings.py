@@ -103,7 +103,7 @@ def test_an_empty_variable_of_a_setting_is_an_error(variable):
         ("coreset", "the group of settings coreset cannot be 1: pass a CoresetSettings"),
     ],
 )
-def test_a_name_without_its_group_one_like_no_other_and_an_invalid_group_are_rejected(name, why):
+def test_a_setting_without_its_group_or_with_an_unknown_group_or_name_is_rejected(name, why):
     with pytest.raises(SettingsError, match=why):
         Settings(**{name: 1})
 

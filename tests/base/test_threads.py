@@ -47,7 +47,7 @@ def test_a_library_that_is_imported_inside_is_on_one_thread_too():
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_all_libraries_are_on_one_thread_inside_and_as_before_outside_also_after_an_exception():
+def test_all_libraries_use_one_thread_inside_and_as_many_as_before_after_it():
     before = counts()
     with one_thread(), one_thread():
         assert set(counts().values()) == {1}
@@ -147,7 +147,7 @@ print(blake2b(catstream.merge(models).to_bytes()).hexdigest())
 FIRST, LAST = "", "import numpy, scipy.linalg, cv2, sklearn.linear_model\n"  # catstream is imported first, or last
 
 
-def test_what_is_learned_has_the_same_bits_in_any_order_of_imports_and_on_any_number_of_cores(demo_video):
+def test_a_model_has_the_same_bits_in_any_order_of_imports_and_on_any_number_of_cpus(demo_video):
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         pytest.skip("this machine has one core")

@@ -53,7 +53,7 @@ def kept(run, frames):
     assert run.totals["sent"] == run.totals["stored"] == run.learned.seq == frames
 
 
-def test_three_objects_that_begin_and_are_forgotten_between_faults_lose_no_frame_and_no_row(video):
+def test_three_objects_that_begin_and_end_between_faults_lose_no_frame_and_no_row(video):
     path, truth = video
     boxes = sequences.objects(path, truth[0], 3)
     faults = ["kill -9 all three", "kill -9 compressor", "kill -9 detector", "kill -9 trainer"]

@@ -61,7 +61,7 @@ def written(folder, errors):
     return frames
 
 
-def test_repeated_frames_of_a_restarted_detector_are_skipped_and_another_run_ends_the_sink(
+def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_sink(
     catstream, endpoint, tmp_path, until
 ):
     file = tmp_path / "tracks.ndjson"

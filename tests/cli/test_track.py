@@ -279,9 +279,7 @@ def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, s
     assert (code, tracking) == (130, []), errors
 
 
-def test_what_is_hardly_meant_is_said_before_the_run_and_models_that_were_saved_after_it(
-    video, said, succeed, tmp_path
-):
+def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(video, said, succeed, tmp_path):
     source, box = video
     words = ["--box", f"a={box}", "--box", f"b={box}", "--save-model", f"a={tmp_path / 'a'}"]
     _, errors = succeed("track", source, *words, "--end", 24)

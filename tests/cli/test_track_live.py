@@ -160,7 +160,7 @@ def test_a_run_goes_on_while_the_server_for_its_pictures_is_away_slow_and_back(
     assert [int(row["frame"]) for row in rows] == list(range(len(rows)))
 
 
-def test_a_restarted_detector_follows_a_stream_over_http_also_if_its_frames_have_another_size(camera, following, story):
+def test_a_restarted_detector_tracks_an_http_stream_whose_frames_changed_their_size(camera, following, story):
     scale = [1]
     cam = camera(lambda number: cv2.resize(story[number % len(story)][0], None, fx=scale[0], fy=1))
     with following(cam.url) as run:

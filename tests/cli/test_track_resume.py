@@ -175,7 +175,7 @@ def test_settings_that_are_given_again_change_and_all_others_stay(video, said, s
         assert Job.load(kept).settings.changed() == [*changed, "run.checkpoint_seconds=0.05"]
 
 
-def test_a_complete_run_gets_no_further_rows_but_files_that_it_lacks_and_that_is_reported(video, succeed, tmp_path):
+def test_a_complete_run_gets_no_further_rows_but_the_files_that_it_lacks(video, succeed, tmp_path):
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
     succeed("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
     before = (out / "demo.ndjson").read_bytes()

@@ -62,7 +62,7 @@ def stream(until):
         yield Stream(until, pool, stack)
 
 
-def test_a_subscription_goes_on_where_its_stream_moved_and_returns_repeated_frames_once(stream, managing):
+def test_a_subscription_follows_its_stream_and_returns_repeated_frames_once(stream, managing):
     with managing(stream.status):
         first = stream.runs()
         with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
@@ -89,9 +89,7 @@ def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, m
             assert tracks.missed == 6
 
 
-def test_a_subscription_goes_on_without_the_controller_and_follows_the_stream_once_there_is_one_again(
-    stream, managing, folder
-):
+def test_a_subscription_continues_without_the_controller_and_uses_it_once_it_is_back(stream, managing, folder):
     place = str(folder / "registry")  # the same for each controller of a fleet
     with ExitStack() as controller:
         controller.enter_context(managing(stream.status, place))
@@ -180,9 +178,7 @@ def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
         assert (first, second, control.source) == (["pause"], ["resume"], "walk.mp4")
 
 
-def test_a_client_of_the_fleet_may_do_at_each_stream_what_its_role_says_until_it_is_revoked(
-    stream, managing, keys, folder, tcp
-):
+def test_a_client_of_the_fleet_has_its_role_at_each_stream_until_it_is_revoked(stream, managing, keys, folder, tcp):
     create(folder / "stream")
     synchronise(folder / "stream", allowed(keys))
     allow(keys, "carl", "watch", output=folder / "carl")  # the stream does not know him yet
@@ -237,7 +233,7 @@ STEPS = st.lists(st.sampled_from(["move", "stop", "down", "end of the pipeline"]
 
 
 @given(STEPS, st.sampled_from(["ended", "removed"]))
-def test_only_the_registry_ends_a_stream_whatever_its_pipelines_and_its_controller_do(steps, last):
+def test_only_the_registry_ends_a_stream_not_its_pipelines_or_its_controller(steps, last):
     registry, token = _Script(), 0
     followed = FollowedStream(registry, "cam-7")
     for step in steps:

@@ -94,9 +94,7 @@ def assert_gives_the_loss(tree: CoresetTree, model: np.ndarray, parts: list[Trai
 
 
 @pytest.mark.parametrize("count", [1, 60], ids=["exact", "reduced"])
-def test_rows_of_the_loss_tree_give_the_loss_of_any_model_and_those_of_the_extent_tree_of_each_head(
-    settings, messages, rng, count
-):
+def test_the_loss_tree_gives_the_loss_of_any_model_and_the_extent_tree_of_each_head(settings, messages, rng, count):
     forest, seen = Forest(settings), [next(messages) for _ in range(count)]
     for message in seen:
         forest.take(message)
@@ -123,7 +121,7 @@ def test_an_object_that_begins_again_has_new_trees(settings, messages):
     assert all(sample.version > before for sample in take(forest, messages, 40)), "no version is used twice"
 
 
-def test_a_missing_message_is_an_error_and_is_still_accepted_later_and_a_stored_one_is_ignored(settings, messages):
+def test_a_missing_message_is_an_error_but_accepted_later_a_stored_one_is_ignored(settings, messages):
     forest, (first, second) = Forest(settings), (next(messages), next(messages))
     with pytest.raises(ProtocolError, match="features 2 came after 0: 1 are missing"):
         forest.take(second)
@@ -200,7 +198,7 @@ def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, 
         assert_equal(dataclasses.asdict(state), dataclasses.asdict(detector))
 
 
-def test_the_detector_states_after_the_last_256_messages_are_known_across_a_checkpoint(settings, tmp_path):
+def test_a_checkpoint_has_the_detector_states_after_the_last_256_messages(settings, tmp_path):
     states = {seq: DetectorState(seq, "lost", *[Window(1.0, 2.0, 3.0, 4.0)] * 3) for seq in range(1, 301)}
     forest = Forest(settings)
     assert forest.states_at(5) == {}

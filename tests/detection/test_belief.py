@@ -53,7 +53,7 @@ def test_trust_allows_to_train_and_searches_no_more_often(score):
     assert searches(doubted) >= searches(trusted)
 
 
-def test_a_redetected_object_trains_nothing_and_a_lost_one_changes_nothing_and_is_searched_for_in_each_frame():
+def test_a_redetected_object_trains_nothing_and_a_lost_one_is_searched_in_each_frame():
     assert done("redetected") == {"report", "resize"}
     assert not done("lost")
     assert TABLE["lost"].search_interval == 1

@@ -78,7 +78,7 @@ def test_a_moving_object_is_followed(scene, detection):
 
 
 @pytest.mark.parametrize("noise", [0, 1, 2])
-def test_of_a_still_scene_every_seventh_frame_teaches_and_of_a_moving_one_every_frame(scene, noise):
+def test_every_seventh_frame_of_a_still_scene_and_each_frame_of_a_moving_one_teaches(scene, noise):
     """Noise is the standard deviation of each pixel's level."""
     detector, rng = started(scene), np.random.default_rng(0)
     detector.adopt(dataclasses.replace(detector.model, version=1))
@@ -94,7 +94,7 @@ def test_of_a_still_scene_every_seventh_frame_teaches_and_of_a_moving_one_every_
 
 
 @pytest.mark.parametrize("interval", [1, 2, 3])
-def test_of_the_frames_that_the_model_explains_a_part_teaches_once_the_object_is_known(scene, interval):
+def test_only_a_part_of_the_explained_frames_teaches_once_there_is_a_model(scene, interval):
     detector = started(scene, {"training.interval": interval})
     detector.adopt(dataclasses.replace(detector.model, version=1))
     steps = [detector.step(scene((60 + 2 * (number % 2) + number // 2, 50))) for number in range(80)]
@@ -123,9 +123,7 @@ def test_each_frame_that_scm_follows_is_learned_from_whatever_its_score(scene):
 
 @pytest.mark.parametrize("detection", ["local", "full"])
 @pytest.mark.parametrize(("trust", "teaches"), [(0.0, True), (10.0, False)])
-def test_a_redetected_object_is_learned_from_only_if_it_is_trusted_and_is_doubtful_otherwise(
-    scene, trust, teaches, detection
-):
+def test_a_redetected_object_trains_only_if_it_is_trusted_and_is_doubtful_otherwise(scene, trust, teaches, detection):
     detector = started(scene, {"belief.trusted_score": trust, "search.mode": detection})
     detector.step(scene())
     track, features = detector.step(scene((250, 180)))
@@ -192,7 +190,7 @@ def test_an_object_at_the_edge_stays_a_box_in_the_frame(scene):
         assert track.box is None or 0 <= track.box.centre[0] < 320
 
 
-def test_another_object_begins_with_a_model_of_its_own_and_older_ones_are_not_adopted(scene):
+def test_another_object_begins_with_its_own_model_and_adopts_no_older_one(scene):
     detector = started(scene)
     detector.adopt(dataclasses.replace(detector.model, version=1))
     for left in (60, 62):
@@ -315,7 +313,7 @@ def test_a_model_of_other_features_is_rejected(similarity):
         Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, similarity)
 
 
-def test_a_box_of_a_past_frame_is_searched_for_in_those_since_and_only_its_own_rows_are_learned(scene):
+def test_a_box_of_a_past_frame_is_tracked_up_to_now_and_only_its_rows_are_learned(scene):
     places = [(60 + 6 * i, 50 + 4 * i) for i in range(10)]
     now = Box(*places[-1], 48, 40)
     detectors = Detectors(Settings())

@@ -32,7 +32,7 @@ def test_windows_of_a_region_lie_in_it(image, rng):
 
 
 @given(st.integers(0, 10**6), st.integers(1, 30), st.integers(1, 60))
-def test_each_part_is_due_once_in_an_interval_or_in_as_many_frames_as_there_are_parts(seq, interval, count):
+def test_each_part_is_due_once_in_an_interval_or_in_as_many_frames_as_parts(seq, interval, count):
     frames = max(interval, count)
     parts = [part for number in range(seq, seq + frames) if (part := due_part(number, interval, count)) is not None]
     assert sorted(parts) == list(range(count))
@@ -53,9 +53,7 @@ def visited(monkeypatch):
 
 @pytest.mark.parametrize("side", [6, 20, 60])
 @pytest.mark.parametrize("interval", [1, 10])
-def test_in_a_round_each_window_of_each_size_is_searched_for_and_a_frame_costs_no_more_than_is_allowed(
-    visited, side, interval
-):
+def test_a_round_searches_each_window_of_each_size_within_the_budget_of_a_frame(visited, side, interval):
     frame, window, model = Pyramid(np.zeros((240, 320, 3), np.uint8)), Window(100, 90, side, side), Model(0, 0, None, 0)
     for seq in range(200):
         before = len(visited)

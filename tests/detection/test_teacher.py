@@ -84,7 +84,7 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
     assert np.isfinite(rows.rows).all()
 
 
-def test_a_wrong_size_or_aspect_ratio_is_labelled_with_a_gaussian_of_its_steps_and_with_the_steps(frame, model):
+def test_a_wrong_size_or_aspect_ratio_is_labelled_with_its_steps_and_their_gaussian(frame, model):
     settings = SETTINGS.replace({"extent.size_count": 5, "extent.aspect_count": 3})
     training = teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)

@@ -263,7 +263,7 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     assert not psutil.wait_procs(children, timeout=10)[1]
 
 
-def test_ctrl_c_that_another_thread_receives_interrupts_only_after_all_workers_were_started():
+def test_ctrl_c_in_another_thread_interrupts_only_after_all_workers_were_started():
     started = []
 
     def start_all(other):

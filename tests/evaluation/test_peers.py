@@ -29,7 +29,7 @@ def test_a_tracker_gets_its_model_files_and_its_confidence_is_reported(tracker, 
     assert run.confidence.tolist() == [1] + [0.625] * (len(sequence) - 1)
 
 
-def test_a_tracker_without_its_model_files_is_an_error_that_names_them_before_the_first_run(tmp_path, sequence):
+def test_the_model_files_that_a_tracker_lacks_are_named_before_the_first_run(tmp_path, sequence):
     with pytest.raises(SettingsError, match=r"needs object_tracking_vittrack_2023sep.onnx: .* --peer-models"):
         evaluate([sequence], ["mil", "vit"], Settings())
     (tmp_path / "nanotrack_backbone_sim.onnx").touch()
@@ -48,7 +48,7 @@ def test_a_model_file_that_opencv_cannot_read_is_one_line_of_error(tracker, tmp_
     assert capfd.readouterr().err == ""
 
 
-def test_a_box_across_the_edge_of_the_frame_is_clipped_and_one_outside_it_is_an_error(sequence, monkeypatch):
+def test_a_box_across_the_edge_of_the_frame_is_clipped_and_one_outside_is_an_error(sequence, monkeypatch):
     frame, peer = next(iter(sequence.frames())), Peer("mil")
     peer.init(frame, (-8.0, 90.0, 40.0, 40.0))
     assert peer.update(frame)[0]

@@ -61,7 +61,7 @@ def test_the_command_prints_a_table_and_writes_all(tmp_path, walk, succeed):
     assert (out / "catstream" / "walk.txt").exists()
 
 
-def test_the_command_shows_the_spread_over_several_runs_and_counts_the_sequences_that_flip(tmp_path, walk, succeed):
+def test_the_command_shows_the_spread_over_runs_and_counts_sequences_that_flip(tmp_path, walk, succeed):
     output, errors = succeed("evaluate", walk, "--jitter", 2, "--tracker", "mil", "--output", tmp_path)
     assert re.search(r"walk +mil +12 +0\.\d{3} ±0\.\d{3}", output)
     (sentence,) = re.findall(r"mil: [01] of 1 sequences flip with the initial box", output + errors)  # MIL is random

@@ -113,7 +113,7 @@ def test_frames_without_a_reported_box_are_noticed_or_false_absence():
     assert score(found, truth).absence == Absence(absent=8, noticed=3, present=32, false=7)
 
 
-def test_boxes_in_frames_without_the_object_reduce_precision_unless_their_confidence_is_low():
+def test_boxes_in_frames_without_the_object_reduce_precision_by_their_confidence():
     truth = boxes()[1]
     found = truth.copy()
     truth[10:20] = np.nan

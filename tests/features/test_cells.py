@@ -138,7 +138,7 @@ def test_a_histogram_is_the_root_of_shares_in_the_middle_6_by_6_cells():
     assert sorted(found[found > 0]) == pytest.approx([3 * np.sqrt(0.25), 3 * np.sqrt(0.75)])
 
 
-def test_neither_the_place_of_a_colour_nor_the_edge_of_the_image_changes_the_features(rng):
+def test_neither_the_place_of_a_colour_nor_the_edge_of_an_image_changes_features(rng):
     image = np.repeat(np.repeat(rng.integers(0, 256, (32, 32, 3), np.uint8), 2, axis=0), 2, axis=1)
     turned = image.copy()
     turned[8:56, 8:56] = np.rot90(image[8:56, 8:56])
@@ -165,7 +165,7 @@ def test_no_histogram_scores_higher_than_the_highest_score(rng):
     assert own @ own == pytest.approx(features.highest_colour_score(own), rel=1e-5)
 
 
-def test_every_third_level_of_each_channel_is_converted_as_opencv_does_but_for_one_level_in_few_colours():
+def test_colours_are_converted_as_by_opencv_but_for_one_level_in_few_colours():
     levels = np.arange(0, 256, 3, np.uint8)
     colours = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
     ours = features.lab(colours).astype(int)

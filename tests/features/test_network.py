@@ -123,7 +123,7 @@ def test_a_window_sampled_from_the_region_is_nearly_as_if_it_was_described_by_it
         assert np.linalg.norm(own - sampled) < 0.2 * np.linalg.norm(own)
 
 
-def test_all_windows_of_a_frame_that_is_described_at_once_are_nearly_as_if_each_was_by_itself(frame, rng):
+def test_windows_of_a_frame_described_at_once_are_nearly_those_described_alone(frame, rng):
     model = Model(1, 0, rng.normal(size=row_length(frame.descriptor.channels)).astype(np.float32), 0.5)
     scores = ScoreMap.within(frame, frame.region, OBJECT, model, described=True)
     for place in ((0, 0), (7, 11), *np.argwhere(scores.scores == scores.scores.min()).tolist()):

@@ -109,9 +109,7 @@ def test_a_store_that_the_node_cannot_use_is_named(spec, until):
         assert "the URL of the store is not valid" in stream.report()[0].trouble
 
 
-def test_followed_objects_are_searched_for_by_the_newest_merged_model_once_they_are_absent(
-    long_spec, store, until, monkeypatch
-):
+def test_absent_objects_are_searched_for_by_the_newest_merged_model(long_spec, store, until, monkeypatch):
     """However many models are merged meanwhile, each is searched for once, and without a thread of its own."""
     searched = []
     monkeypatch.setattr(Stream, "_search", lambda _, __, model, name: searched.append((name, model.files["model"])))

@@ -189,7 +189,7 @@ def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec,
             site.end()
 
 
-def test_a_drained_node_loses_its_streams_and_gets_them_back_only_if_it_takes_streams_again(site, ray):
+def test_a_drained_node_loses_its_streams_until_it_is_uncordoned(site, ray):
     running(site, ray, "gate")
     site.drain("n1", undo=False)
     assert states(site)["gate"] == "moving", "from the answer on, so that `up` waits for it"
@@ -309,7 +309,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
     assert site.status().nodes["n1"].state == "draining"
 
 
-def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_is_back(made, ray, spec, monkeypatch):
+def test_a_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch):
     before = made()
     before.apply(spec, {})
     before.end()
@@ -327,7 +327,7 @@ def test_a_controller_that_is_restarted_while_the_store_is_away_begins_once_it_i
     assert sorted(again.status().streams) == ["gate", "roof"]
 
 
-def test_a_stream_that_is_not_placed_or_does_not_answer_is_said_long_before_it_is_started_again(site, ray, monkeypatch):
+def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_restart(site, ray, monkeypatch):
     running(site, ray, "gate")
     assert [each.trouble for each in site.status().streams.values()] == ["", ""]
     ray.of("gate").status = None  # its machine is cut off
@@ -363,7 +363,7 @@ def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
     assert site.end() == ["gate: the store is full"]
 
 
-def test_a_controller_that_is_started_after_the_end_of_a_fleet_runs_nothing_before_the_first_up(site, ray, made, spec):
+def test_a_controller_after_the_end_of_a_fleet_runs_nothing_before_the_first_up(site, ray, made, spec):
     for _ in range(4):
         site.close()
         site._turn()

@@ -69,7 +69,7 @@ def local(file, until, *options):
 
 
 @pytest.mark.usefixtures("home")
-def test_a_fleet_on_this_machine_is_closed_to_other_machines_and_users_until_ctrl_c_ends_it(file, home, until):
+def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, home, until):
     with local(file, until) as up:
         found = set().union(*map(listening, psutil.Process(up.pid).children(recursive=True)))
         assert found
@@ -152,9 +152,7 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
         fleet.drain("west")
 
 
-def test_a_stream_runs_on_a_node_with_its_labels_and_continues_elsewhere_after_the_death_of_the_node(
-    site, cluster, streams, until
-):
+def test_a_stream_runs_on_a_node_with_its_labels_and_moves_when_the_node_dies(site, cluster, streams, until):
     fleet, spec = site
     fleet.add(module.replace(streams["gate"], labels={"site": "south"}))
     until(lambda: (found := fleet.status().streams["gate"]).node == "south" and found.state == "running")

@@ -60,7 +60,7 @@ def test_a_stream_of_another_digest_cores_drained_node_or_missing_label_is_stopp
     assert event(NORTH, actor, [replace(nodes[0], draining=True), nodes[1]], 0.0) == "unwanted"
 
 
-def test_a_stream_whose_node_died_is_not_asked_to_stop_if_it_may_run_again_on_a_node_that_was_drained():
+def test_a_stream_of_a_dead_node_is_not_stopped_if_an_uncordoned_node_can_run_it():
     """Its order still excludes that node. Nobody would answer, and it would be killed only later."""
     nodes = [Node("n1", "1", alive=False), Node("n2", "2")]
     before = order(GATE, [Node("n1", "1"), Node("n2", "2", draining=True)])

@@ -41,7 +41,7 @@ def learned(seed):
 
 
 @given(PARTS, st.randoms())
-def test_the_models_that_are_merged_share_no_frames_none_could_be_added_and_their_order_does_not_matter(parts, random):
+def test_merged_models_share_no_frames_are_maximal_and_do_not_depend_on_the_order(parts, random):
     chosen = disjoint(parts)
     together = set().union(*(parts[name][0] for name in chosen))
     assert len(together) == sum(len(parts[name][0]) for name in chosen)
@@ -73,7 +73,7 @@ def put_state(tmp_path, name, seed, frames=12):
     Store(str(tmp_path / "store")).stream(name).claim("here").write(files(folder), {})
 
 
-def test_the_newest_states_of_all_streams_are_merged_within_the_bound_and_only_a_new_model_is_stored(store, tmp_path):
+def test_the_newest_states_are_merged_within_the_bound_and_new_models_are_stored(store, tmp_path):
     streams = ["door", "yard", "hall", "gate"]
     merged = merge_streams(store, streams, "anna", named=False)
     assert (set(merged.streams), merged.skipped) == ({"door", "yard", "hall"}, ())

@@ -44,7 +44,7 @@ def load(tmp_path):
     return load
 
 
-def test_a_file_is_read_with_paths_from_its_folder_and_is_shown_without_its_passwords(load, tmp_path):
+def test_paths_are_relative_to_the_fleet_file_and_passwords_are_redacted(load, tmp_path):
     fleet = load(WHOLE)
     assert "secret" not in repr(fleet)
     assert (fleet.name, fleet.store, fleet.every) == ("site", str(tmp_path / "state"), 2.0)

@@ -74,7 +74,7 @@ def test_a_fenced_holder_writes_no_more_and_is_told_by_whom(store):
     assert store.stream("cam-7").newest().facts == {"frame": 2}
 
 
-def test_two_states_stay_and_a_later_holder_removes_the_states_and_the_claim_of_an_earlier_one(store):
+def test_two_states_stay_and_a_later_holder_removes_those_of_earlier_ones(store):
     claim = store.stream("cam-7").claim("node-1")
     for frame in range(9):
         claim.write(STATE, {"frame": frame})

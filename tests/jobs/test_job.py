@@ -131,7 +131,7 @@ def test_a_saved_model_that_is_stored_while_a_state_is_read_is_in_it_if_it_is_na
     assert "searched_models/0a.safetensors" in content
 
 
-def test_the_files_of_a_state_are_restored_with_the_models_that_are_searched_for_and_the_newest_checkpoint(tmp_path):
+def test_a_state_is_restored_with_its_searched_models_and_newest_checkpoint(tmp_path):
     names = ["desired_state.json", "job.safetensors", "searched_models/0af3.safetensors", "trees/000002.safetensors"]
     for name in [*names, "trees/000001.safetensors", "log", "searched_models/.part"]:
         (tmp_path / "old" / name).parent.mkdir(parents=True, exist_ok=True)

@@ -88,7 +88,7 @@ def test_samples_continue_after_the_version_of_the_saved_model(learned, messages
     assert bits(learned.trees) == before, "the run has trees of its own"
 
 
-def test_before_the_first_sample_or_while_its_object_is_searched_for_a_run_has_nothing_to_save(learned):
+def test_a_run_has_nothing_to_save_before_the_first_sample_or_before_a_detection(learned):
     with pytest.raises(ServiceError, match="nothing was learned"):
         learn(stream(1, 1))
     (message,) = stream(2, 1)

@@ -27,14 +27,14 @@ def test_the_latency_of_a_skipped_frame_ends_with_the_track_of_a_newer_one(sched
     assert (measures.without_track, measures.track.max()) == (2, pytest.approx(4.2))  # until the end of the run
 
 
-def test_stills_before_the_start_and_after_the_end_count_only_for_the_time_within_the_run(schedule, track):
+def test_still_frames_before_and_after_a_run_count_only_for_the_time_within_it(schedule, track):
     observations = Observations(tracks=[track(-3, 0.01), track(4, 0.01), track(12, 0.01)])
     measures = measure(observations, schedule, 10, TRUTH, end=105.0, totals={})
     assert measures.followed.sum() == 1
     assert (measures.without_track, measures.track.max()) == (0, pytest.approx(0.71))
 
 
-def test_the_model_latency_ends_with_the_first_model_trained_on_the_frame_or_a_newer_one(schedule, track):
+def test_model_latency_ends_with_the_first_model_of_the_frame_or_a_newer_one(schedule, track):
     observations = Observations(tracks=[track(number, 0.02) for number in range(10)])
     observations.models = [(100.45, 2), (100.95, 7), (101.5, 9)]
     measures = measure(observations, schedule, 10, TRUTH, end=102.0, totals={})

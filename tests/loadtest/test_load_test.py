@@ -131,7 +131,7 @@ def test_the_limit_on_success_is_a_minimum(result):
     assert "limit at least 0.9" in violations([Limit("success", 0.9)], run)[0]
 
 
-def test_skipped_and_missed_are_shares_and_a_failed_stream_is_a_violation_in_any_case(result):
+def test_skipped_and_missed_frames_are_shares_and_a_failed_stream_is_a_violation(result):
     run = result([0.01] * 10, followed=0.9, received=[99, 99], missed=[1, 1], errors=["stream 0: it died"])
     assert violations([Limit("skipped", 0.1), Limit("missed", 0.01)], run) == ["stream 0: it died"]
     assert len(violations([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 3

@@ -56,7 +56,7 @@ def test_a_process_that_a_signal_ends_before_the_run_is_started_again(video):
     assert pipeline.totals["stored"] == len(video[1])
 
 
-def test_a_detector_that_ends_with_messages_for_two_slow_subscribers_does_not_count_as_stuck(endless):
+def test_a_detector_that_ends_with_two_slow_subscribers_does_not_count_as_stuck(endless):
     with (
         Pipeline(endless, (20, 20, 60, 60), part=slice(0, 200)) as pipeline,
         subscribe(pipeline.endpoint, "features"),
@@ -67,7 +67,7 @@ def test_a_detector_that_ends_with_messages_for_two_slow_subscribers_does_not_co
     assert pipeline.restarts == 0
 
 
-def test_tracks_that_have_arrived_are_returned_although_a_signal_has_ended_the_detector(video, until):
+def test_received_tracks_are_returned_after_a_signal_has_ended_the_detector(video, until):
     """It does not wait for its owner any longer."""
     with Pipeline(video[0], video[1][0]) as pipeline, subscribe(pipeline.endpoint, "tracks") as published:
         tracks, detector = list(islice(pipeline, 1)), pipeline.pids["detector"]
@@ -81,7 +81,7 @@ def test_tracks_that_have_arrived_are_returned_although_a_signal_has_ended_the_d
 
 
 @pytest.mark.parametrize("stays", [False, True], ids=["private folder", "folder of the user"])
-def test_a_subscriber_that_reads_nothing_from_a_restart_to_the_end_does_not_wait_for_ever(video, folder, stays):
+def test_a_subscriber_that_reads_nothing_from_a_restart_on_receives_the_end(video, folder, stays):
     """Its subscription is sent to the restarted detector only once it reads."""
     settings = Settings(run={"endpoint": str(folder) if stays else ""})
     with Pipeline(video[0], video[1][0], settings) as pipeline, subscribe(pipeline.endpoint, "tracks") as tracks:

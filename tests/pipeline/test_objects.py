@@ -42,7 +42,7 @@ def expected(video, objects):
 
 
 @pytest.mark.parametrize("victims", [{}, {5: "detector", 12: "compressor", 20: "trainer"}], ids=["none", "each"])
-def test_with_keys_and_in_lockstep_three_objects_are_as_in_one_process_and_none_is_lost_whoever_dies(
+def test_in_lockstep_three_objects_are_as_in_one_process_whichever_process_dies(
     video, objects, expected, folder, tcp, victims
 ):
     create(folder / "keys")

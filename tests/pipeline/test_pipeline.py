@@ -184,7 +184,7 @@ def test_a_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, fo
         assert next(iter(next_one)).frame == 0, "the place is free at once"
 
 
-def test_a_box_outside_the_first_frame_or_a_missing_source_is_rejected_before_anything_starts(video, folder):
+def test_a_box_outside_the_first_frame_or_a_missing_source_is_rejected_at_once(video, folder):
     for box in ((0, 0, 0, 10), (400, 10, 20, 20), (10, 10, float("nan"), 20)):
         with pytest.raises(BoxError):
             Pipeline(video[0], box)

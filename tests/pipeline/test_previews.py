@@ -57,7 +57,7 @@ def test_a_new_viewer_receives_the_newest_frame_if_none_arrives(previews, looks)
         assert next(reader).frame == 4
 
 
-def test_frames_that_pass_by_while_none_is_followed_are_seen_though_they_have_one_number(previews, looks, until):
+def test_frames_are_shown_while_no_object_is_tracked_although_their_number_stays(previews, looks, until):
     seen = []
     with looks() as reader:
         reader.timeout = 0

@@ -31,7 +31,7 @@ def test_a_restored_state_is_at_the_same_position(state, tmp_path):
     assert last_seq(tmp_path / "there") == 12
 
 
-def test_a_run_is_resumed_with_all_settings_that_are_given_also_if_they_are_the_defaults(state):
+def test_a_run_is_resumed_with_passed_settings_also_if_they_are_the_defaults(state):
     assert Pipeline(resume=state).settings.run.lockstep
     assert Pipeline(resume=state, settings={"run.lag_frames": 3}).settings.run.lockstep
     assert Pipeline(resume=state, settings=Settings()).settings == Settings()

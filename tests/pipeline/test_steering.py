@@ -85,7 +85,7 @@ def saved(long_video, once):
     return once("saved", save) / "object.safetensors"
 
 
-def test_without_a_box_the_first_frame_waits_and_in_a_pause_a_box_applies_to_the_waiting_frame(video):
+def test_the_first_frame_waits_for_a_box_and_in_a_pause_a_box_is_for_the_waiting_one(video):
     path, boxes = video
     with steered(path) as (pipeline, steering, _):
         assert told(pipeline, lambda counters: counters["waiting"])["sent"] == 0
@@ -122,7 +122,7 @@ def refuses_what_cannot_be_done(pipeline, steering):
 
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor")], ids=str)
-def test_another_object_is_followed_from_its_frame_on_and_the_old_is_forgotten_whoever_dies(long_video, victims):
+def test_another_object_replaces_the_first_from_its_frame_on_whichever_process_dies(long_video, victims):
     path, boxes = long_video
     with steered(path, PATCH) as (pipeline, steering, pool):
         tracks = with_model(pipeline)
@@ -248,7 +248,7 @@ def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, r
     assert tracks[-1].box.overlap(video[1][19].scaled(1.9).centred(*(1.9 * c for c in video[1][19].centre))) > 0.5
 
 
-def test_a_pause_with_a_limit_ends_by_itself_and_whoever_attaches_meanwhile_is_told_why_nothing_arrives(endless, video):
+def test_a_pause_with_a_timeout_ends_and_a_new_subscriber_learns_of_the_pause(endless, video):
     with steered(endless, video[1][0]) as (pipeline, steering, _):
         told(pipeline, lambda counters: counters["sent"])
         steering.pause(seconds=600)
@@ -265,7 +265,7 @@ def test_a_pause_with_a_limit_ends_by_itself_and_whoever_attaches_meanwhile_is_t
         assert report.objects[""].keys() == {"model_version", "score", "present"}
 
 
-def test_an_object_begins_where_it_is_by_now_if_its_box_was_drawn_in_a_past_picture_of_a_camera(walker):
+def test_an_object_whose_box_is_of_a_past_picture_begins_where_it_has_moved_to(walker):
     url, find = walker
     with (
         steered(url) as (pipeline, steering, _),
@@ -306,7 +306,7 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
     assert pipeline.totals["skipped"] > passed["skipped"]
 
 
-def test_a_picture_of_a_live_source_has_the_number_and_the_boxes_of_the_track_of_its_frame(video, camera):
+def test_a_picture_of_a_live_source_has_the_frame_number_and_the_boxes_of_its_track(video, camera):
     path, boxes = video
     with open_source(path) as source:
         images = [frame.image for frame, _ in zip(source, range(23), strict=False)]
@@ -338,7 +338,7 @@ def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_
 
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor", "trainer")], ids=str)
-def test_an_object_is_searched_for_in_a_running_pipeline_as_in_one_process_whoever_dies(video, saved, victims):
+def test_an_object_is_searched_for_in_a_pipeline_as_in_one_process_whichever_dies(video, saved, victims):
     path, settings = video[0], Settings(run={"lockstep": True})
     tracks = []
     with (

@@ -113,7 +113,7 @@ def test_only_what_was_learned_can_be_saved(tracked, name, done, reason):
     assert answer.reason.startswith(reason) or reason in answer.reason
 
 
-def test_a_box_is_for_the_only_object_and_continues_it_only_if_something_was_learned_of_it(tracked):
+def test_a_box_is_for_the_only_object_and_continues_it_only_if_it_has_a_model(tracked):
     assert object_of(command("set-box"), desired("anna")) == "anna"
     assert object_of(command("set-box"), desired("", "anna")) == object_of(command("set-box"), desired()) == ""
     check_room("anna", desired("anna", "b", "c", "d"), 4)

@@ -42,7 +42,7 @@ def test_a_desired_state_is_read_as_it_was_written(tmp_path_factory, desired):
 
 
 @given(DESIRED, NAMES, st.integers(1, 30))
-def test_an_object_that_begins_is_the_last_one_and_one_that_is_forgotten_leaves_the_others_in_order(desired, name, seq):
+def test_a_new_object_is_the_last_one_and_forgetting_one_keeps_the_order_of_others(desired, name, seq):
     others = [other for other in desired.objects if other != name]
     begun = desired.with_object(name, DesiredObject(BOX, seq))
     assert [*begun.objects] == [*others, name]
@@ -50,7 +50,7 @@ def test_an_object_that_begins_is_the_last_one_and_one_that_is_forgotten_leaves_
 
 
 @given(DESIRED, SEQ, SEQ | st.none(), VERSIONS, st.sets(NAMES), st.booleans())
-def test_a_detector_continues_where_nothing_is_lost_and_no_frame_is_learned_from_twice(
+def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
     desired, processed, after, versions, known, live
 ):
     position = Position(processed, processed, versions=versions, states=dict.fromkeys(known, STATE))
@@ -72,7 +72,7 @@ def test_a_detector_continues_where_nothing_is_lost_and_no_frame_is_learned_from
         assert replace(each, begins=0, box=BOX) == replace(desired.objects[name], begins=0, box=BOX)
 
 
-def test_if_nothing_was_learned_yet_a_file_is_tracked_from_the_first_frame_of_an_object_again():
+def test_without_a_model_a_restart_tracks_from_the_first_frame_of_an_object_again():
     desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
     position = Position(0, 8, states={"anna": STATE})
     start = resume_at(position, 6, desired, 1.5, live=False)
@@ -88,7 +88,7 @@ def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last()
 
 
 @given(VERSIONS, VERSIONS, DESIRED)
-def test_the_models_of_all_objects_that_are_tracked_have_to_arrive_in_the_compressors_version(newest, arrived, desired):
+def test_lockstep_waits_for_the_compressors_version_of_the_models_of_all_objects(newest, arrived, desired):
     here = {name: version for name, version in newest.items() if name in desired.objects}
     assert have_arrived(Position(versions=newest), desired, newest)
     assert have_arrived(Position(versions=newest), desired, arrived) == (here.items() <= arrived.items())

@@ -104,7 +104,7 @@ def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_
 
 
 @pytest.mark.usefixtures("own_server")
-def test_the_processes_end_with_the_server_and_the_next_one_is_started_by_a_new_server(start, until):
+def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next(start, until):
     process, *_ = start()
     running, server = psutil.Process(process.pid), start_server()
     os.kill(server.pid, signal.SIGKILL)
@@ -262,7 +262,7 @@ def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_
         (STOPPED_EARLY, "another program asked it to end with a signal"),
     ],
 )
-def test_the_reason_of_a_death_is_the_signal_and_what_the_process_itself_has_said_of_it(tmp_path, code, ending):
+def test_the_reason_of_a_death_has_the_signal_and_the_words_of_the_process(tmp_path, code, ending):
     child = Child("trainer", tmp_path, tmp_path)
     with closing(child.log), (tmp_path / "trainer.log").open("ab") as file:
         file.write(b"trainer: its last line\n")

@@ -110,7 +110,7 @@ def test_another_database_is_no_log(tmp_path):
         read(tmp_path / "t.sqlite")
 
 
-def test_frames_wait_while_another_program_locks_the_database_and_are_written_after_it(tmp_path, caplog, monkeypatch):
+def test_frames_wait_in_memory_while_another_program_locks_the_database(tmp_path, caplog, monkeypatch):
     monkeypatch.setattr(remote, "_STABLE_SECONDS", 0.0)
     path = tmp_path / "t.sqlite"
     with closing(open_sink(str(path), Origin())) as sink:

@@ -121,7 +121,7 @@ def test_whatever_begins_ends(history):
 
 
 @given(st.text(".0123456789", max_size=60))
-def test_the_zones_of_an_object_are_those_entered_and_not_left_and_none_while_it_is_lost(history):
+def test_an_object_is_in_the_zones_that_it_entered_and_in_none_while_it_is_lost(history):
     events, inside = Events(SinkOptions(DOOR, lost_seconds=2)), set()
     for track in tracks(history):
         for event in events.update([track]):

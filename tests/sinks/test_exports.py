@@ -107,7 +107,7 @@ def test_coco_has_tracks_and_cuts_boxes_at_the_edges_of_the_frame(tmp_path):
     assert (video["id"], [each["id"] for each in coco.dataset["tracks"]]) == (1, [1, 2, 3])
 
 
-def test_cvat_has_a_key_frame_for_each_box_and_one_outside_where_the_object_disappears(tmp_path):
+def test_cvat_has_a_keyframe_for_each_box_and_an_outside_one_after_the_last(tmp_path):
     root = ElementTree.parse(made(tmp_path / "t.xml", log=ANNOTATED, size=(100, 80))).getroot()
     assert (root.tag, root.findtext("version"), root.findtext("meta/task/mode")) == (
         "annotations",
@@ -180,7 +180,7 @@ def test_a_format_that_needs_the_size_of_a_frame_asks_for_it(tmp_path, name, kin
 
 @pytest.mark.parametrize("disk", [1 << 16], indirect=True)
 @pytest.mark.parametrize("suffix", [".txt", ".sqlite", ".parquet", ".json", ".xml", ".via.csv"])
-def test_a_file_for_which_the_disk_has_no_room_is_an_error_and_the_one_before_is_kept(disk, suffix):
+def test_a_full_disk_is_an_error_and_leaves_the_earlier_file_as_it_is(disk, suffix):
     (disk / f"t{suffix}").write_text("dear to somebody")
     (disk / "ballast").write_bytes(bytes((1 << 16) - 4096))
     with pytest.raises(VideoError, match="cannot write"):

@@ -134,7 +134,7 @@ def test_wherever_a_crash_cuts_the_files_no_row_is_lost_or_doubled(history, data
         assert rows_of(again) == rows_of(whole)
 
 
-def test_an_ndjson_file_that_is_new_when_a_run_is_resumed_gets_the_frames_of_its_csv_file(tmp_path):
+def test_a_new_ndjson_file_of_a_resumed_run_gets_the_frames_of_its_csv_file(tmp_path):
     run = RunFiles(Origin(), None, [str(tmp_path / "t.csv")])
     add(run, [[""]] * 7)
     more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
@@ -157,7 +157,7 @@ def test_a_frame_counts_only_if_it_is_whole_at_each_byte_at_which_a_file_can_end
         assert run.position() == (3 if held == 8 else 2 if held >= 5 else 1 if held > 2 else 0)
 
 
-def test_existing_files_are_replaced_only_if_requested_and_continued_only_by_their_own_run(tmp_path):
+def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_only(tmp_path):
     run = run_in(tmp_path, "t.csv", "t.mcap")
     add(replace(run, places=run.places[:3]), [[""]] * 2)
     with pytest.raises(VideoError, match=r"walk\.ndjson exists already: replace it with --overwrite"):

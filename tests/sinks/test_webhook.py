@@ -208,9 +208,7 @@ def test_an_event_is_sent_again_after_some_answers_and_not_after_others(receiver
     assert len(set(ids)) == len(ALL)
 
 
-def test_a_slow_receiver_never_holds_the_run_up_and_what_does_not_fit_into_the_queue_is_counted(
-    receiver, monkeypatch, caplog, until
-):
+def test_a_slow_receiver_never_blocks_the_run_and_dropped_events_are_counted(receiver, monkeypatch, caplog, until):
     monkeypatch.setattr(webhook, "QUEUED", 2)
     receiver.holds.clear()
     with sending(receiver.port) as sink:

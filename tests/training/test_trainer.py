@@ -80,7 +80,7 @@ def test_an_object_like_the_background_is_rejected(sample):
         Trainer(Settings()).train(with_tree(sample, "object", sample.trees["background"]))
 
 
-def test_a_direction_in_which_the_object_scores_lower_gives_way_to_the_one_between_the_means(sample):
+def test_weights_that_score_the_object_lower_are_replaced_by_those_between_the_means(sample):
     """The rows of a tiny coreset may lie beyond the background, seen from the mean of all they stand for."""
     there, background = sample.trees["object"], sample.trees["background"].mean
     few = with_tree(sample, "object", dataclasses.replace(there, rows=2 * background - there.rows))

@@ -65,7 +65,7 @@ def test_a_stream_has_a_name_and_a_size_also_if_its_password_contains_a_bracket(
         assert (source.name, source.frames, source.size, source.live) == ("one", None, (128, 96), True)
 
 
-def test_every_frame_is_returned_or_counted_as_skipped_and_the_last_returned_is_the_newest(camera, until):
+def test_every_frame_is_returned_or_counted_as_skipped_and_the_last_is_the_newest(camera, until):
     cam, taken = camera(numbered), []
     with open_source(cam.url) as source:
         for frame in source:
@@ -194,7 +194,7 @@ def test_an_unreachable_stream_is_an_error_without_its_password(camera, caplog):
     ("seconds", "left_out", "late"),
     [(0.03, (0, 0), 0.1), (0.08, (0.4, 0.7), 2.1), (0.5, (0.9, 0.97), 2.6)],
 )
-def test_a_stream_that_is_decoded_too_slowly_is_never_far_behind_and_goes_on_at_a_key_frame(seconds, left_out, late):
+def test_a_stream_that_is_decoded_too_slowly_continues_at_a_keyframe(seconds, left_out, late):
     backlog, moment, left, ages, broken = live.Backlog(), 0.0, 0, [], False
     for number in range(3000):  # two minutes, with a key frame every second
         moment, is_key = max(moment, number / 25), number % 25 == 0

@@ -146,7 +146,7 @@ def broken(path, start: int = 0) -> tuple[list[int], str]:
 
 
 @KINDS
-def test_every_frame_of_a_video_is_returned_once_in_order_with_its_number_and_the_time_since_the_first(video, name):
+def test_every_frame_of_a_video_is_returned_once_in_order_with_its_number_and_time(video, name):
     with open_source(video(name)) as source:
         assert (source.name, source.size, source.rate, source.live) == ("a", (160, 120), 25.0, False)
         assert source.frames == 100
@@ -211,7 +211,7 @@ def test_what_ffmpeg_cannot_decode_is_an_error_after_the_frames_before_it(video,
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.avi", "a.mpg"])
 @pytest.mark.parametrize("share", [0.3, 0.7])
-def test_with_skip_damaged_reading_goes_on_at_the_next_key_frame_and_frames_keep_their_times(video, name, share):
+def test_skip_damaged_continues_at_the_next_keyframe_and_frames_keep_their_times(video, name, share):
     path = damaged(video(name, options={"v:g": "10"}), share)
     with open_source(path, skip_damaged=True) as source:
         found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
@@ -555,7 +555,7 @@ def test_images_of_more_than_8_bits_are_scaled_by_the_range_of_the_first_one(tmp
         np.testing.assert_array_equal(second, np.dstack([wanted] * 3))
 
 
-def test_an_image_file_with_several_pages_is_read_whole_and_in_a_folder_its_first_page_is(tmp_path, caplog):
+def test_all_pages_of_an_image_file_are_read_but_only_the_first_one_in_a_folder(tmp_path, caplog):
     pages = [numbered(number) for number in range(40)]
     animation = cv2.Animation()
     animation.frames, animation.durations = pages, np.full(40, 40, np.int32)

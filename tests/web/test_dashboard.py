@@ -45,7 +45,7 @@ def test_two_minutes_of_points_are_kept_at_any_rate_of_tracks(dashboard, facts):
 
 
 @pytest.mark.parametrize("names", [[""], ["anna", "ben", "carl"]], ids=len)
-def test_frames_per_second_are_counted_over_the_last_two_seconds_however_many_objects(dashboard, facts, names):
+def test_frames_per_second_are_of_the_last_two_seconds_for_any_number_of_objects(dashboard, facts, names):
     for frame in range(100):
         for name in names:
             dashboard.take(facts.track(frame, name=name), frame / 50)
@@ -77,9 +77,7 @@ HOLDING = {
 @pytest.mark.parametrize(
     ("state", "counters", "words"), [(state, *told) for state, told in HOLDING.items()], ids=HOLDING
 )
-def test_while_no_frames_are_tracked_the_page_says_why_and_nothing_of_where_the_objects_are(
-    dashboard, facts, state, counters, words
-):
+def test_while_no_frames_are_tracked_the_page_says_why_and_shows_no_positions(dashboard, facts, state, counters, words):
     told = {}
     dashboard.take(facts.tracking(3, "anna"), 0.0)
     dashboard.take(facts.track(2, name="anna"), 0.1)
@@ -95,7 +93,7 @@ def test_while_no_frames_are_tracked_the_page_says_why_and_nothing_of_where_the_
     assert [one["state"] for one in parts["tracks"]["objects"]] == ["present"]
 
 
-def test_ready_is_what_tracks_and_a_process_is_silent_some_seconds_after_its_last_report():
+def test_a_pipeline_that_tracks_is_ready_until_a_process_is_silent_for_some_seconds():
     feed, everyone = PipelineFeed(Address("run")), "no health report from: detector, compressor, trainer"
     assert feed.problem_of() == everyone
     for ago, names, more, problem in (
@@ -124,7 +122,7 @@ def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, fac
     assert (dashboard.phase, names(dashboard)) == ("running", [])
 
 
-def test_the_trees_and_skipped_frames_of_the_last_health_reports_are_shown_after_the_end(dashboard):
+def test_the_trees_and_skipped_frames_of_the_last_reports_stay_after_the_end(dashboard):
     dashboard.take(Health("detector", 1.0, {"sent": 1.0, "skipped": 40.0}), 0.0)
     dashboard.take(End(2, "the source has ended"), 10.0)
     dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
@@ -191,7 +189,7 @@ def names(dashboard):
     return [one["name"] for one in dashboard.updates({})["tracks"]["objects"]]
 
 
-def test_objects_are_listed_in_the_order_in_which_they_began_each_in_a_colour_of_its_own(dashboard, facts):
+def test_objects_are_listed_in_the_order_in_which_they_began_in_different_colours(dashboard, facts):
     for frame, alive in enumerate((["ben"], ["ben", "anna"], ["ben", "anna", "carl"])):
         for name in alive:
             dashboard.take(facts.track(frame, name=name), float(frame))
@@ -208,7 +206,7 @@ def test_a_point_of_the_charts_has_each_object(dashboard, facts):
     assert (now, rate, objects) == (2.0, 1.0, {"anna": (0.25, None, 1, True), "ben": (0.1, None, 3, False)})
 
 
-def test_latency_is_measured_from_a_track_to_the_model_trained_on_its_frame_for_each_object(dashboard, facts):
+def test_latency_is_the_time_from_a_track_to_the_model_of_its_frame_for_each_object(dashboard, facts):
     for frame in range(10):
         for name in ("anna", "ben", "carl"):
             dashboard.take(facts.track(frame, name=name), float(frame))

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.system
 TOKEN = "correct-horse-battery"
 
 
-def test_a_stream_is_found_and_opened_and_the_last_state_stays_if_the_fleet_is_silent(
+def test_a_stream_can_be_opened_and_the_last_state_stays_if_the_fleet_is_silent(
     fleet, manager, serve_fleet, camera, turning, folder, script_of_browser, monkeypatch
 ):
     monkeypatch.setattr(feed, "REGISTRY_SECONDS", 1.0)

@@ -22,7 +22,7 @@ SIZE = (320, 240)
 LEAVES = 475  # frame of the demo in which the object has left the picture
 
 
-def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_after_a_restart(
+def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restart(
     script_of_browser, folder, tmp_path, until
 ):
     path, boxes = tmp_path / "demo.mp4", []
@@ -75,9 +75,7 @@ def test_objects_are_drawn_and_forgotten_and_one_is_tracked_until_it_leaves_and_
     assert "overflow 0" in lines
 
 
-def test_an_object_of_a_camera_is_followed_from_the_still_picture_in_which_it_was_drawn(
-    script_of_browser, folder, walker
-):
+def test_an_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_of_browser, folder, walker):
     url, find = walker
     server = Server(pipeline_site(Address(str(folder))), port=0, token=None)
     words = script_of_browser("live.mjs", server.url, "1")

@@ -74,7 +74,7 @@ def test_the_state_is_a_metric_and_alerts_on_a_lost_source_or_a_pause_need_no_ot
     assert [found[f"catstream_{name}"][0][1] for name in ("paused", "source_lost_seconds")] == [paused, lost]
 
 
-def test_each_number_of_a_stream_and_of_a_node_is_a_metric_with_their_names_as_labels(fleet):
+def test_each_number_of_a_stream_and_a_node_is_a_metric_with_their_names_as_labels(fleet):
     feed = FleetFeed(Address(fleet=fleet.address))
     fleet.stream("cam-7", node="north", models={"anna": 3}, frame=25)
     fleet.stream("cam-8", "failed", trouble="no source")

@@ -278,7 +278,7 @@ def test_the_link_sets_a_cookie_and_the_browser_does_not_show_the_token(locked, 
     assert (answer.status_code, "<form" in answer.text) == (401, True), "a wrong cookie"
 
 
-def test_the_link_sets_a_cookie_for_tls_behind_a_proxy_with_tls_and_never_leads_to_another_host(locked):
+def test_the_link_sets_a_secure_cookie_behind_tls_and_never_leads_to_another_host(locked):
     answer = locked.get(f"/?token={TOKEN}", headers={"X-Forwarded-Proto": "https"})
     assert "Secure" in answer.headers["set-cookie"]
     answer = locked.get(f"{locked.base_url}/evil.example/?token={TOKEN}")
@@ -307,7 +307,7 @@ def test_a_short_token_is_an_error():
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_server_on_all_interfaces_is_found_at_the_loopback_and_by_the_name_of_the_machine(host):
+def test_a_server_on_all_interfaces_is_reached_at_loopback_and_by_the_host_name(host):
     server = Server(pipeline_site(Address()), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]

@@ -74,9 +74,7 @@ def test_a_malformed_address_is_an_error(text):
 
 
 @pytest.mark.parametrize("prefix", ["", "view-"])
-def test_the_token_of_a_page_is_read_from_an_option_or_a_variable_and_is_that_of_the_user_without_them(
-    prefix, tmp_path, monkeypatch
-):
+def test_the_token_of_a_page_is_from_an_option_or_a_variable_or_that_of_the_user(prefix, tmp_path, monkeypatch):
     @click.command()
     @with_token(prefix)
     def command(token):
@@ -105,7 +103,7 @@ BOARD = Path(__file__).parents[2] / "docs" / "grafana.json"
 OTHERS = {"catstream_detector_skipped", "catstream_detector_present", "catstream_detector_score"}
 
 
-def test_the_first_box_can_come_from_the_page_which_shows_the_end_of_the_run_and_of_the_server(
+def test_the_initial_box_can_come_from_the_page_which_shows_the_end_of_the_run(
     demo_video, catstream, folder, tmp_path, until
 ):
     source, boxes = demo_video(40)

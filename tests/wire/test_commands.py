@@ -151,7 +151,7 @@ def test_of_a_flood_of_large_commands_the_most_waits_for_the_next_turn(endpoint,
     assert max(after - before for before, after in pairwise(counts)) <= 2
 
 
-def test_of_a_flood_of_commands_64_wait_the_others_are_rejected_and_stop_is_let_through(endpoint, raw, until):
+def test_of_a_flood_of_commands_64_wait_others_are_rejected_and_stop_passes(endpoint, raw, until):
     with Responder(CONTROL, endpoint) as responder:
         heard, answers = [], []
 

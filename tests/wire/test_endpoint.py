@@ -35,13 +35,13 @@ def test_ports_follow_the_table():
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "localhost", "[::1]"])
 @pytest.mark.parametrize("other", ["0.0.0.0", "192.168.1.1", "[fe80::1%eth0]", "example.org", "*", "127.0.0.1.nip.io"])
-def test_without_keys_this_machine_is_accepted_and_a_host_that_others_can_reach_is_not(host, other):
+def test_without_keys_only_endpoints_of_this_machine_are_accepted(host, other):
     assert Endpoint.parse(f"tcp://{host}:5700").port == 5700
     with pytest.raises(ServiceError, match="other machines"):
         Endpoint.parse(f"tcp://{other}:5700")
 
 
-def test_a_name_that_has_addresses_of_one_family_only_is_listened_on_and_looked_up_there(folder, monkeypatch):
+def test_a_host_name_of_one_address_family_is_listened_on_and_resolved_in_it(folder, monkeypatch):
     create(folder / "keys")
     known = {"four": ["192.0.2.1"], "six": ["2001:db8::1"], "both": ["2001:db8::1", "192.0.2.1"]}
 
@@ -137,7 +137,7 @@ def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
         assert endpoint.folder == folder
 
 
-def test_the_folder_of_a_killed_process_is_removed_by_the_next_one_and_of_a_running_one_kept(folder, monkeypatch):
+def test_the_folder_of_a_killed_process_is_removed_and_that_of_a_running_one_is_not(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.setenv("TMPDIR", str(folder))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)

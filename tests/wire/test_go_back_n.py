@@ -347,7 +347,7 @@ def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late
     assert window.must_ask(50.0), "it is no sign of life"
 
 
-def test_messages_kept_in_memory_by_a_full_disk_are_acknowledged_and_do_not_count_as_stored():
+def test_messages_in_memory_due_to_a_full_disk_are_acknowledged_but_not_stored():
     window = filled(size=4, count=3)
     window.receive(Position(3, 3, in_memory=2), now=0.0)
     assert (window.acknowledged, window.stored) == (3, 1)
@@ -356,7 +356,7 @@ def test_messages_kept_in_memory_by_a_full_disk_are_acknowledged_and_do_not_coun
         window.receive(Position(1, 1, again=True), now=0.0)
 
 
-def test_a_receiver_of_another_stream_is_detected_and_messages_of_an_earlier_sender_are_accepted():
+def test_a_receiver_detects_another_stream_and_accepts_messages_of_an_earlier_sender():
     window = SendWindow("features", 4, now=0.0)
     window.resume(3, Position(5, 5))
     window.receive(Position(9, 9), now=0.0)

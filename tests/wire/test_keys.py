@@ -237,7 +237,7 @@ def test_a_client_that_may_only_watch_gets_an_error_if_it_sends(name, place, lis
         until(lambda: False, lambda: (turn(), client._wait(0.02)))
 
 
-def test_a_client_is_revoked_also_if_its_file_is_damaged_but_never_the_pipeline_itself(keys):
+def test_a_client_is_revoked_even_if_its_file_is_damaged_but_never_the_pipeline(keys):
     with pytest.raises(ServiceError, match="make keys in another folder"):
         revoke(keys, "pipeline")
     (keys / "clients" / "operator").write_bytes(b"\xff")
@@ -274,7 +274,7 @@ def test_a_client_that_is_allowed_later_needs_no_restart(keys, place, until):
             until(lambda: heard, lambda: (tracks.send(track(2)), heard.extend(reader.receive_all())))
 
 
-def test_clients_are_rejected_while_their_keys_cannot_be_read_and_accepted_afterwards(keys, place, until):
+def test_clients_are_rejected_as_long_as_their_keys_cannot_be_read(keys, place, until):
     heard, before = [], rejected()
     good = (keys / "clients" / "operator").read_bytes()
     (keys / "clients" / "operator").write_bytes(b"role = ")

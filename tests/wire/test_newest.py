@@ -113,7 +113,7 @@ def heard_by_all(publisher, subscriber, count, until):
     return heard
 
 
-def test_a_late_joiner_receives_the_newest_model_of_each_object_that_was_not_forgotten(endpoint, until):
+def test_a_late_joiner_receives_the_newest_model_of_each_object_still_tracked(endpoint, until):
     with Publisher(MODELS, endpoint) as models:
         for version, name in enumerate(["anna", "ben", "anna", "", "ben"], 1):
             models.send(model(version, name))
@@ -160,7 +160,7 @@ def test_a_publisher_remembers_the_last_messages_of_a_limited_number_of_names(en
         assert list(models._last) == [("model", f"o{version}") for version in range(344, 600)]
 
 
-def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_that_arrive():
+def test_a_subscriber_remembers_a_limited_number_of_names_and_receives_all_messages():
     turns = Turns()
     try:
         turns.queue.extend(encode(model(version, f"o{version}")) for version in range(1, 1500))

@@ -140,7 +140,7 @@ def test_ipv6_loopback_is_an_endpoint(until):
         until(lambda: reader.receive(0.01) is not None, lambda: models.send(model(1)))
 
 
-def test_sockets_that_are_dropped_without_close_do_not_block_the_thread_on_which_all_others_depend(endpoint):
+def test_sockets_that_are_dropped_without_close_do_not_block_the_io_thread(endpoint):
     with Publisher(TRACKS, endpoint):
         dropped = [Subscriber(TRACKS, endpoint) for _ in range(10)]
         with pytest.warns(ResourceWarning, match="not closed"):
