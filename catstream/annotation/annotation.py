@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
@@ -19,7 +20,7 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED, check_count, check_name, errors_about
 from catstream.base.settings import Settings
 from catstream.base.text import listed
-from catstream.base.workers import run_tasks
+from catstream.base.workers import Workers
 from catstream.errors import BoxError, ObjectError
 from catstream.messages.kinds import Check, Track
 from catstream.video.source import ALL_FRAMES
@@ -59,7 +60,8 @@ class Annotation:
     Call `track` after the constructor; `annotate` does both. Each stretch between two keyframes is tracked from both
     ends. If that does not check all of its frames, it is tracked from both ends again, with the merged model of all
     other boxes of the object. `add` tracks only beside its box; earlier passes are still used as far as they agree with
-    it. Close the annotation, or use it in a `with`: the decoded frames are in a temporary file until then.
+    it. Close the annotation, or use it in a `with`: until then, its processes run, and the decoded frames are in a
+    temporary file.
 
     Parameters
     ----------
@@ -98,6 +100,7 @@ class Annotation:
     ) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         self._jobs, self._progress = jobs or len(os.sched_getaffinity(0)), progress
+        self._workers = Workers(self._jobs)
         self.keyframes: dict[str, dict[int, Box | None]] = _parsed(boxes)
         check_count(len(self.keyframes), self.settings.run.max_objects)
         self._passes: dict[str, list[Pass]] = {}
@@ -128,7 +131,8 @@ class Annotation:
         return f"<catstream.Annotation of {self.frames.name}: {count} boxes, {self.share_checked:.0%} checked>"
 
     def close(self) -> None:
-        """Delete the decoded frames. The tracks remain; `add` and `track` cannot be called any more."""
+        """End the processes and delete the decoded frames; `add` and `track` cannot be called any more."""
+        self._workers.close()
         self._folder.cleanup()
 
     def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
@@ -246,12 +250,13 @@ class Annotation:
                     tasks.append((name, self.frames, *way, dict(drawn), self.settings, use_memory))
         tasks.sort(key=lambda task: -abs(task[2] - task[3]))
         total, finished = sum(abs(task[2] - task[3]) for task in tasks), 0
-        results = run_tasks(_work, tasks, self._jobs) if self._jobs > 1 else (_work(*task) for task in tasks)
-        for name, frames, one in results:
-            if one is not None:
-                self._passes.setdefault(name, []).append(one)
-            finished += frames
-            self._progress("tracking again" if use_memory else "tracking", finished, total)
+        results = self._workers.run(_work, tasks) if self._jobs > 1 else (_work(*task) for task in tasks)
+        with closing(results):
+            for name, frames, one in results:
+                if one is not None:
+                    self._passes.setdefault(name, []).append(one)
+                finished += frames
+                self._progress("tracking again" if use_memory else "tracking", finished, total)
 
     def _checks(self, name: str, probabilities: Float64) -> list[Check]:
         checks: list[Check] = ["checked" if each >= _CHECKED else "unchecked" for each in probabilities]

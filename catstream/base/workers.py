@@ -1,4 +1,4 @@
-"""Processes that run a function of this program: the workers of an evaluation, and those of a load test.
+"""Processes that run a function of this program: workers of an evaluation, an annotation, and a load test.
 
 They end with their parent. SIGINT stays blocked in them, because on Ctrl-C their parent ends them in order: a worker
 that ended first would be reported as killed.
@@ -11,11 +11,12 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from multiprocessing import resource_tracker
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TypeVar
 
@@ -87,26 +88,62 @@ def sharing() -> Iterator[None]:
         ) from None
 
 
-def run_tasks(work: Callable[..., _Result], tasks: Sequence[tuple[object, ...]], jobs: int) -> Generator[_Result]:
-    """Yield the result of `work(*task)` for each task, in order of completion, from `jobs` processes.
+class Workers:
+    """Processes that run functions of this program. They are started by the first tasks, and remain until `close`."""
 
-    If the caller stops early, for example on Ctrl-C, all workers are killed.
-    """
-    others, kills = set(multiprocessing.active_children()), oom_kills()
-    with sharing():
-        made = ProcessPoolExecutor(jobs, mp_context=SPAWN, initializer=die_with, initargs=(os.getpid(),))
-    with made as pool:
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+        self._processes: set[BaseProcess] = set()
+
+    def run(self, work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]]) -> Generator[_Result]:
+        """Yield the result of `work(*task)` for each task, in order of completion.
+
+        If the caller stops early, for example on Ctrl-C, all workers are killed; the next tasks start others.
+        """
+        kills = oom_kills()
         try:
             with sigint_blocked():  # the workers are started here
-                futures = [pool.submit(work, *task) for task in tasks]
+                others = set(multiprocessing.active_children())
+                futures = [self._started().submit(work, *task) for task in tasks]
+                self._processes |= set(multiprocessing.active_children()) - others
             for future in as_completed(futures):
                 yield future.result()
         except BrokenProcessPool:
+            self.close()
             doubt = "" if oom_kills() > kills else "?"
-            raise ServiceError(
-                f"a process of the evaluation was killed (out of memory{doubt}): try fewer --jobs"
-            ) from None
+            raise ServiceError(f"a worker process was killed (out of memory{doubt}): try fewer --jobs") from None
         except BaseException:
-            for worker in set(multiprocessing.active_children()) - others:
+            for worker in self._processes:
                 worker.kill()
+            self.close()
             raise
+
+    def close(self) -> None:
+        """End the workers."""
+        if self._pool is not None:
+            self._pool.shutdown()
+        self._pool, self._processes = None, set()
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            with sharing():
+                self._pool = ProcessPoolExecutor(self._jobs, mp_context=SPAWN, initializer=_end_with_parent)
+        return self._pool
+
+
+def run_tasks(work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]], jobs: int) -> Generator[_Result]:
+    """Yield the results of tasks as `Workers.run` does, from processes that end with the last task."""
+    with closing(Workers(jobs)) as workers:
+        yield from workers.run(work, tasks)
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent process ends. `die_with` would end it with the thread that started it."""
+
+    def wait() -> None:
+        if (parent := multiprocessing.parent_process()) is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

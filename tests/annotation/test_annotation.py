@@ -1,5 +1,7 @@
 """Annotation of a rendered video: what is tracked, what is checked, and which frame is asked for."""
 
+import multiprocessing
+
 import numpy as np
 import pytest
 
@@ -75,10 +77,14 @@ def test_a_box_that_is_replaced_drops_what_was_tracked_from_it(demo):
         assert annotation.share_checked == 1
 
 
-def test_two_processes_give_the_same_tracks_as_one(demo, both_ends):
+def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(demo, both_ends):
     video, truth = demo
     with annotate(video, {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}, jobs=2) as annotation:
         assert annotation.tracks == both_ends.tracks
+        processes = {*multiprocessing.active_children()}
+        annotation.add(12, truth[12], "anna")
+        assert {*multiprocessing.active_children()} == processes
+    assert not multiprocessing.active_children()
 
 
 def test_where_an_object_is_absent_it_has_no_box(demo):

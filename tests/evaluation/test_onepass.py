@@ -1,12 +1,10 @@
 """One-pass evaluation: what is run, kept, found again, refused, and interrupted."""
 
-import multiprocessing
 import os
 import re
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +12,6 @@ import psutil
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.base.workers import run_tasks, sigint_blocked
 from catstream.errors import CatstreamError, SettingsError
 from catstream.evaluation import onepass, runs
 from catstream.evaluation.accuracy import describe_flips, flips_of, mean_of, rows_of
@@ -261,33 +258,3 @@ def test_ctrl_c_while_the_workers_start_is_one_line_and_no_worker_is_left(walk, 
     assert errors.splitlines()[-1].startswith("stopped: complete runs are in ")
     assert process.returncode == 130
     assert not psutil.wait_procs(children, timeout=10)[1]
-
-
-def test_ctrl_c_in_another_thread_interrupts_only_after_all_workers_were_started():
-    started = []
-
-    def start_all(other):
-        with sigint_blocked():
-            for worker in range(2):
-                other.submit(signal.raise_signal, signal.SIGINT).result()
-                started.append(worker)
-
-    with ThreadPoolExecutor(1) as other:
-        other.submit(abs, 0).result()  # the thread exists, and does not block the signal
-        with pytest.raises(KeyboardInterrupt):
-            start_all(other)
-    assert started == [0, 1]
-
-
-def test_ctrl_c_ends_no_worker_because_the_caller_does():
-    """A worker that ended on its own would be reported as killed, also by a caller that ignores Ctrl-C."""
-    assert list(run_tasks(signal.raise_signal, [(signal.SIGINT,)] * 2, jobs=2)) == [None, None]
-
-
-def test_a_caller_that_stops_early_leaves_no_worker():
-    given = run_tasks(abs, [(-1,), (-2,), (-3,)], jobs=2)
-    assert next(given) in {1, 2, 3}
-    running = multiprocessing.active_children()
-    given.close()
-    assert len(running) == 2
-    assert not multiprocessing.active_children()
