@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -12,9 +13,9 @@ from typing import NamedTuple, Self, cast
 
 import numpy as np
 
-from catstream.annotation.decoded import DecodedFrames, decode
+from catstream.annotation.decoded import DecodedFrames, decode, open_frames
 from catstream.annotation.fusion import fuse
-from catstream.annotation.passes import Keyframes, Pass, run_pass
+from catstream.annotation.passes import Pass, run_pass
 from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED, check_count, check_name, errors_about
@@ -23,6 +24,7 @@ from catstream.base.text import listed
 from catstream.base.workers import Workers
 from catstream.errors import BoxError, ObjectError
 from catstream.messages.kinds import Check, Track
+from catstream.video.frames import Source
 from catstream.video.source import ALL_FRAMES
 
 #: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
@@ -46,6 +48,20 @@ class NextFrame(NamedTuple):
     errors: float
 
 
+class Task(NamedTuple):
+    """A pass to be tracked, and the boxes that it begins with: that at `start`; with a memory, all of the object."""
+
+    object: str
+    start: int
+    stop: int
+    keyframes: tuple[tuple[int, Box | None], ...]
+    use_memory: bool
+
+    @property
+    def frames(self) -> int:
+        return abs(self.start - self.stop)
+
+
 class _Stretch(NamedTuple):
     """The frames of an object between two keyframes, or between a keyframe and an end of the video."""
 
@@ -57,11 +73,11 @@ class _Stretch(NamedTuple):
 class Annotation:
     """The keyframes of the objects of a video, and the tracks between them.
 
-    Call `track` after the constructor; `annotate` does both. Each stretch between two keyframes is tracked from both
-    ends. If that does not check all of its frames, it is tracked from both ends again, with the merged model of all
-    other boxes of the object. `add` tracks only beside its box; earlier passes are still used as far as they agree with
-    it. Close the annotation, or use it in a `with`: until then, its processes run, and the decoded frames are in a
-    temporary file.
+    Call `track` after the constructor, which decodes nothing yet; `annotate` does both. Each stretch between two
+    keyframes is tracked from both ends. If that does not check all of its frames, it is tracked from both ends again,
+    with the merged model of all other boxes of the object. `add` tracks only beside its box; earlier passes are still
+    used as far as they agree with the boxes. Close the annotation, or use it in a `with`: until then, its processes
+    run, and the decoded frames are in a temporary file.
 
     Parameters
     ----------
@@ -83,9 +99,9 @@ class Annotation:
     VideoError
         If the video is live or cannot be read.
     BoxError
-        For a box outside its frame, or a frame beyond the end of the video.
+        For a box outside its frame; from `decode` and `track` also for a frame beyond the end of the video.
     ObjectError
-        For a name that is not valid, no object, or too many.
+        For a name that is not valid, an object without a box, or too many.
     """
 
     def __init__(
@@ -100,24 +116,15 @@ class Annotation:
     ) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         self._jobs, self._progress = jobs or len(os.sched_getaffinity(0)), progress
+        self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
         self._workers = Workers(self._jobs)
-        self.keyframes: dict[str, dict[int, Box | None]] = _parsed(boxes)
-        check_count(len(self.keyframes), self.settings.run.max_objects)
-        self._passes: dict[str, list[Pass]] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
-            self.frames: DecodedFrames = decode(
-                os.fspath(video),
-                Path(self._folder.name),
-                self.settings,
-                lambda *done: progress("decoding", *done),
-                part,
-            )
-            for name, drawn in self.keyframes.items():
-                for frame, box in drawn.items():
-                    self._check(name, frame, box)
+            self._video: Source | None
+            self._video, self.frames = open_frames(os.fspath(video), Path(self._folder.name), self.settings, part)
+            self.set_boxes(boxes)
         except BaseException:
-            self.close()
+            self._folder.cleanup()
             raise
 
     def __enter__(self) -> Self:
@@ -132,7 +139,9 @@ class Annotation:
 
     def close(self) -> None:
         """End the processes and delete the decoded frames; `add` and `track` cannot be called any more."""
-        self._workers.close()
+        self._workers.kill()
+        if self._video is not None:
+            self._video.close()
         self._folder.cleanup()
 
     def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
@@ -140,19 +149,68 @@ class Annotation:
 
         BoxError or ObjectError as of the constructor.
         """
-        name, parsed = check_name(object), None if box is None else Box.parse(box)
-        self._check(name, frame, parsed)
-        check_count(len({*self.keyframes, name}), self.settings.run.max_objects)
-        if frame in self.keyframes.get(name, {}):  # what was tracked from the box before is wrong
-            self._passes[name] = [one for one in self.passes(name) if frame not in (one.start, one.stop)]
-        self.keyframes.setdefault(name, {})[frame] = parsed
+        name = check_name(object)
+        drawn: _BoxesByFrame = {**self.keyframes.get(name, {}), frame: box}
+        self.set_boxes({**self.keyframes, name: drawn})
         self.track()
+
+    def set_boxes(self, boxes: KeyframeBoxes) -> None:
+        """Replace the boxes of all objects, without tracking. BoxError or ObjectError as of the constructor."""
+        parsed = _parsed(boxes)
+        check_count(len(parsed), self.settings.run.max_objects)
+        self._check(parsed)
+        self.keyframes: dict[str, dict[int, Box | None]] = parsed
+
+    def rename(self, object: str, name: str) -> None:
+        """Rename an object, and keep its passes. ObjectError if the name is not valid, or that of another object."""
+        if check_name(name) in self.keyframes:
+            raise ObjectError(f"there is an object {name} already: give another name")
+        self.keyframes = {name if each == object else each: drawn for each, drawn in self.keyframes.items()}
+        passes = self._passes.items()
+        self._passes = {task._replace(object=name) if task.object == object else task: one for task, one in passes}
+
+    def decode(self) -> None:
+        """Decode the frames, if they are not yet. VideoError if one cannot be decoded: those before it are there."""
+        if self._video is not None:
+            video, self._video = self._video, None
+            decode(video, self.frames, lambda *done: self._progress("decoding", *done))
+        self._check(self.keyframes)
 
     def track(self) -> None:
         """Run the passes that are missing. If it is interrupted, the finished passes remain."""
-        self._run(self._stretches(), use_memory=False)
-        several = [stretch for stretch in self._stretches() if len(self.keyframes[stretch.object]) > 1]
-        self._run([stretch for stretch in several if not self._is_checked(stretch)], use_memory=True)
+        self.decode()
+        while tasks := self.missing():
+            total, finished = sum(task.frames for task in tasks), 0
+            work = [(task, self.frames, self.settings) for task in tasks]
+            results = self._workers.run(_work, work) if self._jobs > 1 else (_work(*each) for each in work)
+            with closing(results):
+                for task, one in results:
+                    self._passes[task] = one
+                    finished += task.frames
+                    self._progress("tracking again" if task.use_memory else "tracking", finished, total)
+
+    def missing(self) -> list[Task]:
+        """The passes that are missing, longest first: of each stretch those without a memory, then those with one.
+
+        A pass without a memory is not missing if a longer one starts at the same keyframe: it has the same boxes. Those
+        with a memory are missing if the frames are not checked, and there are other boxes of the object.
+        """
+        tasks: list[Task] = []
+        for stretch in self._stretches():
+            plain = self._missing_of(stretch, use_memory=False)
+            several = len(self.keyframes[stretch.object]) > 1
+            again = several and not plain and not self._is_checked(stretch)
+            tasks += self._missing_of(stretch, use_memory=True) if again else plain
+        return sorted(tasks, key=lambda task: -task.frames)
+
+    def submit(self, task: Task) -> Future[tuple[Task, Pass | None]]:
+        """Run a missing pass in one of the processes; `store` takes it."""
+        return self._workers.submit(_work, task, self.frames, self.settings)
+
+    def store(self, future: Future[tuple[Task, Pass | None]]) -> None:
+        """Store a pass that was submitted; it is used as long as the boxes that it began with are there."""
+        task, one = self._workers.result(future)
+        self._passes[task] = one
 
     @property
     def tracks(self) -> dict[str, list[Track]]:
@@ -195,7 +253,8 @@ class Annotation:
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
-        return sorted(self._passes.get(name, []), key=lambda one: (one.start, one.stop, one.with_memory))
+        passes = [one for task, one in self._passes.items() if one is not None and self._is_valid(task, name)]
+        return sorted(passes, key=lambda one: (one.start, one.stop, one.with_memory))
 
     def next_frame(self) -> NextFrame | None:
         """The first of `next_frames`; None if all frames are checked."""
@@ -210,16 +269,18 @@ class Annotation:
         unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
         return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
 
-    def _check(self, name: str, frame: int, box: Box | None) -> None:
-        """Raise BoxError if a keyframe is not in the video, or its box not in the frame."""
-        with errors_about(name):
-            if not 0 <= frame < len(self.frames):
-                raise BoxError(
-                    f"frame {frame} is not in the video, which has {len(self.frames)} frames, numbered from 0: "
-                    f"give a frame from 0 to {len(self.frames) - 1}"
-                )
-            if box is not None:
-                box.validated(*self.frames.size)
+    def _check(self, keyframes: Mapping[str, Mapping[int, Box | None]]) -> None:
+        """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as it is decoded."""
+        for name, drawn in keyframes.items():
+            for frame, box in drawn.items():
+                with errors_about(name):
+                    if self._video is None and not 0 <= frame < len(self.frames):
+                        raise BoxError(
+                            f"frame {frame} is not in the video, which has {len(self.frames)} frames, numbered from 0: "
+                            f"give a frame from 0 to {len(self.frames) - 1}"
+                        )
+                    if box is not None:
+                        box.validated(*self.frames.size)
 
     def _stretches(self) -> Iterator[_Stretch]:
         """Yield the stretches of all objects that have a frame."""
@@ -235,28 +296,21 @@ class Annotation:
         ways = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
         return [way for way in ways if way[0] in drawn]
 
-    def _run(self, stretches: Iterable[_Stretch], *, use_memory: bool) -> None:
-        """Run the missing passes of stretches from both of their ends, longest first; store each once it is finished.
+    def _is_valid(self, task: Task, name: str) -> bool:
+        """Whether a task is of this object, and the boxes that it began with are there."""
+        return task.object == name and set(task.keyframes) <= self.keyframes.get(name, {}).items()
 
-        A pass without a memory is not missing if a longer one starts at the same keyframe: it has the same boxes.
-        """
+    def _missing_of(self, stretch: _Stretch, *, use_memory: bool) -> list[Task]:
+        name, drawn = stretch.object, self.keyframes[stretch.object]
         tasks = []
-        for stretch in stretches:
-            name, drawn = stretch.object, self.keyframes[stretch.object]
-            for way in self._ways(stretch):
-                same = (one for one in self.passes(name) if one.start == way[0] and one.with_memory == use_memory)
-                done = any(one.stop == way[1] or (one.covers(*way) and not use_memory) for one in same)
-                if not done and (use_memory or drawn[way[0]] is not None):
-                    tasks.append((name, self.frames, *way, dict(drawn), self.settings, use_memory))
-        tasks.sort(key=lambda task: -abs(task[2] - task[3]))
-        total, finished = sum(abs(task[2] - task[3]) for task in tasks), 0
-        results = self._workers.run(_work, tasks) if self._jobs > 1 else (_work(*task) for task in tasks)
-        with closing(results):
-            for name, frames, one in results:
-                if one is not None:
-                    self._passes.setdefault(name, []).append(one)
-                finished += frames
-                self._progress("tracking again" if use_memory else "tracking", finished, total)
+        for start, stop in self._ways(stretch):
+            boxes = tuple(sorted(drawn.items())) if use_memory else ((start, drawn[start]),)
+            task = Task(name, start, stop, boxes, use_memory)
+            same = (one for one in self.passes(name) if one.start == start and one.with_memory == use_memory)
+            done = any(one.stop == stop or (one.covers(start, stop) and not use_memory) for one in same)
+            if not done and task not in self._passes and (use_memory or drawn[start] is not None):
+                tasks.append(task)
+        return tasks
 
     def _checks(self, name: str, probabilities: Float64) -> list[Check]:
         checks: list[Check] = ["checked" if each >= _CHECKED else "unchecked" for each in probabilities]
@@ -311,6 +365,8 @@ def annotate(
     box is right with a probability of 96 %, see `catstream.annotation.fusion`. Parameters and errors are those of
     `Annotation`.
     """
+    if not boxes:
+        raise ObjectError("no object: pass the box of one in at least one frame")
     annotation = Annotation(video, boxes, settings, part=part, jobs=jobs, progress=progress)
     try:
         annotation.track()
@@ -320,21 +376,17 @@ def annotate(
     return annotation
 
 
-def _work(
-    name: str, frames: DecodedFrames, start: int, stop: int, keyframes: Keyframes, settings: Settings, use_memory: bool
-) -> tuple[str, int, Pass | None]:
-    """Run a pass; return the name of its object and its number of frames with it."""
-    return name, abs(start - stop), run_pass(frames, start, stop, keyframes, settings, use_memory=use_memory)
+def _work(task: Task, frames: DecodedFrames, settings: Settings) -> tuple[Task, Pass | None]:
+    one = run_pass(frames, task.start, task.stop, dict(task.keyframes), settings, use_memory=task.use_memory)
+    return task, one
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, Box | None]]:
-    """The boxes by object and frame; ObjectError if there is no object, or a name is not valid."""
+    """The boxes by object and frame; ObjectError if an object has no box, or a name is not valid."""
     if all(isinstance(value, Mapping) for value in boxes.values()):
         by_name = cast(Mapping[str, _BoxesByFrame], boxes)
     else:
         by_name = {UNNAMED: cast(_BoxesByFrame, boxes)}
-    if not by_name:
-        raise ObjectError("no object: pass the box of one in at least one frame")
     parsed: dict[str, dict[int, Box | None]] = {}
     for name, drawn in by_name.items():
         with errors_about(check_name(name)):

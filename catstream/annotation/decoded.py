@@ -15,71 +15,71 @@ from catstream.base.arrays import UInt8
 from catstream.base.files import writing
 from catstream.base.settings import Settings
 from catstream.errors import VideoError
+from catstream.video.frames import Source
 from catstream.video.source import ALL_FRAMES, is_live, open_source
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedFrames:
-    """The frames of a video by number, uint8 (h, w, 3) in BGR.
+    """The frames of a video by number, uint8 (h, w, 3) in BGR: those that `decode` has written so far.
 
     path   file with the pixels of all frames
-    shape  number of frames, height, width, 3
+    size   width and height of a frame in pixels
     times  time of each frame in seconds
     rate   frames per second of the video
     name   that of the results
     """
 
     path: Path
-    shape: tuple[int, int, int, int]
-    times: tuple[float, ...]
+    size: tuple[int, int]
+    times: list[float]
     rate: float
     name: str
 
     def __len__(self) -> int:
-        return self.shape[0]
+        return len(self.times)
 
     def __getitem__(self, number: int) -> UInt8:
-        frame: UInt8 = np.array(np.memmap(self.path, np.uint8, "r", shape=self.shape)[number])
-        return frame  # a copy: kernels take no array that cannot be written
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of a frame in pixels."""
-        return self.shape[2], self.shape[1]
+        width, height = self.size
+        count = height * width * 3
+        return np.fromfile(self.path, np.uint8, count, offset=number * count).reshape(height, width, 3)
 
 
-def decode(
-    source: str | Path,
-    folder: Path,
-    settings: Settings,
-    progress: Callable[[int, int | None], object],
-    part: slice = ALL_FRAMES,
-) -> DecodedFrames:
-    """Decode a part of a file or folder once, into a file in `folder`.
+def open_frames(
+    source: str | Path, folder: Path, settings: Settings, part: slice = ALL_FRAMES
+) -> tuple[Source, DecodedFrames]:
+    """Open a part of a file or folder; its frames, none of which is decoded yet, will be in a file in `folder`.
+
+    Raises
+    ------
+    VideoError
+        If the source is live or cannot be read.
+    """
+    if is_live(source):
+        raise VideoError(f"{without_password(str(source))} is live, and has no frame to return to: record it to a file")
+    video = open_source(source, part=part, settings=settings.run)
+    return video, DecodedFrames(folder / "frames", video.size, [], video.rate, video.name)
+
+
+def decode(video: Source, frames: DecodedFrames, progress: Callable[[int, int | None], object]) -> None:
+    """Decode all frames once, into their file, and close the video.
 
     progress : called after each frame with the number of decoded frames, and of all if it is known
 
     Raises
     ------
     VideoError
-        If the source is live or cannot be read, or if the folder has too little space: a frame takes
+        If a frame cannot be decoded; those before it are there. If the disk has too little space: a frame takes
         3 * width * height bytes.
     """
-    if is_live(source):
-        raise VideoError(f"{without_password(str(source))} is live, and has no frame to return to: record it to a file")
-    path, times = folder / "frames", []
-    with (
-        closing(open_source(source, part=part, settings=settings.run)) as video,
-        writing(path, VideoError),
-        path.open("wb") as file,
-    ):
-        width, height = video.size
-        _check_space(folder, (video.frames or 0) * width * height * 3)
+    with closing(video), writing(frames.path, VideoError), frames.path.open("wb") as file:
+        width, height = frames.size
+        _check_space(frames.path.parent, (video.frames or 0) * width * height * 3)
         for frame in video:
             file.write(frame.image.tobytes())
-            times.append(frame.time)
-            progress(len(times), video.frames)
-        return DecodedFrames(path, (len(times), height, width, 3), tuple(times), video.rate, video.name)
+            file.flush()  # before its number is counted
+            frames.times.append(frame.time)
+            progress(len(frames), video.frames)
 
 
 def _check_space(folder: Path, required: int) -> None:

@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from multiprocessing import resource_tracker
@@ -92,35 +92,46 @@ class Workers:
     """Processes that run functions of this program. They are started by the first tasks, and remain until `close`."""
 
     def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
+        self._jobs, self._kills = jobs, oom_kills()
         self._pool: ProcessPoolExecutor | None = None
         self._processes: set[BaseProcess] = set()
+
+    def submit(self, work: Callable[..., _Result], *task: object) -> Future[_Result]:
+        """Run `work(*task)` as soon as a process is free; `result` returns its result."""
+        with sigint_blocked():  # the workers are started here
+            others = set(multiprocessing.active_children())
+            future = self._started().submit(work, *task)
+            self._processes |= set(multiprocessing.active_children()) - others
+        return future
+
+    def result(self, future: Future[_Result]) -> _Result:
+        """The result of a task; ServiceError if its process was killed."""
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            doubt = "" if oom_kills() > self._kills else "?"
+            raise ServiceError(f"a worker process was killed (out of memory{doubt}): try fewer --jobs") from None
 
     def run(self, work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]]) -> Generator[_Result]:
         """Yield the result of `work(*task)` for each task, in order of completion.
 
         If the caller stops early, for example on Ctrl-C, all workers are killed; the next tasks start others.
         """
-        kills = oom_kills()
         try:
-            with sigint_blocked():  # the workers are started here
-                others = set(multiprocessing.active_children())
-                futures = [self._started().submit(work, *task) for task in tasks]
-                self._processes |= set(multiprocessing.active_children()) - others
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool:
-            self.close()
-            doubt = "" if oom_kills() > kills else "?"
-            raise ServiceError(f"a worker process was killed (out of memory{doubt}): try fewer --jobs") from None
+            for future in as_completed([self.submit(work, *task) for task in tasks]):
+                yield self.result(future)
         except BaseException:
-            for worker in self._processes:
-                worker.kill()
-            self.close()
+            self.kill()
             raise
 
+    def kill(self) -> None:
+        """Kill the workers, and drop their tasks; the next tasks start others."""
+        for worker in self._processes:
+            worker.kill()
+        self.close()
+
     def close(self) -> None:
-        """End the workers."""
+        """End the workers after their tasks."""
         if self._pool is not None:
             self._pool.shutdown()
         self._pool, self._processes = None, set()

@@ -94,6 +94,7 @@ def annotate(
         with Annotation(
             video, drawn, Settings.from_values(overrides), jobs=jobs, progress=lambda *done: _show(bar, *done)
         ) as annotation:
+            annotation.decode()
             files = _files(annotation, video, output, overwrite=overwrite)
             files.make_folder()
             write_keyframes(tables[0], annotation.keyframes)
