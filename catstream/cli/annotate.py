@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,11 +58,10 @@ def annotate(
 
     \b
     OUTPUT
-      NAME.ndjson, NAME.csv  the log of the tracks, for catstream export; unchecked
-                             boxes are doubtful
+      NAME.ndjson, NAME.csv  the log of the tracks, for catstream export, with
+                             checked (keyframe, checked or unchecked) and
+                             probability; unchecked boxes are doubtful
       keyframes.csv          all boxes: frame,object,x,y,w,h
-      checked.csv            frame,object,checked,probability; checked is
-                             keyframe, checked or unchecked
       next.csv               frames to look at, those with most expected errors
                              first: frame,object,errors
 
@@ -83,8 +79,8 @@ def annotate(
     if not drawn:
         raise click.UsageError("missing box: pass --box NAME@FRAME=X,Y,W,H or --boxes FILE.csv")
     # Checked before the work, which takes minutes.
-    tables = [output / name for name in ("keyframes.csv", "checked.csv", "next.csv")]
-    for table in tables:
+    boxes, following = output / "keyframes.csv", output / "next.csv"
+    for table in (boxes, following):
         if table.exists() and not overwrite:
             raise VideoError(f"{table} exists already: pass --overwrite, or another --output")
     bar = line_of(messages(), text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
@@ -97,13 +93,13 @@ def annotate(
             annotation.decode()
             files = _files(annotation, video, output, overwrite=overwrite)
             files.make_folder()
-            write_keyframes(tables[0], annotation.keyframes)
+            write_keyframes(boxes, annotation.keyframes)
             try:
                 annotation.track()
             except KeyboardInterrupt:
                 interrupted = True
             with INTERRUPTS.deferred():
-                _write(annotation, files, *tables[1:])
+                _write(annotation, files, following)
     _report(annotation)
     click.echo(f"results: {output}")
     if interrupted:
@@ -131,27 +127,16 @@ def _files(annotation: Annotation, video: str, output: Path, *, overwrite: bool)
     return files
 
 
-def _write(annotation: Annotation, files: RunFiles, checked: Path, following: Path) -> None:
-    """Write the log, and the tables of checked frames and of the frames to look at next."""
+def _write(annotation: Annotation, files: RunFiles, following: Path) -> None:
+    """Write the log, and the table of the frames to look at next."""
     from catstream.sinks.destinations import TrackedFrame
 
-    frames = [*zip(*annotation.tracks.values(), strict=True)]
     with files.opened("") as write:
-        for tracks in frames:
+        for tracks in zip(*annotation.tracks.values(), strict=True):
             write(TrackedFrame(list(tracks)))
-    checks = [
-        (track.frame, track.object, track.checked, f"{track.probability:.4f}") for each in frames for track in each
-    ]
-    _write_table(checked, ("frame", "object", "checked", "probability"), checks)
-    rows = [(frame, name, f"{errors:.1f}") for frame, name, errors in annotation.next_frames()]
-    _write_table(following, ("frame", "object", "errors"), rows)
-
-
-def _write_table(path: Path, header: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-    table = io.StringIO()
-    csv.writer(table, lineterminator="\n").writerows([header, *rows])
-    with writing(path, VideoError):
-        write_atomically(path, table.getvalue().encode())
+    rows = [f"{frame},{name},{errors:.1f}\n" for frame, name, errors in annotation.next_frames()]
+    with writing(following, VideoError):
+        write_atomically(following, "".join(["frame,object,errors\n", *rows]).encode())
 
 
 def _report(annotation: Annotation) -> None:

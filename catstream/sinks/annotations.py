@@ -2,7 +2,7 @@
 
 Frames have their numbers in the source. The image of a frame is NAME_000000.jpg, with the name of the log and the
 number of the frame; if a folder of images was tracked, it has the name that it has there. A doubtful box is marked,
-except in YOLO, which has no place for it.
+except in YOLO, which has no place for it; CVAT also has `checked` of an annotation.
 """
 
 from __future__ import annotations
@@ -39,11 +39,15 @@ _CVAT_HEAD = """<?xml version="1.0" encoding="utf-8"?>
 """
 _CVAT_LABEL = (
     "<label><name>{}</name><attributes><attribute><name>doubtful</name><mutable>True</mutable><input_type>checkbox"
-    "</input_type><default_value>false</default_value><values>false</values></attribute></attributes></label>"
+    "</input_type><default_value>false</default_value><values>false</values></attribute>{}</attributes></label>"
+)
+_CVAT_CHECKED = (
+    "<attribute><name>checked</name><mutable>True</mutable><input_type>select</input_type><default_value>unchecked"
+    "</default_value><values>unchecked\nchecked\nkeyframe</values></attribute>"
 )
 _CVAT_BOX = (
     '<box frame="{}" outside="{:d}" occluded="0" keyframe="1" xtl="{:.2f}" ytl="{:.2f}" xbr="{:.2f}" ybr="{:.2f}" '
-    'z_order="0"><attribute name="doubtful">{}</attribute></box>\n'
+    'z_order="0"><attribute name="doubtful">{}</attribute>{}</box>\n'
 )
 
 #: The classes in a data.yaml, as a list or by number, in brackets or one on each line.
@@ -108,6 +112,9 @@ def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None
 def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
     """Write `CVAT for video 1.1`: a key frame for each box, and one that is outside where the object disappears.
 
+    CVAT drops the boxes of a file that are no key frames, and interpolates. So those that a person drew in an
+    annotation are marked by the attribute `checked`.
+
     CVAT refuses a file with a frame that its video does not have, so a track that reaches the last frame of the source
     has no such end. If `about.frames` is None, this is the last frame of the log; returns a line that says so.
     """
@@ -119,16 +126,18 @@ def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
             objects.setdefault(place.number, []).append(place)
     note = "" if about.frames else "the video was not read: its last frame is assumed to be the last tracked one"
     end = about.frames or end
-    labels = map(escape, _numbers(frames, about))
+    checked = any(place.track.checked for places in objects.values() for place in places)
+    labels = (_CVAT_LABEL.format(escape(name), _CVAT_CHECKED if checked else "") for name in _numbers(frames, about))
     with path.open("w", encoding="utf-8") as file:
-        kinds = "\n".join(map(_CVAT_LABEL.format, labels))
+        kinds = "\n".join(labels)
         file.write(_CVAT_HEAD.format(name=escape(about.name), frames=end, labels=kinds, **_size(about)))
         for number, places in objects.items():
             file.write(f'<track id="{number - 1}" label="{escape(places[0].label)}" source="auto">\n')
             following = [*(place.track.source_frame for place in places[1:]), end]
             for place, after in zip(places, following, strict=True):
                 frame, (x, y, w, h) = place.track.source_frame, place.box
-                rest = x, y, x + w, y + h, str(place.track.doubtful).lower()
+                check = f'<attribute name="checked">{place.track.checked}</attribute>' if checked else ""
+                rest = x, y, x + w, y + h, str(place.track.doubtful).lower(), check
                 file.write(_CVAT_BOX.format(frame, False, *rest))
                 if frame + step < after:
                     file.write(_CVAT_BOX.format(frame + step, True, *rest))

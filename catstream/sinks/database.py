@@ -20,12 +20,14 @@ from catstream.sinks.destinations import About, Head, Origin, TrackedFrame
 from catstream.sinks.remote import Warnings
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
-#: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name.
+#: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name. But for an
+#: annotation, `checked` is '' and `probability` NULL.
 COLUMNS = {
     **{"frame": "INTEGER NOT NULL", "seq": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
     **{"x": "REAL", "y": "REAL", "w": "REAL", "h": "REAL", "score": "REAL NOT NULL"},
     **{"model_version": "INTEGER NOT NULL", "pts": "REAL", "object": "TEXT NOT NULL"},
     **{"began": "INTEGER NOT NULL", "doubtful": "INTEGER NOT NULL", "source_frame": "INTEGER NOT NULL"},
+    **{"checked": "TEXT NOT NULL", "probability": "REAL"},
 }
 _NAMES = ", ".join(COLUMNS)
 _TYPES = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
@@ -171,13 +173,14 @@ def rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:
         yield (
             *(track.frame, track.seq, track.time, track.state, *box, track.score),
             *(track.model_version, track.pts, track.object, track.began, int(track.doubtful), track.source_frame),
+            *(track.checked, track.probability),
         )
 
 
 def _track(row: tuple[Any, ...]) -> Track:
-    frame, seq, seconds, state, x, y, w, h, score, version, pts, name, began, doubtful, source = row
+    frame, seq, seconds, state, x, y, w, h, score, version, pts, name, began, doubtful, *rest = row
     box = None if x is None else Box(x, y, w, h)
-    return Track(seq, frame, seconds, state, box, score, version, pts, name, began, bool(doubtful), source)
+    return Track(seq, frame, seconds, state, box, score, version, pts, name, began, bool(doubtful), *rest)
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from catstream.base.names import UNNAMED, check_name
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, VideoError
 from catstream.jobs.job import Results
-from catstream.messages.kinds import State, Track
+from catstream.messages.kinds import Check, State, Track
 from catstream.sinks.database import read_database, read_database_head
 from catstream.sinks.destinations import (
     Head,
@@ -49,15 +49,16 @@ from catstream.video.source import is_live
 from catstream.wire.codec import decode_json
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
+_CHECKS: dict[str, Check] = {check: check for check in get_args(Check)}
 
 #: Stands for the objects of the frame before the first one: an object without a name is written last.
 _FIRST = frozenset({UNNAMED})
 
 _COLUMNS = (
     *("frame", "seconds", "state", "x", "y", "w", "h"),
-    *("score", "model_version", "object", "source_frame", "processing"),
+    *("score", "model_version", "object", "source_frame", "checked", "probability", "processing"),
 )
-_OPTIONAL = {"source_frame", "processing"}
+_OPTIONAL = {"source_frame", "checked", "probability", "processing"}
 
 
 class LineSink(ABC):
@@ -147,7 +148,10 @@ class StdoutSink(NdjsonSink):
 
 
 class CsvSink(LineSink):
-    """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known."""
+    """Tracks as rows of comma-separated values; `processing` is the time that the frame took, empty if not known.
+
+    `checked` and `probability` are empty but for an annotation.
+    """
 
     def first_line(self, _: Origin) -> str:
         return ",".join(_COLUMNS)
@@ -155,8 +159,11 @@ class CsvSink(LineSink):
     def line(self, track: Track, seconds: float) -> str:
         box = ",,," if track.box is None else ",".join(f"{side:.4f}" for side in track.box)
         took = "" if isnan(seconds) else f"{seconds:.6f}"
-        score = f"{track.score:.6f},{track.model_version}"
-        return f"{track.frame},{track.time:.6f},{track.state},{box},{score},{track.object},{track.source_frame},{took}"
+        probability = "" if track.probability is None else f"{track.probability:.6f}"
+        return (
+            f"{track.frame},{track.time:.6f},{track.state},{box},{track.score:.6f},{track.model_version},{track.object},"
+            f"{track.source_frame},{track.checked},{probability},{took}"
+        )
 
 
 #: The suffixes of all logs; of several, a run is continued after the first one that exists.
@@ -299,6 +306,8 @@ def _parse_row(row: Mapping[str, str]) -> tuple[Track, float]:
         model_version=_integer(row["model_version"]),
         object=check_name(row["object"]),
         source_frame=_integer(row.get("source_frame") or "-1"),
+        checked=_CHECKS[row.get("checked") or ""],
+        probability=_number(row["probability"]) if row.get("probability") else None,
     )
     return track, _number(row["processing"]) if row.get("processing") else nan
 

@@ -32,9 +32,9 @@ def test_annotate_writes_the_log_and_its_tables_and_continues_from_its_boxes(dem
     assert "all frames are checked" in output
     assert rows(out / "next.csv") == []
     assert len(rows(out / "keyframes.csv")) == 2
-    checked = rows(out / "checked.csv")
-    assert [row["checked"] for row in checked] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
-    assert all(0.96 <= float(row["probability"]) <= 1 for row in checked)
+    log = rows(out / "demo.csv")
+    assert [row["checked"] for row in log] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
+    assert all(0.96 <= float(row["probability"]) <= 1 for row in log)
 
 
 def test_the_log_of_an_annotation_is_exported_as_that_of_a_run(demo, succeed, tmp_path):
@@ -88,4 +88,4 @@ def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, mo
     code, _, errors = said("annotate", demo[0], "--box", f"@0={demo[1][0]}", "--output", tmp_path / "out")
     assert (code, errors) == (130, f"stopped: the results so far are in {tmp_path / 'out'}\n")
     assert len(rows(tmp_path / "out" / "keyframes.csv")) == 1
-    assert len(rows(tmp_path / "out" / "checked.csv")) == FRAMES
+    assert len(rows(tmp_path / "out" / "demo.csv")) == FRAMES

@@ -132,6 +132,16 @@ def test_cvat_has_a_keyframe_for_each_box_and_an_outside_one_after_the_last(tmp_
     assert (box.get("keyframe"), box.get("occluded"), box.get("z_order")) == ("1", "0", "0")
 
 
+def test_cvat_has_the_checks_of_an_annotation_as_an_attribute_of_every_keyframe(tmp_path):
+    checks = ("keyframe", "checked", "unchecked")
+    log = [TrackedFrame([present(frame, "anna", checked=check)]) for frame, check in enumerate(checks)]
+    root = ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(100, 80))).getroot()
+    boxes = [(box.get("keyframe"), box.findtext("attribute[@name='checked']")) for box in root.iter("box")]
+    assert boxes == [("1", check) for check in checks], "CVAT drops boxes that are no keyframes"
+    (values,) = (each.findtext("values") for each in root.iter("attribute") if each.findtext("name") == "checked")
+    assert {*values.split()} == {*checks}
+
+
 def test_yolo_has_a_file_for_each_frame_with_centres_in_parts_of_it(tmp_path):
     folder = made(tmp_path / "set", "yolo", [*ANNOTATED[:2], TrackedFrame([present(2, "", None)])], size=(100, 80))
     object_line, half = "0 0.252500 0.500000 0.305000 0.500000\n", "1 0.100000 0.500000 0.200000 0.500000\n"
