@@ -67,6 +67,7 @@ IMPORTERS = {
     ],
     "paho": ["catstream/sinks/mqtt_sink.py"],
     "mcap": ["catstream/sinks/mcap_sink.py"],
+    "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/base/settings.py", "catstream/fleet/spec.py"),
         *("catstream/client/registry.py", "catstream/fleet/registry.py"),

@@ -14,25 +14,23 @@ A message is one frame of msgpack, `[version, kind, object, run, fields]`:
 Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may take one kind of
 message, or that of one object.
 
-The bytes are decoded straight into the fields of their kind: what is not one of them is skipped, and takes no memory.
-A sender decodes what it sends, too, so that nothing leaves it that would be rejected on arrival.
+msgpack packs and unpacks the bytes, within limits on the length of every text, list and map and on the number of all
+entries; msgspec converts the values to the fields of their kind, and skips what is not one of them. A sender checks
+what it sends in the same way, so that nothing leaves it that would be rejected on arrival.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import field
-from functools import cache
-from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
+import msgpack
 import msgspec
 import numpy as np
 
 from catstream.errors import ProtocolError
 from catstream.messages.kinds import Position
-from catstream.messages.schema import Integer, Text, check_message
+from catstream.messages.schema import LONGEST_LIST, LONGEST_TEXT, Integer, Text, check_message
 from catstream.wire.channels import CHANNELS, REGISTRY
 
 Message = TypeVar("Message")
@@ -45,8 +43,9 @@ KINDS: dict[str, type] = {
     kind.__name__.lower(): kind for channel in (*CHANNELS.values(), REGISTRY) for kind in channel.messages
 } | {"position": Position}
 
-#: What is wrong with bytes: msgspec raises no other error for them.
-_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+_MOST_ENTRIES = 1 << 18  # of all lists and maps of a message, which take 25 MB at most; the schema allows 2**17
+_TOPIC_BYTES = 512  # that contain version, kind and object
+_BYTES = (bytes, memoryview)  # msgspec leaves them as they are; it would take a text for bytes, too
 
 
 class Topic(NamedTuple):
@@ -61,16 +60,36 @@ class _Envelope(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
     kind: Text
     object: Text
     run: Text
-    fields: msgspec.Raw
+    fields: Any
+
+
+class _Array(msgspec.Struct, forbid_unknown_fields=True):
+    dtype: Literal["<f4", "<f8"]
+    shape: Annotated[tuple[Integer, ...], msgspec.Meta(min_length=1, max_length=2)]
+    data: memoryview
+
+
+class _Entries:
+    """Counts the entries of the lists and maps of a message while it is unpacked."""
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def __call__(self, entries: Any) -> Any:
+        self._count += 1 + len(entries)
+        if self._count > _MOST_ENTRIES:
+            raise ValueError(f"it has more than {_MOST_ENTRIES} entries")
+        return entries
 
 
 def encode(message: object, run: str = "") -> bytes:
     """A message of a run as bytes; ProtocolError if it breaks its schema."""
     check_message(message)
     kind = type(message)
-    data = _ENCODER.encode((VERSION, kind.__name__.lower(), getattr(message, "object", ""), run, message))
-    _fields_in(_opened(data), kind)
-    return data
+    values = msgspec.to_builtins(message, builtin_types=_BYTES, enc_hook=_plain)
+    _convert(values, kind)
+    packed: bytes = msgpack.packb((VERSION, kind.__name__.lower(), getattr(message, "object", ""), run, values))
+    return packed
 
 
 def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
@@ -80,17 +99,16 @@ def decode(data: bytes | memoryview, *kinds: type[Message]) -> Message:
 
 def decode_with_run(data: bytes | memoryview, *kinds: type[Message]) -> tuple[Message, str]:
     """The same, and the run that the message is from."""
-    envelope = _opened(data)
+    envelope = _unpack(data)
+    if envelope.version != VERSION:
+        raise ProtocolError(
+            f"expected version {VERSION} of the protocol, got {envelope.version}: run the same catstream"
+        )
     if (kind := KINDS.get(envelope.kind)) not in kinds:
         expected = " or ".join(sorted(kind.__name__.lower() for kind in kinds))
         raise ProtocolError(f"expected {expected}, got {envelope.kind!r:.40}")
-    message: Message = _fields_in(envelope, kind)
-    if type(message) is not kind:
-        try:
-            message = msgspec.convert(message, kind, from_attributes=True, dec_hook=_array)
-        except msgspec.ValidationError as error:
-            raise ProtocolError(f"{envelope.kind}: {error}") from None
-        check_message(message)
+    message: Message = _convert(envelope.fields, kind)
+    check_message(message)
     if envelope.object != getattr(message, "object", ""):
         raise ProtocolError(f"{envelope.kind}: the envelope names another object, {envelope.object!r:.40}")
     return message, envelope.run
@@ -99,80 +117,63 @@ def decode_with_run(data: bytes | memoryview, *kinds: type[Message]) -> tuple[Me
 def opening(kind: type, about: str | None = None) -> bytes:
     """The bytes that every message of a kind begins with; of those about one object, if a name is given."""
     names = (kind.__name__.lower(),) if about is None else (kind.__name__.lower(), about)
-    return _ENCODER.encode((VERSION, *names, *[None] * (4 - len(names))))[: -(4 - len(names))]  # nil is one byte
+    packed: bytes = msgpack.packb((VERSION, *names, *[None] * (4 - len(names))))
+    return packed[: -(4 - len(names))]  # nil is one byte
 
 
 def topic_of(data: bytes | memoryview) -> Topic:
-    """The topic of a message; of no kind if it is not a message.
+    """The topic of a message, by its first bytes; of no kind if they do not begin a message.
 
     >>> from catstream.messages.kinds import End
     >>> topic_of(encode(End(1, "over")))
     Topic(kind='end', object='')
     """
+    unpacker = msgpack.Unpacker(max_buffer_size=_TOPIC_BYTES)
+    unpacker.feed(data[:_TOPIC_BYTES])
     try:
-        envelope = _opened(data)
-    except ProtocolError:
-        return Topic("", "")
-    return Topic(envelope.kind, envelope.object)
+        unpacker.read_array_header()
+        match [unpacker.unpack() for _ in range(3)]:
+            case [int(version), str(kind), str(about)] if version == VERSION:
+                return Topic(kind, about)
+    except (ValueError, msgpack.UnpackException):
+        pass
+    return Topic("", "")
 
 
 def decode_json(data: bytes, kind: type[Message]) -> Message:
     """A message without arrays, from a JSON object of its fields; ProtocolError if it is anything else."""
     try:
         return msgspec.json.decode(data, type=kind)
-    except _ERRORS as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise ProtocolError(f"expected {kind.__name__.lower()} in JSON, got {len(data)} bytes: {error}") from None
 
 
-def _opened(data: bytes | memoryview) -> _Envelope:
+def _unpack(data: bytes | memoryview) -> _Envelope:
+    """Unpack a message. msgpack does not nest deeper than 1024 lists and maps, and copies each array once."""
+    entries = _Entries()
     try:
-        envelope = _OPENER.decode(data)
-    except _ERRORS as error:
-        raise ProtocolError(f"expected [version, kind, object, run, fields] in msgpack: {error}") from None
-    if envelope.version != VERSION:
+        values = msgpack.unpackb(
+            data,
+            list_hook=entries,
+            object_hook=entries,
+            max_str_len=4 * LONGEST_TEXT,  # bytes of UTF-8
+            max_array_len=LONGEST_LIST,
+            max_map_len=LONGEST_LIST,
+            max_ext_len=0,
+        )
+        return msgspec.convert(values, _Envelope)
+    except ValueError as error:  # msgpack raises no other, and that of msgspec is one
         raise ProtocolError(
-            f"expected version {VERSION} of the protocol, got {envelope.version}: run the same catstream"
-        )
-    return envelope
+            f"expected [version, kind, object, run, fields] in msgpack: {str(error) or type(error).__name__}"
+        ) from None
 
 
-def _fields_in(envelope: _Envelope, kind: type) -> Any:
-    """The fields of a message of this kind, in the form that `_form` gives it."""
+def _convert(values: Any, kind: type[Message]) -> Message:
+    """The message of a kind that has these values."""
     try:
-        return _decoder(kind).decode(envelope.fields)
-    except _ERRORS as error:
-        raise ProtocolError(f"{envelope.kind}: {error}") from None
-
-
-@cache
-def _decoder(kind: type) -> msgspec.msgpack.Decoder[Any]:
-    return msgspec.msgpack.Decoder(_form(kind))
-
-
-def _form(hint: Any) -> Any:
-    """The type into which bytes are decoded for a kind of message, or for a field of it.
-
-    It has an `_Array` for each array: msgspec would take any value for an array, however deeply nested.
-    """
-    if hint is np.ndarray:
-        return _Array
-    if dataclasses.is_dataclass(hint):
-        hints = get_type_hints(hint, include_extras=True)
-        forms = {name: _form(each) for name, each in hints.items()}
-        if forms == hints:
-            return hint
-        return dataclasses.make_dataclass(
-            hint.__name__,  # type: ignore[union-attr]
-            [
-                (each.name, forms[each.name], field(default=each.default, default_factory=each.default_factory))
-                for each in dataclasses.fields(hint)
-            ],
-        )
-    if (origin := get_origin(hint)) is Annotated:
-        return Annotated[(_form(hint.__origin__), *hint.__metadata__)]
-    if origin in (dict, Union, UnionType):
-        return (dict if origin is dict else Union)[tuple(map(_form, get_args(hint)))]
-    return hint
+        return msgspec.convert(values, kind, builtin_types=_BYTES, dec_hook=_array)
+    except msgspec.ValidationError as error:
+        raise ProtocolError(f"{kind.__name__.lower()}: {error}") from None
 
 
 def _plain(value: object) -> dict[str, object]:
@@ -183,18 +184,9 @@ def _plain(value: object) -> dict[str, object]:
     raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
-class _Array(msgspec.Struct, forbid_unknown_fields=True):
-    dtype: Literal["<f4", "<f8"]
-    shape: Annotated[tuple[Integer, ...], msgspec.Meta(min_length=1, max_length=2)]
-    data: memoryview
-
-
 def _array(_: type, value: Any) -> np.ndarray:
-    """The array that `_plain` converted."""
-    if math.prod(value.shape) * np.dtype(value.dtype).itemsize != len(value.data):
-        raise ValueError(f"{len(value.data)} bytes are not an array of {value.dtype} and shape {value.shape}")
-    return np.frombuffer(bytes(value.data), value.dtype).reshape(value.shape)  # a copy, which begins at a word
-
-
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
-_OPENER = msgspec.msgpack.Decoder(_Envelope)
+    """The array that `_plain` converted, in the same memory."""
+    array = msgspec.convert(value, _Array, builtin_types=_BYTES)
+    if math.prod(array.shape) * np.dtype(array.dtype).itemsize != len(array.data):
+        raise ValueError(f"{len(array.data)} bytes are not an array of {array.dtype} and shape {array.shape}")
+    return np.frombuffer(array.data, array.dtype).reshape(array.shape)

@@ -28,7 +28,7 @@ from catstream.messages.kinds import (
     Track,
     TrainingRows,
 )
-from catstream.messages.schema import LARGEST_INTEGER, LONGEST_TEXT, Array, Field, fields
+from catstream.messages.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, Array, Field, fields
 from catstream.video import rendered
 from catstream.wire.channels import CHANNELS
 from catstream.wire.codec import KINDS, VERSION, decode, encode
@@ -153,6 +153,19 @@ def test_every_message_that_the_schema_allows_arrives_as_it_was_sent(message):
     np.testing.assert_equal(dataclasses.asdict(arrived), dataclasses.asdict(message))
 
 
+@pytest.mark.parametrize("kind", ["an array", "bytes"])
+def test_arrays_and_bytes_are_copied_once_on_arrival(kind):
+    rows = features(TrainingRows.labelled(np.zeros((512, 4096)), 1))
+    message = rows if kind == "an array" else dataclasses.replace(EXAMPLES["modelfile"], file=bytes(8 << 20))
+    data = encode(message)
+    tracemalloc.start()
+    try:
+        decode(data, type(message))
+        assert tracemalloc.get_traced_memory()[1] < 9 << 20
+    finally:
+        tracemalloc.stop()
+
+
 def test_arrays_arrive_read_only():
     arrived = decode(encode(EXAMPLES["features"]), Features)
     with pytest.raises(ValueError, match="read-only"):
@@ -242,6 +255,15 @@ REJECTED = {
     "a list longer than any message's": msgpack.packb([VERSION, "end", "", "", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * (LONGEST_TEXT + 1)),
     "an extension type": b"\x95\x04\xa3end\xa0\xa0\xd4\x05\x00",
+    "an extension type without bytes": b"\x95\x04\xa3end\xa0\xa0\xc7\x00\x05",
+    "a text for bytes": packed("modelfile", file="YSBmaWxl"),
+    "a text for the bytes of an array": retrained(labels=plain("<f4", [3], "AAAA" * 4)),
+    "bytes for a text": packed("end", reason=b"over"),
+    "a map for a list": packed("track", box={"x": 1.0, "y": 2.0, "w": 3.0, "h": 4.0}),
+    "a list for a map": packed("health", counters=[1.0]),
+    "a list as a name in a map": b"\x95\x04\xa3end\xa0\xa0\x81\x90\x01",
+    "a text that is not UTF-8": b"\x95\x04\xa3end\xa0\xa0\x81\xa6reason\xa1\xff",
+    "a byte that msgpack does not use": b"\x95\x04\xa3end\xa0\xa0\xc1",
     "a timestamp": b"\x95\x04\xa3end\xa0\xa0\xd6\xff\x00\x00\x00\x00",
     "lists in lists, as version": b"\x95" + b"\x91" * 1015 + b"\x90\xa3end\xa0\xa0\x80",
     "lists in lists, as kind": b"\x95\x04" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80",
@@ -274,23 +296,34 @@ def test_a_message_that_would_be_rejected_on_arrival_is_not_sent(message):
         encode(message)
 
 
-def nested(bytes_of_it: int) -> bytes:
-    """As msgpack, a list of lists in lists: objects of some bytes each, if they are made."""
-    inner = b"\x91" * 255 + b"\x80"
-    return b"\xdd" + struct.pack(">I", bytes_of_it // 256) + inner * (bytes_of_it // 256)
+def many(entry: bytes) -> bytes:
+    """As msgpack, 255 lists of 255 lists of eight entries: an object each, if they are made."""
+    entry = b"\x98" + entry * 8
+    for _ in range(2):
+        entry = b"\xdc\x00\xff" + entry * 255
+    return entry
 
 
-@pytest.mark.parametrize("place", ["a field that is unknown", "an array", "a number"])
-def test_lists_in_lists_take_no_memory(place):
-    field = {"a field that is unknown": b"colour", "an array": b"weights", "a number": b"seq"}[place]
-    bomb = b"\x95\x04\xa5model\xa0\xa0\x81" + bytes([0xA0 + len(field)]) + field + nested(4 << 20)
+BOMBS = {"lists": b"\x90", "maps": b"\x80", "lists of maps": b"\x91\x81\xa1x\x80", "texts": b"\xa2xy"}
+
+
+@pytest.mark.parametrize("place", ["colour", "weights", "version"])
+@pytest.mark.parametrize("bomb", BOMBS.values(), ids=BOMBS)
+def test_many_entries_take_little_memory_whatever_field_they_are_in(bomb, place):
+    data = b"\x95\x04\xa5model\xa0\xa0\x81" + msgpack.packb(place) + many(bomb)
     tracemalloc.start()
     try:
-        with pytest.raises(ProtocolError):
-            decode(bomb, *ALL)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+        with pytest.raises(ProtocolError, match="entries"):
+            decode(data, *ALL)
+        assert tracemalloc.get_traced_memory()[1] < 32 << 20
     finally:
         tracemalloc.stop()
+
+
+def test_as_many_entries_arrive_as_the_schema_allows():
+    names = [f"o{i}" for i in range(LONGEST_LIST)]
+    health = Health("detector", 0.0, objects={name: dict.fromkeys(names, 1.5) for name in names})
+    assert decode(encode(health), Health) == health
 
 
 SHAPES = st.lists(st.integers(-2, 2**64 - 1) | st.integers(0, 3), max_size=3)
