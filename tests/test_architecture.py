@@ -52,7 +52,7 @@ IMPORTERS = {
         "catstream/processes/detector.py",
         "catstream/sinks/events.py",
     ],
-    "filterpy": ["catstream/numerics/kalman.py"],
+    "filterpy": ["catstream/training/motion_em.py"],
     "numba": ["catstream/features/kernels.py"],
     "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
     "safetensors": ["catstream/messages/storage.py"],

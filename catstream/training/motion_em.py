@@ -10,7 +10,7 @@ import numpy as np
 
 from catstream.base.arrays import Bool, Float64
 from catstream.messages.kinds import Motion
-from catstream.numerics.kalman import OBSERVATION, TRANSITION, constant_velocity
+from catstream.numerics.kalman import OBSERVATION, TRANSITION
 
 FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
@@ -68,8 +68,11 @@ def _smooth(
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
-    kalman = constant_velocity(mean, covariance, motion.process, motion.observation)
-    kalman.inv = _inverse
+    from filterpy.kalman import KalmanFilter  # most of a second, with scipy.stats
+
+    kalman = KalmanFilter(dim_x=4, dim_z=2)
+    kalman.F, kalman.H, kalman.Q, kalman.R = TRANSITION, OBSERVATION, motion.process, motion.observation
+    kalman.x, kalman.P, kalman.inv = mean, covariance, _inverse
     measured = [centre if present else None for centre, present in zip(centres, _present(centres), strict=True)]
     states, covariances, _, predicted = kalman.batch_filter(measured, update_first=True)
     # The smoother asks for the inverse of each predicted covariance, the newest first: one call for all is faster.
