@@ -28,7 +28,7 @@ LEVELS = [
     {"tracker", "processes", "web"},
     {"pipeline", "backbone", "annotation"},
     {"reports"},
-    {"evaluation"},
+    {"evaluation", "batch"},
     {"finding", "loadtest", "fleet"},
     {"cli"},
 ]
@@ -75,6 +75,7 @@ IMPORTERS = {
         *("catstream/processes/decisions.py", "catstream/compression/forest.py"),
         *("catstream/jobs/job.py", "catstream/evaluation/datasets.py"),
         *("catstream/finding/results.py", "catstream/cli/attach.py", "catstream/sinks/destinations.py"),
+        "catstream/batch.py",
     ],
     "threadpoolctl": ["catstream/base/threads.py", "catstream/reports/provenance.py"],
     "psutil": ["catstream/loadtest/latency.py"],

@@ -41,6 +41,11 @@ def parse_keyframe(text: str) -> Keyframe:
         return name, int(frame), _box(box)
 
 
+def format_keyframe(name: str, frame: int, box: Box | None) -> str:
+    """Return the text that `parse_keyframe` parses."""
+    return f"{name}@{frame}={ABSENT if box is None else ','.join(f'{side:.10g}' for side in box)}"
+
+
 def read_keyframes(path: Path) -> list[Keyframe]:
     """Read a CSV file with the columns frame, object, x, y, w, h; VideoError if it cannot be read or is malformed."""
     try:
@@ -49,17 +54,19 @@ def read_keyframes(path: Path) -> list[Keyframe]:
         raise VideoError(
             f"cannot read the boxes in {str(path)!r} ({error}): pass a CSV file {','.join(_HEADER)}"
         ) from None
-    keyframes = []
-    for line, row in enumerate(rows, start=2):
-        try:
-            box = ABSENT if row["x"] == ABSENT else ",".join(row[side] for side in "xywh")
-            keyframes.append((check_name(row["object"]), int(row["frame"]), _box(box)))
-        except (KeyError, TypeError, ValueError):
-            raise VideoError(
-                f"{str(path)!r}, line {line}: expected the columns {','.join(_HEADER)} with a number of a frame, and a "
-                f"box or {ABSENT!r} in x"
-            ) from None
-    return keyframes
+    return [parse_row(path, line, row) for line, row in enumerate(rows, start=2)]
+
+
+def parse_row(path: Path, line: int, row: Mapping[str, str]) -> Keyframe:
+    """Parse a row of a CSV file, by the names of its columns; VideoError if it is malformed."""
+    try:
+        box = ABSENT if row["x"] == ABSENT else ",".join(row[side] for side in "xywh")
+        return check_name(row["object"]), int(row["frame"]), _box(box)
+    except (KeyError, TypeError, ValueError):
+        raise VideoError(
+            f"{str(path)!r}, line {line}: expected the columns {','.join(_HEADER)} with a number of a frame, and a "
+            f"box or {ABSENT!r} in x"
+        ) from None
 
 
 def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, Box | None]]) -> None:

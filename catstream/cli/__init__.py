@@ -20,6 +20,7 @@ from catstream.errors import CatstreamError
 COMMANDS = {
     "track": ("track", "Track objects in a video."),
     "annotate": ("annotate", "Track objects between boxes at keyframes, and check the tracks."),
+    "batch": ("batch", "Track objects in many videos."),
     "demo": ("measure", "Track an object in a rendered demo video."),
     "find": ("models", "Find the objects of saved models in videos, folders and images."),
     "evaluate": ("measure", "Measure accuracy on annotated sequences, also of other trackers."),

@@ -13,7 +13,7 @@ from catstream.cli.options import PATH, with_overwrite
 from catstream.cli.write import with_table
 from catstream.errors import VideoError
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, About, Head
+from catstream.sinks.destinations import EXPORTS, About, Head, Row
 from catstream.sinks.track_log import LOGS, Log, is_log
 from catstream.video.source import VIDEOS, is_live, open_source
 
@@ -79,7 +79,8 @@ def export(
     """Convert the log of a run to another format.
 
     LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream
-    sink`. The extension of DEST or --format selects the format. A folder gets
+    sink`, or the folder of `catstream batch`, whose logs become one data set:
+    yolo, coco, otb, got10k or vot. The extension of DEST or --format selects the format. A folder gets
     files for each object, such as NAME-OBJECT.txt; NAME is that of LOG. Frames
     have their numbers in the source. Only CSV stores processing times; CSV
     lacks the `doubtful` flag and the frame in which a reused name began.
@@ -101,19 +102,34 @@ def export(
         raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
     if images and row is not EXPORTS["yolo"]:
         raise click.UsageError("--images requires --format yolo")
-    if not is_log(log) or not log.is_file():
-        problem = "is not the log of a run" if log.exists() else "does not exist"
-        raise VideoError(f"{log} {problem}: pass one of a run's files, {', '.join(LOGS)}")
+    logs = _logs(log, row)
     destinations.check_export(dest, row, overwrite=overwrite, append=append, log=log)
-    content = Log(log, skip_damaged=skip_damaged)
-    if next(content.frames(), None) is None:
-        raise VideoError(f"{log} contains no tracks")
-    about = About(log.stem, label=label, head=content.head() or Head(), classes=classes, append=append)
-    about = _with_source(about, log, size, required=images, useful=row.images)
-    if note := destinations.export(content, dest, row, about):
-        click.echo(note, err=True)
-    if content.damaged:
-        click.echo(f"{counted(content.damaged, 'damaged line')} of {log} skipped", err=True)
+    for path in logs:
+        content = Log(path, skip_damaged=skip_damaged)
+        if next(content.frames(), None) is None:
+            raise VideoError(f"{path} contains no tracks")
+        about = About(path.stem, label=label, head=content.head() or Head(), classes=classes, append=append)
+        about = _with_source(about, path, size, required=images, useful=row.images)
+        if note := destinations.export(content, dest, row, about):
+            click.echo(note, err=True)
+        if content.damaged:
+            click.echo(f"{counted(content.damaged, 'damaged line')} of {path} skipped", err=True)
+        append = True
+
+
+def _logs(path: Path, row: Row) -> list[Path]:
+    """The log, or the NDJSON logs in a folder; VideoError if there is none, or the format holds one video only."""
+    if not path.is_dir():
+        if not is_log(path) or not path.is_file():
+            problem = "is not the log of a run" if path.exists() else "does not exist"
+            raise VideoError(f"{path} {problem}: pass one of a run's files, {', '.join(LOGS)}")
+        return [path]
+    if not row.appends:
+        formats = ", ".join(name for name, other in EXPORTS.items() if other.appends)
+        raise VideoError(f"{path} is a folder, and this format holds one video: pass --format, one of {formats}")
+    if not (logs := sorted(path.glob("*.ndjson"))):
+        raise VideoError(f"{path} contains no .ndjson file: pass the output folder of a batch")
+    return logs
 
 
 def _with_source(about: About, log: Path, size: str | None, *, required: bool, useful: bool) -> About:

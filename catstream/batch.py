@@ -1,0 +1,280 @@
+"""Many videos: boxes in a table, and the tracks of each video, which one process computes.
+
+If each object has one box, the video is tracked frame by frame from the first of them to its end. If an object has
+boxes in several frames, the video is annotated: `catstream.annotate` tracks between them, and checks the frames.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from catstream.annotation.annotation import Annotation
+from catstream.annotation.keyframes import Keyframe, by_object, format_keyframe, parse_row
+from catstream.base.box import Box
+from catstream.base.files import write_atomically, writing
+from catstream.base.settings import Settings
+from catstream.base.text import listed
+from catstream.base.threads import one_thread
+from catstream.base.workers import run_tasks
+from catstream.errors import BoxError, CatstreamError, ServiceError, VideoError
+from catstream.jobs.job import Results
+from catstream.messages.kinds import Track
+from catstream.multi import MultiTracker
+from catstream.sinks.destinations import Head, Origin, TrackedFrame
+from catstream.sinks.track_log import RunFiles, places_of
+from catstream.video.source import open_source
+
+#: Called during the work with the number of finished frames, and of all; None if that is unknown.
+Progress = Callable[[int, int | None], object]
+
+
+class Video(NamedTuple):
+    """A video of a batch.
+
+    file       its path as in the table
+    path       its absolute path
+    name       of its results: `file` without its suffix, with _ for each separator
+    keyframes  boxes of each object, by name and frame
+    """
+
+    file: str
+    path: Path
+    name: str
+    keyframes: Mapping[str, Mapping[int, Box | None]]
+
+    @property
+    def boxes(self) -> str:
+        """All boxes in one line."""
+        drawn = ((name, frame, box) for name, boxes in self.keyframes.items() for frame, box in boxes.items())
+        return " ".join(format_keyframe(*keyframe) for keyframe in drawn)
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A row of batch.csv: the result of a video.
+
+    objects   number of objects
+    frames    number of frames with a track
+    tracks    number of tracks: one for each object and frame
+    present   tracks with a box
+    doubtful  tracks that should be looked at
+    checked   tracks that are keyframes or checked
+    error     reason why the video was not tracked to its end; empty if it was
+    boxes     `Video.boxes`
+    """
+
+    video: str
+    objects: int = 0
+    frames: int = 0
+    tracks: int = 0
+    present: int = 0
+    doubtful: int = 0
+    checked: int = 0
+    error: str = ""
+    boxes: str = ""
+
+    def add(self, tracks: Sequence[Track]) -> Summary:
+        """Return the summary with the tracks of a frame."""
+        return replace(
+            self,
+            frames=self.frames + 1,
+            tracks=self.tracks + len(tracks),
+            present=self.present + sum(track.box is not None for track in tracks),
+            doubtful=self.doubtful + sum(track.doubtful for track in tracks),
+            checked=self.checked + sum(track.checked in ("keyframe", "checked") for track in tracks),
+        )
+
+
+def read_videos(table: Path) -> list[Video]:
+    """Read the videos of a table with the columns file, object, x, y, w, h, and optionally frame, by default 0.
+
+    Paths are relative to the folder of the table. An empty object has no name; `absent` in x is no box.
+
+    Raises
+    ------
+    VideoError
+        If the table cannot be read, a column is missing, a value is invalid, or two videos have the same name.
+    BoxError
+        If an object has two boxes in one frame.
+    """
+    try:
+        rows = list(csv.DictReader(table.read_text(encoding="utf-8-sig").splitlines(), restval=""))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise VideoError(
+            f"cannot read the boxes in {str(table)!r} ({error}): pass a CSV file file,object,x,y,w,h"
+        ) from None
+    if not rows:
+        raise VideoError(f"{str(table)!r} has no row: pass a CSV file file,object,x,y,w,h with a row for each box")
+    boxes: dict[str, list[Keyframe]] = {}
+    for line, row in enumerate(rows, start=2):
+        if not row.get("file"):
+            raise VideoError(f"{str(table)!r}, line {line}: expected the path of a video in the column file")
+        boxes.setdefault(row["file"], []).append(parse_row(table, line, row | {"frame": row.get("frame") or "0"}))
+    videos = []
+    for file, keyframes in boxes.items():
+        name = "_".join(part for part in Path(file).with_suffix("").parts if part not in ("/", "..", "."))
+        try:
+            videos.append(Video(file, (table.parent / file).absolute(), name, by_object(keyframes)))
+        except BoxError as error:
+            raise BoxError(f"{file}: {error}") from None
+    names = [video.name for video in videos]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise VideoError(f"several videos would have the results {listed(twice)}: rename their files")
+    return videos
+
+
+def check_results(videos: Iterable[Video], output: Path) -> None:
+    """Raise VideoError if a file of the results of a video exists."""
+    for video in videos:
+        _files(video, output, Head(), overwrite=False)
+
+
+def track_video(video: Video, output: Path, settings: Settings, progress: Progress) -> Summary:
+    """Track the objects of a video, and write their tracks to NAME.ndjson and NAME.csv in `output`.
+
+    An error is in the summary; the tracks up to it are in the files. Existing files are replaced.
+    """
+    summary = Summary(video.file, len(video.keyframes), boxes=video.boxes)
+    method = _annotated if any(len(boxes) > 1 for boxes in video.keyframes.values()) else _tracked
+    try:
+        with one_thread(opencv=True), ExitStack() as stack:
+            head, frames = method(video, settings, progress, stack)
+            files = _files(video, output, head, overwrite=True)
+            files.make_folder()
+            write = stack.enter_context(files.opened(""))
+            for frame in frames:
+                write(frame)
+                summary = summary.add(frame.tracks)
+    except CatstreamError as error:
+        return replace(summary, error=str(error))
+    return summary
+
+
+def track_videos(
+    videos: Sequence[Video], output: Path, settings: Settings, jobs: int, counts: Path
+) -> Generator[tuple[Video, Summary]]:
+    """Track videos in `jobs` processes, and yield each with its summary once it has ended.
+
+    If a process is killed, for example because memory is exhausted, the remaining videos are tracked one by one.
+
+    counts : file of the progress, which is made here: int64 (videos, 2), the finished frames, and all or 0
+    """
+    np.zeros((len(videos), 2), np.int64).tofile(counts)
+    tasks = {video.name: (number, video, output, settings, counts) for number, video in enumerate(videos)}
+    try:
+        for name, summary in run_tasks(_work, [*tasks.values()], jobs):
+            yield tasks.pop(name)[1], summary
+    except ServiceError as error:
+        for _, video, *_ in [*tasks.values()]:
+            try:
+                ((_, summary),) = run_tasks(_work, [tasks[video.name]], 1)
+            except ServiceError:
+                summary = Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
+            yield video, summary
+
+
+def _work(number: int, video: Video, output: Path, settings: Settings, counts: Path) -> tuple[str, Summary]:
+    progress = np.memmap(counts, np.int64, "r+").reshape(-1, 2)
+
+    def show(done: int, total: int | None) -> None:
+        progress[number] = done, total or 0
+
+    return video.name, track_video(video, output, settings, show)
+
+
+def read_summaries(path: Path) -> list[Summary]:
+    """Read a file that `write_summaries` wrote; none if it does not exist, VideoError if it is not one."""
+    if not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [msgspec.convert(row, Summary, strict=False) for row in csv.DictReader(file)]
+    except (OSError, UnicodeDecodeError, csv.Error, msgspec.ValidationError) as error:
+        raise VideoError(f"{path} is not the table of a batch ({error}): pass another --output") from None
+
+
+def write_summaries(path: Path, summaries: Iterable[Summary]) -> None:
+    """Write the rows of batch.csv, atomically."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow([field.name for field in fields(Summary)])
+    rows.writerows(map(astuple, summaries))
+    with writing(path, VideoError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, text.getvalue().encode(errors="surrogateescape"))
+
+
+def _files(video: Video, output: Path, head: Head, *, overwrite: bool) -> RunFiles:
+    """The files of a video; VideoError if they exist, unless `overwrite`, or cannot be written."""
+    files = RunFiles(Origin(str(video.path), head=head), output, places_of(video.name, Results(output=output)))
+    files.check(overwrite=overwrite, earlier=[])
+    return files
+
+
+def _tracked(
+    video: Video, settings: Settings, progress: Progress, stack: ExitStack
+) -> tuple[Head, Iterator[TrackedFrame]]:
+    """Track the objects of a video, each from its only box on; the same tracks as of `catstream track` in lockstep."""
+    begins: dict[int, dict[str, Box]] = {}
+    for name, boxes in video.keyframes.items():
+        for frame, box in boxes.items():
+            if box is None:
+                raise BoxError(f"{name or 'the object'} has no box: pass its box in at least one frame")
+            begins.setdefault(frame, {})[name] = box
+    first = min(begins)
+    source = stack.enter_context(open_source(str(video.path), part=slice(first, None), settings=settings.run))
+    settings = settings.for_length(source.frames)
+    head = Head(
+        source=str(video.path),
+        size=source.size,
+        rate=source.rate,
+        frames=source.frames,
+        start=first,
+        settings=tuple(settings.changed()),
+        boxes=begins[first],
+    )
+
+    def frames() -> Iterator[TrackedFrame]:
+        tracker = MultiTracker(settings)
+        for frame in source:
+            begin = begins.pop(number := frame.number + first, {})
+            if frame.number == 0:
+                tracker.init(frame.image, begin, frame.time)
+            else:
+                tracker.update(frame.image, time=frame.time, begin=begin)
+            progress(frame.number + 1, source.frames)
+            yield TrackedFrame([replace(track, source_frame=number) for track in tracker.tracks.values()])
+        for frame_number, boxes in begins.items():
+            raise BoxError(f"{listed(boxes)}: frame {frame_number} is not in the video, which has {number + 1} frames")
+
+    return head, frames()
+
+
+def _annotated(
+    video: Video, settings: Settings, progress: Progress, stack: ExitStack
+) -> tuple[Head, Iterator[TrackedFrame]]:
+    """Track the objects of a video between their boxes."""
+
+    def show(_: str, done: int, total: int | None) -> None:
+        progress(done, total)
+
+    annotation = stack.enter_context(Annotation(str(video.path), video.keyframes, settings, jobs=1, progress=show))
+    annotation.track()
+    frames = annotation.frames
+    head = Head(
+        source=str(video.path),
+        size=frames.size,
+        rate=frames.rate,
+        frames=len(frames),
+        settings=tuple(annotation.settings.changed()),
+    )
+    return head, (TrackedFrame(list(tracks)) for tracks in zip(*annotation.tracks.values(), strict=True))

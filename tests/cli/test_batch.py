@@ -1,0 +1,154 @@
+"""`catstream batch`: the logs of many videos, what is not tracked again, and one data set of all."""
+
+import csv
+import json
+import signal
+from dataclasses import replace
+
+import psutil
+import pytest
+
+from catstream import MultiTracker
+from catstream.sinks.track_log import Log
+from catstream.video.source import open_source
+
+FRAMES = 12
+
+
+@pytest.fixture
+def demo(demo_video, tmp_path):
+    """The boxes of a demo video, which is two/cam.mp4 and, cut off, broken.mp4 in a folder."""
+    video, boxes = demo_video(FRAMES)
+    (tmp_path / "two").mkdir()
+    (tmp_path / "two" / "cam.mp4").write_bytes(video.read_bytes())
+    (tmp_path / "broken.mp4").write_bytes(video.read_bytes()[:1000])
+    return boxes
+
+
+def table(folder, *rows):
+    path = folder / "boxes.csv"
+    path.write_text("\n".join(["file,object,x,y,w,h,frame", *rows]) + "\n")
+    return path
+
+
+def summaries(folder):
+    with (folder / "batch.csv").open(newline="") as file:
+        return {row["video"]: row for row in csv.DictReader(file)}
+
+
+@pytest.fixture
+def batch(said, tmp_path):
+    """Runs a batch with results in out: its exit status, and the rows of batch.csv."""
+
+    def run(*rows):
+        code, *_ = said("batch", table(tmp_path, *rows), "--output", tmp_path / "out", "--jobs", 1)
+        return code, summaries(tmp_path / "out")
+
+    return run
+
+
+def test_a_video_that_fails_does_not_stop_the_others(demo, batch, tmp_path):
+    boxes = f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},", f"two/cam.mp4,ben,{demo[2]},2"
+    code, rows = batch(*boxes)
+    assert code == 1
+    assert "not a video that can be read" in rows["broken.mp4"]["error"]
+    assert (rows["two/cam.mp4"]["frames"], rows["two/cam.mp4"]["tracks"]) == ("12", "22")
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files == {"batch.csv", "two_cam.csv", "two_cam.ndjson"}
+
+
+def test_an_object_with_one_box_is_tracked_as_by_a_tracker_from_its_frame_on(demo, batch, tmp_path):
+    batch(f"two/cam.mp4,anna,{demo[3]},3")
+    log = Log(tmp_path / "out" / "two_cam.ndjson")
+    tracker, expected = MultiTracker(), []
+    with open_source(str(tmp_path / "two" / "cam.mp4"), part=slice(3, None)) as source:
+        for frame in source:
+            if frame.number == 0:
+                tracker.init(frame.image, {"anna": demo[3]}, frame.time)
+            else:
+                tracker.update(frame.image, time=frame.time)
+            expected.append(replace(tracker.tracks["anna"], source_frame=frame.number + 3))
+    assert [track for frame in log for track in frame.tracks] == expected
+    assert (log.head().start, log.head().source) == (3, str(tmp_path / "two" / "cam.mp4"))
+
+
+def test_only_videos_that_failed_or_have_other_boxes_are_tracked_again(demo, batch, demo_video, tmp_path):
+    boxes, log = [f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},"], tmp_path / "out" / "two_cam.ndjson"
+    batch(*boxes)
+    first = log.stat()
+    (tmp_path / "broken.mp4").write_bytes(demo_video(FRAMES)[0].read_bytes())
+    code, rows = batch(*boxes)
+    assert (code, log.stat()) == (0, first)
+    assert not any(row["error"] for row in rows.values())
+
+    code, rows = batch(boxes[1], f"two/cam.mp4,anna,{demo[-1]},{FRAMES - 1}")
+    assert log.stat() != first
+    assert rows["two/cam.mp4"]["checked"] == str(FRAMES)
+
+
+def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
+    (tmp_path / "two_cam.ndjson").touch()
+    boxes = table(tmp_path, f"two/cam.mp4,anna,{demo[0]},")
+    assert "two_cam.ndjson exists already" in fail("batch", boxes, "--output", tmp_path)
+    assert not (tmp_path / "batch.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "has no row"),
+        (["a.mp4,anna,1,2,30,x,0"], "line 2: expected the columns"),
+        ([",anna,1,2,30,40,0"], "line 2: expected the path of a video"),
+        (["a.mp4,anna,1,2,30,40,0", "a.mp4,anna,1,2,30,40,0"], "a.mp4: anna has two boxes in frame 0"),
+        (["a/b.mp4,,1,2,30,40,0", "a_b.avi,,1,2,30,40,0"], "several videos would have the results a_b"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_an_error_of_one_line(fail, tmp_path, rows, message):
+    assert message in fail("batch", table(tmp_path, *rows), "--output", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("absent,,,,0", "ben has no box"),
+        ("900,0,20,20,0", "ben"),
+        ("10,10,20,20,99", "ben: frame 99 is not in the video, which has 12 frames"),
+    ],
+)
+def test_a_box_that_cannot_be_tracked_is_the_error_of_its_video(demo, batch, row, message):
+    code, rows = batch(f"two/cam.mp4,anna,{demo[0]},0", f"two/cam.mp4,ben,{row}")
+    assert code == 1
+    assert rows["two/cam.mp4"]["error"].startswith(message)
+
+
+def test_the_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video, tmp_path):
+    (tmp_path / "cam.mp4").write_bytes(demo_video(FRAMES)[0].read_bytes())
+    boxes = table(tmp_path, f"cam.mp4,ben,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},")
+    succeed("batch", boxes, "--output", tmp_path / "out", "--jobs", 1)
+    succeed("export", tmp_path / "out", tmp_path / "all.json", "--format", "coco", "--label", "person")
+    coco = json.loads((tmp_path / "all.json").read_text())
+    assert [video["name"] for video in coco["videos"]] == ["cam", "two_cam"]
+    assert len(coco["annotations"]) == 2 * FRAMES
+    assert "this format holds one video" in fail("export", tmp_path / "out", tmp_path / "all.xml")
+    assert "contains no .ndjson file" in fail("export", tmp_path / "two", tmp_path / "all2.json", "--format", "coco")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_batch_is_completed_after_a_worker_was_killed_or_ctrl_c(demo_video, catstream, until, tmp_path, number):
+    video, boxes = demo_video(200)
+    for name in "abc":
+        (tmp_path / f"{name}.mp4").write_bytes(video.read_bytes())
+    words = ["batch", table(tmp_path, *(f"{name}.mp4,,{boxes[0]}," for name in "abc")), "--output", tmp_path / "out"]
+    run = catstream(*words, "--jobs", 1)
+    until(lambda: (tmp_path / "out" / "a.ndjson").exists())
+    children = psutil.Process(run.pid).children()
+    worker = next(child for child in children if "spawn_main" in " ".join(child.cmdline()))
+    (worker if number == signal.SIGKILL else run).send_signal(number)
+    errors = run.communicate(timeout=150)[1]
+    if number == signal.SIGINT:
+        assert (run.returncode, "the same command continues" in errors) == (130, True)
+        run = catstream(*words)
+        errors = run.communicate(timeout=150)[1]
+    assert run.returncode == 0, errors
+    assert {row["frames"] for row in summaries(tmp_path / "out").values()} == {"200"}
