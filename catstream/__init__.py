@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from catstream.client.attach import control, subscribe
     from catstream.client.control import Control
     from catstream.client.subscription import Subscription
+    from catstream.compression.tree import CoresetTree, FrequentDirections
     from catstream.errors import CatstreamError
     from catstream.finding.find import Detection, find
     from catstream.fleet.fleet import Fleet
@@ -37,8 +38,10 @@ __all__ = [
     "Box",
     "CatstreamError",
     "Control",
+    "CoresetTree",
     "Detection",
     "Fleet",
+    "FrequentDirections",
     "MultiTracker",
     "Pipeline",
     "SavedModel",
@@ -61,7 +64,9 @@ _HOMES = {
     "Box": "base.box",
     "CatstreamError": "errors",
     "Control": "client.control",
+    "CoresetTree": "compression.tree",
     "Fleet": "fleet.fleet",
+    "FrequentDirections": "compression.tree",
     "SavedModel": "jobs.saved_model",
     "MultiTracker": "multi",
     "Pipeline": "pipeline",

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from catstream.compression.tree import FrequentDirections
+from catstream import FrequentDirections
 from catstream.features.cells import Cells
 from catstream.features.layout import CELL, WINDOW
 
@@ -73,7 +73,6 @@ class Summary:
     """The images that represent a stream of them; `size` is n, the rows of the sketch, and half of the candidates."""
 
     size: int = 128
-    energy: float = 0.0  # ||A||^2
     names: list[str] = field(default_factory=list)  # of the candidates
     rows: list[np.ndarray] = field(default_factory=list)
 
@@ -84,7 +83,6 @@ class Summary:
         """Add the next image, uint8 (h, w, 3), blue green red."""
         row = describe(image)
         self.sketch.insert(row[None])
-        self.energy += float(row.astype(float) @ row)
         self.names.append(name)
         self.rows.append(row)
         if len(self.rows) == 2 * self.size:
@@ -94,14 +92,13 @@ class Summary:
     def result(self, k: int) -> tuple[dict[str, float], float, float]:
         """Return the share of ||A||^2 that each of k images adds, and the bounds of what they keep together."""
         chosen, energies = self._choose(k)
-        shares = {self.names[number]: each / self.energy for number, each in zip(chosen, energies, strict=True)}
+        shares = {self.names[number]: each / self.sketch.energy for number, each in zip(chosen, energies, strict=True)}
         kept = min(sum(shares.values()), 1.0)
-        error = min(1.0, k / (self.size + 1)) * max(self.sketch.dropped_energy, 0.0) / self.energy
+        error = min(1.0, k / (self.size + 1)) * self.sketch.dropped_energy / self.sketch.energy
         return shares, kept, min(kept + error, 1.0)
 
     def _choose(self, k: int) -> tuple[list[int], list[float]]:
-        sketch = np.vstack([*(node.rows for node in self.sketch.nodes), self.sketch.pending])
-        return choose(np.array(self.rows, float), sketch.astype(float), k)
+        return choose(np.array(self.rows, float), self.sketch.rows.astype(float), k)
 
 
 if __name__ == "__main__":

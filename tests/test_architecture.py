@@ -23,7 +23,7 @@ LEVELS = [
     {"paper"},
     {"detection", "compression", "training", "wire", "video"},
     {"jobs"},
-    {"multi", "client"},
+    {"multi", "client", "sketch"},
     {"sinks"},
     {"tracker", "processes", "web"},
     {"pipeline", "backbone", "annotation"},
@@ -54,7 +54,10 @@ IMPORTERS = {
     ],
     "filterpy": ["catstream/training/motion_em.py"],
     "numba": ["catstream/features/kernels.py"],
-    "sklearn": ["catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"],
+    "sklearn": [
+        *("catstream/paper/scm.py", "catstream/paper/one_class.py", "catstream/video/rendered.py"),
+        "catstream/sketch.py",
+    ],
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/store.py"],
     "boto3": ["catstream/fleet/store.py"],  # obstore imports it

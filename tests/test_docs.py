@@ -230,6 +230,18 @@ def test_the_tutorials_tracker_follows(demo_video, tmp_path, monkeypatch):
     assert video.startswith("present")
 
 
+def test_the_examples_of_coreset_trees_summarise_a_stream():
+    program = "\n".join(blocks(DOCS / "coreset-trees.md", "python")).replace("1_000_000", "20_000")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(program, "docs/coreset-trees.md", "exec"), {})
+    rows, *figures = printed.getvalue().splitlines()
+    assert rows.startswith("20000 rows in ")
+    variance, error, accuracy = (float(line.rpartition(" ")[2].rstrip("%")) for line in figures)
+    assert variance == pytest.approx(74, abs=1)
+    assert error < 0.1
+    assert accuracy > 90
+
+
 def test_every_test_that_a_page_names_exists():
     tests = "\n".join(path.read_text(encoding="utf-8") for path in ROOT.glob("tests/**/test_*.py"))
     for name in set(re.findall(r"`(test_\w+)`", everything())):
@@ -245,4 +257,4 @@ def test_the_version_is_the_same_everywhere_and_the_reference_has_all_public_nam
     assert tomllib.loads(page("pyproject.toml"))["project"]["version"] == catstream.__version__
     assert set(dir(catstream)) >= {*catstream.__all__, "__doc__"}, "before their first use"
     shown = set(re.findall(r"^::: catstream\.(\w+)", page("docs/api.md"), re.MULTILINE))
-    assert shown - {"errors"} == set(catstream.__all__) - {"CatstreamError", "__version__"}
+    assert shown - {"errors", "sketch"} == set(catstream.__all__) - {"CatstreamError", "__version__"}

@@ -26,7 +26,8 @@ class Node:
 
     level   0 for a leaf, otherwise one more than the level of the two nodes that were merged; it summarises
             n * 2**level rows
-    rows    float32 (n, d): the original rows in a leaf, otherwise orthogonal rows, strongest direction first
+    rows    float32 (n, d): the original rows in a leaf, otherwise orthogonal rows, strongest direction first, of which
+            those after the first d are zero
     count   number of rows that it summarises
     sum     float64 (d,), exact sum of these rows
     energy  ||A||^2 of these rows
@@ -46,8 +47,8 @@ class Node:
 
     @property
     def dropped(self) -> float:
-        """c of the paper, the energy that all reductions below it dropped: ||A||^2 = ||C||^2 + c."""
-        return self.energy - energy(self.rows)
+        """c of the paper, the energy that all reductions below it dropped: ||A||^2 = ||C||^2 + c up to rounding."""
+        return max(self.energy - energy(self.rows), 0.0)  # rounding may make it negative
 
     @cached_property
     def products(self) -> np.ndarray:
@@ -55,9 +56,14 @@ class Node:
         # Products of orthogonal rows are not computed: they are zero, up to rounding.
         return np.diag(np.einsum("ij,ij->i", self.rows, self.rows)) if self.level else products(self.rows)
 
-    def products_with(self, newer: Node) -> np.ndarray:
-        """The Gram matrix of its rows stacked on those of a newer node, float32 (2n, 2n)."""
-        n = len(self.rows)
+    def products_with(self, newer: Node) -> np.ndarray | None:
+        """The Gram matrix of its rows stacked on those of a newer node, float32 (2n, 2n).
+
+        None if rows are shorter than 2n: `catstream.compression.reduce.reduce` does not need it.
+        """
+        n, d = self.rows.shape
+        if d < 2 * n:
+            return None
         gram = np.zeros((2 * n, 2 * n), np.float32)
         gram[:n, :n] = self.products
         gram[n:, n:] = newer.products

@@ -6,10 +6,10 @@ The first n rows of S V' are optimal: no other n rows retain more of ||A||^2, th
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import ssyrk
-from scipy.linalg.lapack import ssyevd
+from scipy.linalg.blas import dsyrk, ssyrk
+from scipy.linalg.lapack import dsyevd, ssyevd
 
-from catstream.base.arrays import Float32
+from catstream.base.arrays import Float32, Float64
 
 _TINY = np.float32(1e-30)  # divisor in place of an energy of 0
 
@@ -40,9 +40,9 @@ def reduce(
 ) -> np.ndarray:
     """Reduce rows to at most `size`, along the strongest singular vectors.
 
-    For every orthonormal Y, ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2 with
-    c = ||A||^2 - ||C||^2 (paper, "Coresets"). Costs one triangle of the Gram
-    matrix and its eigenvectors, O(m^2 d) for m rows of length d > m.
+    For every orthonormal Y, ||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2, up to rounding, with c = ||A||^2 - ||C||^2 (paper,
+    "Coresets"). Costs one triangle of a matrix of products and its eigenvectors: of A A' for m rows of length d >= m,
+    O(m^2 d); of A'A for shorter rows, O(m d^2).
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def reduce(
 
     Returns
     -------
-    float32 (min(size, m), d), strongest first, orthogonal to one another
+    float32 (min(size, m), d), strongest first, orthogonal to one another; those after the first d are zero
 
     >>> reduce(np.ones((6, 4), np.float32), size=2).shape
     (2, 4)
@@ -90,13 +90,28 @@ def _strongest(
 ) -> tuple[Float32, Float32]:
     """Energies and rows s_i v_i of the `count` strongest singular vectors, or of all if there are fewer rows."""
     count = min(count, len(rows))
+    target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
+    if rows.shape[1] < len(rows):
+        return _strongest_of_short_rows(rows, count, target)
     # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
     energies, vectors, failed = ssyevd(products(rows) if gram is None else gram, lower=1)
     if failed:
         raise np.linalg.LinAlgError(f"the eigenvectors of the Gram matrix of {len(rows)} rows did not converge")
     # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.
     strongest = vectors.T[: -count - 1 : -1].copy()
-    target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
     with np.errstate(invalid="ignore"):  # OpenBLAS may set the flag for memory beyond the rows
         strongest[strongest @ (rows @ target) < 0] *= -1
     return energies[: -count - 1 : -1].clip(min=0), strongest @ rows
+
+
+def _strongest_of_short_rows(rows: Float32, count: int, target: Float32) -> tuple[Float32, Float32]:
+    """The same from A'A, d x d, in float64; zeros follow the d strongest."""
+    values, vectors, failed = dsyevd(dsyrk(1, rows.T.astype(np.float64), lower=1), lower=1)
+    if failed:
+        raise np.linalg.LinAlgError(f"the eigenvectors of A'A of {len(rows)} rows did not converge")
+    energies: Float64 = np.zeros(count)
+    strongest: Float64 = np.zeros((count, rows.shape[1]))
+    energies[: len(values)] = values[: -count - 1 : -1].clip(min=0)
+    strongest[: len(values)] = vectors.T[: -count - 1 : -1]
+    strongest[strongest @ target < 0] *= -1
+    return energies.astype(np.float32), (np.sqrt(energies)[:, None] * strongest).astype(np.float32)

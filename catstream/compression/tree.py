@@ -7,13 +7,15 @@ become a node one level up (paper, "Coreset Tree Implementation"). `FrequentDire
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import ClassVar, Self
 
 import numpy as np
 
-from catstream.base.arrays import Float64, is_finite
+from catstream.base.arrays import Float32, Float64, is_finite
+from catstream.base.threads import one_thread
 from catstream.compression.node import Node, sample
-from catstream.compression.reduce import shrink
+from catstream.compression.reduce import energy, shrink
 from catstream.errors import ProtocolError
 from catstream.messages import storage
 from catstream.messages.kinds import Summary
@@ -26,8 +28,9 @@ class CoresetTree:
     """A coreset of a stream of rows, by merge and reduce.
 
     For p rows it stores at most log2(p / n) + 1 nodes, O(n d log p) bytes. Inserting a row costs O(n d) on average,
-    whatever p is. For every orthonormal Y, `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, where A are all inserted rows, C
-    the rows of all nodes and the pending rows, and c is `dropped_energy`.
+    whatever p is. For every orthonormal Y, `||A Y||^2 - c <= ||C Y||^2 <= ||A Y||^2`, up to the rounding of float32,
+    where A are all inserted rows, C is `rows`, and c is `dropped_energy`. If d <= n, C'C is A'A: nothing is dropped.
+    While rows are reduced, linear algebra runs on one thread in the whole process: more threads are slower.
 
     Parameters
     ----------
@@ -61,6 +64,12 @@ class CoresetTree:
         return self._leaf[: self._filled]
 
     @property
+    def rows(self) -> np.ndarray:
+        """The summary: rows of all nodes, oldest first, and the pending rows, C of the paper, float32 (m, d)."""
+        rows: Float32 = np.vstack([*(node.rows for node in self.nodes), self.pending])
+        return rows
+
+    @property
     def width(self) -> int:
         """Length d of a row, 0 before the first."""
         return self.nodes[0].rows.shape[1] if self.nodes else self._leaf.shape[1]
@@ -84,8 +93,13 @@ class CoresetTree:
         return total
 
     @property
+    def energy(self) -> float:
+        """||A||^2, the sum of the squares of all inserted rows, in float64."""
+        return sum(node.energy for node in self.nodes) + energy(self.pending)
+
+    @property
     def dropped_energy(self) -> float:
-        """c of the paper: the energy, as a part of ||A||^2, that the reductions have dropped."""
+        """c of the paper: the part of `energy` that the reductions have dropped, never negative."""
         return sum(node.dropped for node in self.nodes)
 
     @property
@@ -96,24 +110,21 @@ class CoresetTree:
     def insert(self, rows: np.ndarray) -> None:
         """Add rows, float32 (k, d), in the order of the stream.
 
-        ProtocolError if their length differs from that of earlier rows, or if a number is not finite.
+        ProtocolError, a ValueError, if their length differs from that of earlier rows, or if a number is not finite.
         """
         self.extend(self._checked(rows))
 
     def extend(self, rows: np.ndarray) -> None:
         """Add rows as `insert` does, without its checks: those of a message were checked when it was received."""
-        while len(rows):
-            if not self._filled:  # a node owns the previous array
-                self._leaf = np.empty((self.size, rows.shape[1]), np.float32)
-            elif self._filled == len(self._leaf):  # the pending rows of a loaded or copied tree
-                self._leaf = np.vstack([self._leaf, np.empty((self.size - self._filled, rows.shape[1]), np.float32)])
-            count = min(len(rows), self.size - self._filled)
-            self._leaf[self._filled : self._filled + count] = rows[:count]
-            self._filled += count
-            rows = rows[count:]
-            if self._filled == self.size:
-                self._filled = 0
-                self._push(Node.leaf(self._leaf))
+        # Once for all leaves, and not for rows that complete none: the limit costs as much as inserting some rows.
+        with one_thread() if self._filled + len(rows) >= self.size else nullcontext():
+            while len(rows):
+                count = min(len(rows), self.size - self._filled)
+                self._append(rows[:count])
+                rows = rows[count:]
+                if self._filled == self.size:
+                    self._filled = 0
+                    self._push(Node.leaf(self._leaf))
 
     def copy(self) -> Self:
         """An independent tree with the same content."""
@@ -122,12 +133,13 @@ class CoresetTree:
         tree._leaf, tree._filled = self.pending, self._filled
         return tree
 
+    @one_thread()
     def merged(self, other: CoresetTree) -> Self:
         """A new tree of both streams, with the bound of one tree into which all rows were inserted."""
         if other.reduction != self.reduction:
             raise ProtocolError(
                 f"a tree of coreset.reduction={self.reduction} cannot merge one of {other.reduction}: "
-                "build both with the same setting"
+                f"build both as {type(self).__name__}"
             )
         if other.size != self.size:
             raise ProtocolError(
@@ -136,7 +148,7 @@ class CoresetTree:
         if self.width and other.width and self.width != other.width:
             raise ProtocolError(
                 f"a tree of rows of length {self.width} cannot merge rows of length {other.width}: "
-                "build both from the same features"
+                "merge trees of rows of the same length"
             )
         tree = self.copy()
         if not tree.width:
@@ -148,6 +160,7 @@ class CoresetTree:
             tree.insert(other.pending)
         return tree
 
+    @one_thread()
     def sample(self) -> Summary:
         """A hierarchical sample of at most 2n rows (paper, "Coreset Appearance Model").
 
@@ -186,6 +199,15 @@ class CoresetTree:
             raise ProtocolError(f"not the state of a coreset tree ({error!r}): use an older copy of the file") from None
         return tree
 
+    def _append(self, rows: np.ndarray) -> None:
+        """Add rows to the next leaf, which has room for them."""
+        if not self._filled:  # a node owns the previous array
+            self._leaf = np.empty((self.size, rows.shape[1]), np.float32)
+        elif self._filled == len(self._leaf):  # the pending rows of a loaded or copied tree
+            self._leaf = np.vstack([self._leaf, np.empty((self.size - self._filled, rows.shape[1]), np.float32)])
+        self._leaf[self._filled : self._filled + len(rows)] = rows
+        self._filled += len(rows)
+
     def _push(self, node: Node) -> None:
         nodes = [*self.nodes, node]
         while len(nodes) > 1 and self._to_merge(nodes[-2], nodes[-1]):
@@ -207,11 +229,10 @@ class CoresetTree:
         rows = np.asarray(rows, np.float32)
         if rows.ndim != 2 or (self.width and rows.shape[1] != self.width):
             raise ProtocolError(
-                f"rows have shape {rows.shape}, this tree was built for (any, {self.width or 'any'}): "
-                "start all services with the same settings"
+                f"expected rows float32 (k, {self.width or 'd'}), got {rows.shape}: insert rows of one length"
             )
         if not is_finite(rows):
-            raise ProtocolError("rows hold a number that is not finite: check the source of the features")
+            raise ProtocolError("rows contain a number that is not finite: insert finite rows")
         return rows
 
     def _check(self, pending: np.ndarray) -> None:
@@ -236,8 +257,8 @@ class FrequentDirections(CoresetTree):
 
     It stores one node of n rows and fewer than n pending rows: a new leaf is stacked below the node, and the 2n rows
     are shrunk to n, see `catstream.compression.reduce.shrink`. In addition to the bound of a tree, for every unit
-    vector y, `0 <= ||A y||^2 - ||C y||^2 <= c / (n + 1) <= ||A||^2 / (n + 1)`, for one stream and for merged ones. Here
-    c is `dropped_energy`, which is larger than that of a tree because all directions are shrunk.
+    vector y, `0 <= ||A y||^2 - ||C y||^2 <= c / (n + 1) <= ||A||^2 / (n + 1)`, up to rounding, for one stream and for
+    merged ones. Here c is `dropped_energy`, which is larger than that of a tree because all directions are shrunk.
 
     >>> sketch = FrequentDirections(size=4)
     >>> sketch.insert(np.eye(13, 5, dtype=np.float32))

@@ -104,7 +104,7 @@ class SavedModel:
     def similarity(self) -> Similarity:
         """Measures the similarity of a window to the object, from the trees: see `catstream.detection.similarity`."""
         tree, background = self.trees["object"], self.trees["background"]
-        rows = np.vstack([*(node.rows for node in tree.nodes), tree.pending])
+        rows = tree.rows
         whole = energy(rows) + tree.dropped_energy
         mean = (background.sum / background.rows_seen).astype(np.float32)
         return Similarity.of(rows, whole, tree.sum, tree.rows_seen, mean)

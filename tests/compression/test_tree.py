@@ -10,6 +10,7 @@ The first is sharper than the (1 + epsilon)^q of the paper (section "Coreset Tre
 """
 
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -157,6 +158,38 @@ def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch
     assert bits(tree) == before
 
 
+@KINDS
+@pytest.mark.parametrize("width", [1, SIZE - 1, SIZE, 2 * SIZE - 1])
+def test_rows_shorter_than_a_reduction_stay_within_the_bound(kind, width, rng):
+    rows = rng.normal(size=(40 * SIZE + 3, width)).astype(np.float32)
+    tree, slack = grown(rows, kind=kind), ROUNDING * energy(rows)
+    errors = np.linalg.eigvalsh(rows.T.astype(np.float64) @ rows - tree.rows.T.astype(np.float64) @ tree.rows)
+    assert -slack <= errors[0]
+    assert errors.clip(min=0).sum() <= tree.dropped_energy + slack
+    assert width > SIZE or 0 <= tree.dropped_energy <= slack
+
+
+def test_dropped_energy_is_never_negative(rng):
+    tree = CoresetTree(128)
+    for _ in range(40):
+        tree.insert(rng.normal(size=(128, 64)))
+        assert all(node.dropped >= 0 for node in tree.nodes)
+
+
+@KINDS
+def test_the_energy_is_that_of_all_rows(stream, kind):
+    assert_allclose(grown(stream, kind=kind).energy, energy(stream), rtol=1e-12)
+
+
+def test_a_leaf_is_reduced_on_one_thread_and_other_rows_do_not_change_the_number(stream, monkeypatch):
+    limits = []
+    monkeypatch.setattr("catstream.compression.tree.one_thread", lambda: limits.append(1) or nullcontext())
+    tree = CoresetTree(SIZE)
+    for count in (SIZE - 1, 1, 3 * SIZE, 1):
+        tree.insert(stream[:count])
+    assert len(limits) == 2
+
+
 @pytest.mark.parametrize(
     "rows",
     [np.ones((3, 5)), np.ones(6), np.full((2, 6), np.nan), np.full((2, 6), np.inf)],
@@ -165,7 +198,7 @@ def test_a_reduction_that_is_interrupted_loses_no_node(stream, kind, monkeypatch
 def test_invalid_rows_are_rejected_and_do_not_change_the_tree(rows):
     tree = grown(whole_numbers(14, seed=1), size=4)
     before = bits(tree)
-    with pytest.raises(ProtocolError):
+    with pytest.raises(ProtocolError, match=r"expected rows float32 \(k, 6\)|insert finite rows"):
         tree.insert(rows)
     assert bits(tree) == before
 
