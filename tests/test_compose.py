@@ -169,7 +169,7 @@ def test_a_subscriber_outside_of_the_containers_attaches_with_keys(demo_video, t
             service = [sys.executable, "-P", *line]
             process = stack.enter_context(subprocess.Popen(service, env=os.environ | variables))
             stack.callback(process.kill)
-        with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=60) as tracks:
+        with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=150) as tracks:
             assert next(tracks).box is not None
         first = int(tcp.rpartition(":")[2])
         *_, script, address = SERVICES["trainer"]["healthcheck"]["test"]

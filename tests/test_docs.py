@@ -201,6 +201,7 @@ def test_the_python_examples_use_existing_names():
     assert not errors_on(unknown_names)
 
 
+@pytest.mark.timeout(900)  # mypy reads the types of all libraries
 def test_a_type_checker_accepts_the_python_examples(tmp_path):
     for page in (ROOT / "README.md", DOCS / "tutorial.md"):
         for number, block in enumerate(blocks(page, "python")):

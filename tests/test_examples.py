@@ -99,7 +99,7 @@ def beside(request, demo_video, shown, tmp_path_factory):
             for name, reader in readers.items():
                 if reader.poll() is None and not (name.startswith("rerun") and holds_tracks(shown)):
                     select.select([reader.stdout], [], [], 0.3)  # while they start, few pass
-        told = {name: reader.communicate(timeout=60)[0] for name, reader in readers.items()}
+        told = {name: reader.communicate(timeout=150)[0] for name, reader in readers.items()}
     return Beside(found, norms, {name: (reader.returncode, told[name]) for name, reader in readers.items()})
 
 
@@ -173,7 +173,7 @@ def test_the_images_that_represent_a_folder_keep_the_energy_within_the_bounds(de
     basis = np.linalg.qr(np.array([rows[name] for name in shares]).T)[0]
     whole = np.array([*rows.values()])
     assert kept <= np.sum((whole @ basis) ** 2) / np.sum(whole**2) <= kept_at_most
-    run = subprocess.run([*command("summarise_images.py"), tmp_path, "4"], capture_output=True, text=True, timeout=60)
+    run = subprocess.run([*command("summarise_images.py"), tmp_path, "4"], capture_output=True, text=True, timeout=150)
     assert run.stdout.count(".png") == 4, run.stderr
     assert "of the energy of all images is kept" in run.stdout
 
@@ -206,12 +206,12 @@ def test_a_ground_station_finds_the_camera_selects_an_object_and_is_told_where_i
         def result_of(name, *values):
             number = getattr(mavlink, f"MAV_CMD_{name}")
             link.mav.command_long_send(1, 100, number, 0, *values, *[0] * (7 - len(values)))
-            while (message := link.recv_match(blocking=True, timeout=60)).get_type() != "COMMAND_ACK":
+            while (message := link.recv_match(blocking=True, timeout=150)).get_type() != "COMMAND_ACK":
                 told[message.get_type()] = message
             assert message.command == number
             return message.result
 
-        heartbeat = link.recv_match(type="HEARTBEAT", blocking=True, timeout=60)
+        heartbeat = link.recv_match(type="HEARTBEAT", blocking=True, timeout=150)
         assert (heartbeat.type, heartbeat.get_srcComponent()) == (mavlink.MAV_TYPE_CAMERA, 100)
         assert result_of("REQUEST_MESSAGE", mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION) == mavlink.MAV_RESULT_ACCEPTED
         camera_information = told["CAMERA_INFORMATION"]
@@ -242,7 +242,7 @@ def test_a_ground_station_finds_the_camera_selects_an_object_and_is_told_where_i
         assert result_of("CAMERA_STOP_TRACKING") == mavlink.MAV_RESULT_ACCEPTED
         assert told["CAMERA_TRACKING_IMAGE_STATUS"].tracking_status == 0
         pipeline.close()
-        assert camera.wait(60) == 0
+        assert camera.wait(150) == 0
         *_, begun, forgotten = camera.stdout.read().decode().splitlines()
         assert "begins" in begun
         assert "no longer tracked" in forgotten
@@ -272,7 +272,7 @@ def test_the_zone_counter_counts_beside_a_run(demo_video):
         counts = []
         for _ in pipeline:
             counts = counts or select.select([counter.stdout], [], [], 0.3)[0]  # while it starts, few pass
-        printed, _ = counter.communicate(timeout=60)
+        printed, _ = counter.communicate(timeout=150)
     assert counter.returncode == 0
     entered, left, everywhere, nowhere = printed.splitlines()
     assert entered.endswith("the object entered all, 1 inside")
@@ -293,7 +293,7 @@ def test_the_collector_stores_the_tracks_of_two_pipelines_although_one_is_missin
         stack.callback(collector.kill)
         assert "got 'tcp://127.0.0.1'" in collector.stdout.readline()  # it has subscribed to the others before
         found = [list(run) for run in runs]
-        printed, _ = collector.communicate(timeout=60)
+        printed, _ = collector.communicate(timeout=150)
     assert collector.returncode == 0
     with closing(sqlite3.connect(tmp_path / "tracks.sqlite")) as database:
         for run, tracks in zip(runs, found, strict=True):

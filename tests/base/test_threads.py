@@ -63,13 +63,13 @@ def test_the_last_of_two_threads_restores_the_number():
 
     def first():
         with one_thread():
-            both.wait(60)
-        first_left.wait(60)
+            both.wait(150)
+        first_left.wait(150)
 
     def last():
         with one_thread():
-            both.wait(60)
-            first_left.wait(60)
+            both.wait(150)
+            first_left.wait(150)
             return set(counts().values())
 
     with ThreadPoolExecutor(2) as pool:
@@ -108,7 +108,7 @@ def test_results_have_the_order_of_the_items():
 def test_items_are_processed_at_the_same_time_if_there_are_cores(cores):
     barrier = Barrier(min(cores, 2))
     if cores > 1:
-        assert len(set(in_parallel(lambda _: barrier.wait(60), range(2)))) == 2
+        assert len(set(in_parallel(lambda _: barrier.wait(150), range(2)))) == 2
 
 
 def test_the_first_error_is_raised(cores):

@@ -47,7 +47,7 @@ def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on
 def test_output_for_which_the_disk_has_no_room_is_one_line_of_error(catstream, words):
     with Path("/dev/full").open("w") as full:
         process = catstream(*words, stdout=full)
-        assert process.communicate(timeout=60)[1] == "catstream: cannot write any more: No space left on device\n"
+        assert process.communicate(timeout=150)[1] == "catstream: cannot write any more: No space left on device\n"
     assert process.returncode == 1
 
 

@@ -62,7 +62,7 @@ def test_nan_is_within_no_bounds(fail, name, option):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_process_has_a_help_text(name):
     command = [sys.executable, "-P", SERVICES / f"{name}.py", "--help"]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    run = subprocess.run(command, capture_output=True, text=True, timeout=150)
     assert (run.returncode, run.stderr) == (0, "")
     assert run.stdout.startswith(f"usage: services/{name}.py")
 
@@ -79,7 +79,7 @@ def test_ctrl_c_ends_any_command_with_130_and_no_traceback(catstream, until, tmp
     process = catstream(command, *options, cwd=tmp_path)
     until(lambda: begun(Path(f"/proc/{process.pid}/task").glob("*/comm"), tmp_path) or process.poll() is not None)
     process.send_signal(signal.SIGINT)
-    errors = process.communicate(timeout=60)[1]
+    errors = process.communicate(timeout=150)[1]
     assert process.returncode == 130, errors
     assert errors.strip().splitlines()[-1] == "stopped"
     assert "Traceback" not in errors

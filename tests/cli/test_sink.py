@@ -31,9 +31,9 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
                 select.select([sinks[folder].stderr for folder in waiting], [], [], 0.3)  # while they start, few pass
             if track.frame > 30 and stopped not in waiting and sinks[stopped].poll() is None:
                 sinks[stopped].send_signal(signal.SIGINT)
-                sinks[stopped].wait(60)
+                sinks[stopped].wait(150)
             time.sleep(0.02)  # pictures are sent ten times a second
-        told = {folder: sink.communicate(timeout=60)[1] for folder, sink in sinks.items()}
+        told = {folder: sink.communicate(timeout=150)[1] for folder, sink in sinks.items()}
     for folder, sink in sinks.items():
         assert sink.returncode == 0, told[folder]
     assert written(whole, told[whole])[-1] == 59
@@ -41,9 +41,9 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
 
 
 def holds(folder):
-    """Whether tracks have come there."""
+    """Whether tracks and a picture have come there."""
     file = folder / FILES[0]
-    return file.exists() and file.read_bytes().count(b"\n") > 1  # below the head
+    return file.exists() and file.read_bytes().count(b"\n") > 1 and (folder / "walk.mp4").exists()  # below the head
 
 
 def written(folder, errors):
@@ -78,7 +78,7 @@ def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_si
 
         follow("first", (0, 300), (205, 310), written=310)
         follow("second", (0, 200), written=310)
-        errors = sink.communicate(timeout=60)[1]
+        errors = sink.communicate(timeout=150)[1]
     assert sink.returncode == 0, errors
     frames = [json.loads(line)["frame"] for line in file.read_text().splitlines()[1:]]
     assert frames == list(range(310))

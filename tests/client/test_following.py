@@ -65,7 +65,7 @@ def stream(until):
 def test_a_subscription_follows_its_stream_and_returns_repeated_frames_once(stream, managing):
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, *(track(seq, name) for seq in range(1, 6) for name in ("anna", "ben")), STOPPED)
             second = stream.runs()
@@ -78,7 +78,7 @@ def test_a_subscription_follows_its_stream_and_returns_repeated_frames_once(stre
 def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, managing):
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1), track(2))
             first.close()  # its node dies
@@ -94,7 +94,7 @@ def test_a_subscription_continues_without_the_controller_and_uses_it_once_it_is_
     with ExitStack() as controller:
         controller.enter_context(managing(stream.status, place))
         first = stream.runs()
-        with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=60) as tracks:
+        with catstream.subscribe("fleet://site/cam-7", "tracks", timeout=150) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1))
             controller.close()
@@ -124,7 +124,7 @@ def test_all_frames_of_another_source_and_of_a_live_stream_are_returned_after_a_
     """A live stream uses the numbers of the frames that it lost again."""
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             watched = stream.watched(tracks)
             stream.send(first, track(1), track(2))
             first.close()
@@ -139,7 +139,7 @@ def test_an_event_loop_follows_a_stream_too(stream, managing):
 
     with managing(stream.status):
         first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             result = stream._pool.submit(lambda: asyncio.run(watched(tracks)))
             stream.send(first, track(1), STOPPED)
             stream.send(stream.runs(), track(1), track(2), STOPPED)
@@ -152,7 +152,7 @@ def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, man
         with pytest.raises(ServiceError, match="site has no stream 'cam-8': its streams are cam-7"):
             catstream.subscribe("fleet://cam-8", "tracks")
         stream.update(state="ended")
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             assert list(tracks) == []
             assert tracks.end.reason == "the stream cam-7 has ended"
 
@@ -170,7 +170,7 @@ def test_the_endpoint_of_a_running_stream_is_that_of_its_pipeline(stream, managi
 def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
     with managing(stream.status):
         place = stream.runs()._endpoint
-        with catstream.control("fleet://cam-7", timeout=60) as control:
+        with catstream.control("fleet://cam-7", timeout=150) as control:
             with commanded(place) as first:
                 control.pause()
             with commanded(stream.runs()._endpoint) as second:
@@ -185,17 +185,17 @@ def test_a_client_of_the_fleet_has_its_role_at_each_stream_until_it_is_revoked(s
     anna, carl, server = str(folder / "anna"), str(folder / "carl"), public_key(folder / "stream")
     with managing(stream.status, "", str(keys)):
         pipeline = stream.runs(str(folder / "stream"), tcp, server=server)
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=60, keys=anna) as tracks:
+        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150, keys=anna) as tracks:
             watched = stream.watched(tracks)
             stream.send(pipeline, track(1), STOPPED)
             with Responder[Command, Answer](CONTROL, pipeline._endpoint):
                 with (
-                    catstream.control("fleet://cam-7", timeout=60, keys=anna) as control,
+                    catstream.control("fleet://cam-7", timeout=150, keys=anna) as control,
                     pytest.raises(ServiceError, match=r"rejects this key: .* which control requires"),
                 ):
                     control.stop()
                 with (
-                    catstream.subscribe("fleet://cam-7", "tracks", timeout=60, keys=carl) as rejected,
+                    catstream.subscribe("fleet://cam-7", "tracks", timeout=150, keys=carl) as rejected,
                     pytest.raises(ServiceError, match=r"rejects this key: .* which tracks requires"),
                 ):
                     next(rejected)

@@ -291,13 +291,13 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
 
     def put(*_):
         hangs.set()
-        goes_on.wait(60)
+        goes_on.wait(150)
 
     monkeypatch.setattr(StateStore, "put", put)
     change = threading.Thread(target=site.drain, args=("n1",), kwargs={"undo": False})
     change.start()
     try:
-        assert hangs.wait(60)
+        assert hangs.wait(150)
         running(site, ray, "gate")
         with Registry("site", timeout=30) as registry:
             until(lambda: registry.streams().streams["gate"].state == "running")

@@ -60,7 +60,7 @@ def local(file, until, *options):
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as up:
         try:
             until(lambda: up.poll() is not None or name in fleets())
-            with Registry(name, timeout=60) as registry:
+            with Registry(name, timeout=150) as registry:
                 until(lambda: [each.state for each in registry.streams().streams.values()] == ["running"])
             yield up
         finally:
@@ -100,7 +100,7 @@ def test_a_second_up_changes_a_fleet_that_runs_and_down_ends_it_from_elsewhere(f
         assert (second.returncode, second.stdout.splitlines()[0]) == (0, "gate: is unchanged")
         assert list(json.loads(run("fleet", "status", "--fleet", "other", "--json").stdout)["streams"]) == ["gate"]
         assert run("fleet", "down", "--name", "other").stdout == "the fleet other is down\n"
-        assert "the fleet other was ended from elsewhere" in up.communicate(timeout=60)[0]
+        assert "the fleet other was ended from elsewhere" in up.communicate(timeout=150)[0]
     assert up.returncode == 0
     assert "no fleet 'other' of yours runs" in run("fleet", "down", "--name", "other").stderr
 
@@ -135,7 +135,7 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
     other = "south" if before.node == "north" else "north"
     address, keys = f"fleet://{spec.registry}/gate", str(tmp_path / "desk")
     time.sleep(6.0)  # until the streams know the client
-    with catstream.subscribe(address, "tracks", timeout=60, keys=keys) as tracks:
+    with catstream.subscribe(address, "tracks", timeout=150, keys=keys) as tracks:
         first = next(tracks)
         assert fleet.drain(before.node).startswith(f"{before.node} is draining: ")
         until(lambda: (found := fleet.status().streams["gate"]).node == other and found.state == "running")

@@ -46,7 +46,7 @@ def test_a_run_continues_and_reports_a_disk_that_cannot_be_written(long_video, d
                 until(lambda: list((state / TREES).glob("*.safetensors")))
                 spoil(disk, until)
             if track.frame == 40:
-                with subscribe(pipeline.endpoint, "health", timeout=60) as reports:
+                with subscribe(pipeline.endpoint, "health", timeout=150) as reports:
                     said = next(report.trouble for report in reports if report.trouble)
                 assert 0 < CheckpointStore(state / TREES).load(SETTINGS).seq < 40, "what was kept before is whole"
                 mend(disk)

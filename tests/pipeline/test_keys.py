@@ -17,7 +17,7 @@ def test_a_pipeline_with_keys_loses_no_frame_and_sends_to_allowed_clients(video,
     with (
         Pipeline(path, boxes[0], settings) as pipeline,
         subscribe(tcp, "tracks", keys=str(folder / "anna"), timeout=0.3) as heard,
-        subscribe(tcp, "health", keys=str(keys), timeout=60) as health,
+        subscribe(tcp, "health", keys=str(keys), timeout=150) as health,
     ):
         tracks = iter(pipeline)
         first = next(tracks)

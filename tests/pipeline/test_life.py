@@ -161,8 +161,8 @@ def test_a_run_that_starts_paused_waits_with_its_first_frame(video, until):
     path, boxes = video
     with (
         Pipeline(path, boxes[0], SETTINGS, part=PART, paused=True) as pipeline,
-        subscribe(pipeline.endpoint, "tracks", timeout=60) as tracks,
-        control(pipeline.endpoint, timeout=60) as steering,
+        subscribe(pipeline.endpoint, "tracks", timeout=150) as tracks,
+        control(pipeline.endpoint, timeout=150) as steering,
     ):
         until(lambda: pipeline.holding == "paused")
         assert steering.resume().reason == "resumed before the first frame"

@@ -64,7 +64,7 @@ def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(v
     tracks = []
     with (
         Pipeline(video[0], objects, SETTINGS, part=slice(0, FRAMES), state=tmp_path / "kept") as pipeline,
-        control(Path(pipeline.endpoint), timeout=60) as steering,
+        control(Path(pipeline.endpoint), timeout=150) as steering,
     ):
         frames = pipeline.by_frame()
         tracks.append(next(frames))
@@ -79,7 +79,7 @@ def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(v
 
 
 def test_objects_are_saved_forgotten_and_begun_by_name_while_paused(video, objects, tmp_path):
-    with Pipeline(video[0], objects, SETTINGS) as pipeline, control(pipeline.endpoint, timeout=60) as steering:
+    with Pipeline(video[0], objects, SETTINGS) as pipeline, control(pipeline.endpoint, timeout=150) as steering:
         frames = pipeline.by_frame()
         tracks = [next(frames)]
         while not tracks[-1]["ben"].model_version:

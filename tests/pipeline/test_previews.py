@@ -25,7 +25,7 @@ def looks(endpoint, previews, until):
     """Somebody begins to look."""
 
     def begin():
-        reader = subscribe(str(endpoint), "previews", timeout=60)
+        reader = subscribe(str(endpoint), "previews", timeout=150)
         until(lambda: previews.has_subscribers, previews.turn)
         return reader
 
@@ -86,7 +86,7 @@ def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
 def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_looks(endpoint, until, monkeypatch):
     monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
     with Previews(endpoint, stores=True) as previews:
-        with subscribe(str(endpoint), "previews", timeout=60):
+        with subscribe(str(endpoint), "previews", timeout=150):
             until(lambda: previews.has_subscribers, previews.turn)
             for number in range(80):
                 previews.show(3, Frame(number, number / 10, np.zeros((48, 64, 3), np.uint8)), {})

@@ -65,7 +65,7 @@ def broken(video, tmp_path):
 def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, by_hand):
     source, box = broken
     processes = by_hand(source, box=box)
-    errors = [process.communicate(timeout=60)[1] for process in processes]
+    errors = [process.communicate(timeout=150)[1] for process in processes]
     assert [process.returncode for process in processes] == [3, 3, 3], errors
     assert "5.png' (frame 5): replace or remove it" in errors[-1]
     assert CheckpointStore(folder / TREES).load(Settings()).seq == 5
@@ -87,7 +87,7 @@ def test_no_process_outlives_its_program(video, number, until, alive):
         pids = [int(pid) for pid in program.stdout.readline().split()]
         pids.append(psutil.Process(pids[0]).ppid())
         program.send_signal(number)
-        program.wait(60)
+        program.wait(150)
     assert len(pids) == 1 + len(NAMES)
     until(lambda: not any(map(alive, pids)))
 
@@ -99,7 +99,7 @@ def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(vide
         for process in processes:
             process.send_signal(signal.SIGTERM)
         end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
-        assert [process.wait(30) for process in processes] == [0, 0, 0]
+        assert [process.wait(150) for process in processes] == [0, 0, 0]
     assert end.totals["sent"] > 5
     assert end.totals["stored"] == end.totals["sent"]
 
@@ -113,7 +113,7 @@ def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folde
         told = (report.counters for report in iter(lambda: health.receive(60), None) if report.process == "detector")
         processed = next(counters["processed"] for counters in told if counters["processed"])
         compressor.send_signal(signal.SIGTERM)
-        assert compressor.wait(30) == 0
+        assert compressor.wait(150) == 0
         stored = CheckpointStore(folder / TREES).load(Settings()).seq
         assert stored >= processed
         by_hand(path, order=("compressor",), **run)  # tells it, if the last answer was lost

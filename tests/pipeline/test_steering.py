@@ -61,7 +61,7 @@ def taken(pipeline, tracks, answer):
     """What a command is answered while tracks are taken: few, also if the command takes long to arrive."""
     for track in pipeline:
         tracks.append(track)
-        if wait([answer], timeout=0.3).done:
+        if wait([answer], timeout=2).done:
             break
     return answer.result()
 

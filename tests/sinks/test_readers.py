@@ -70,7 +70,7 @@ def rotated(video, path):
 
 def replace(endpoint, box):
     """Give another object the name anna in a run that is paused before its first frame, some frames later."""
-    with control(str(endpoint), timeout=60) as steering:
+    with control(str(endpoint), timeout=150) as steering:
         steering.resume()
         steering.pause()
         steering.set_box(box, "anna")

@@ -38,7 +38,7 @@ class Receiver:
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self):
                 body = self.rfile.read(int(self.headers["Content-Length"]))
-                receiver.holds.wait(60)
+                receiver.holds.wait(150)
                 receiver.requests.append((self.path, self.headers, body))
                 status, *retry_after = receiver.answers.pop(0) if receiver.answers else (204,)
                 self.send_response(status)
@@ -230,7 +230,7 @@ def test_events_for_a_receiver_that_stays_away_are_counted_at_the_end(monkeypatc
         lose(sink, 1)
     assert sink.missed == 4
     assert "4 events of 4 were not delivered" in caplog.text
-    sink._thread.join(60)
+    sink._thread.join(150)
 
 
 @pytest.mark.parametrize(
@@ -333,5 +333,5 @@ def test_a_zone_outside_the_frame_of_a_running_pipeline_ends_the_sink(demo_video
             if sink.poll() is not None:
                 break
             sleep(0.3)
-        errors = sink.communicate(timeout=60)[1]
+        errors = sink.communicate(timeout=150)[1]
     assert "zone door: it is outside the frame of 320x240 pixels" in errors
