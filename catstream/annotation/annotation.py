@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import closing
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
@@ -93,6 +94,7 @@ class Annotation:
     ----------
     frames : DecodedFrames
     keyframes : dict of the boxes of each object, by name and frame
+    progress : as of the parameters
 
     Raises
     ------
@@ -115,7 +117,7 @@ class Annotation:
         progress: Progress = lambda *_: None,
     ) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
-        self._jobs, self._progress = jobs or len(os.sched_getaffinity(0)), progress
+        self._jobs, self.progress = jobs or len(os.sched_getaffinity(0)), progress
         self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
@@ -172,8 +174,10 @@ class Annotation:
     def decode(self) -> None:
         """Decode the frames, if they are not yet. VideoError if one cannot be decoded: those before it are there."""
         if self._video is not None:
-            video, self._video = self._video, None
-            decode(video, self.frames, lambda *done: self._progress("decoding", *done))
+            try:
+                decode(self._video, self.frames, lambda *done: self.progress("decoding", *done))
+            finally:
+                self._video = None
         self._check(self.keyframes)
 
     def track(self) -> None:
@@ -187,7 +191,7 @@ class Annotation:
                 for task, one in results:
                     self._passes[task] = one
                     finished += task.frames
-                    self._progress("tracking again" if task.use_memory else "tracking", finished, total)
+                    self.progress("tracking again" if task.use_memory else "tracking", finished, total)
 
     def missing(self) -> list[Task]:
         """The passes that are missing, longest first: of each stretch those without a memory, then those with one.
@@ -203,9 +207,15 @@ class Annotation:
             tasks += self._missing_of(stretch, use_memory=True) if again else plain
         return sorted(tasks, key=lambda task: -task.frames)
 
-    def submit(self, task: Task) -> Future[tuple[Task, Pass | None]]:
-        """Run a missing pass in one of the processes; `store` takes it."""
-        return self._workers.submit(_work, task, self.frames, self.settings)
+    def submit(self, task: Task) -> tuple[Future[tuple[Task, Pass | None]], Path]:
+        """Run a missing pass in one of the processes; `store` takes it.
+
+        The size of the file is the number of frames that are tracked. If the file is deleted, the pass is stopped.
+        """
+        file, count = tempfile.mkstemp(dir=self._folder.name)
+        os.close(file)
+        frames = replace(self.frames, count=Path(count))
+        return self._workers.submit(_work, task, frames, self.settings), Path(count)
 
     def store(self, future: Future[tuple[Task, Pass | None]]) -> None:
         """Store a pass that was submitted; it is used as long as the boxes that it began with are there."""
@@ -255,6 +265,24 @@ class Annotation:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
         passes = [one for task, one in self._passes.items() if one is not None and self._is_valid(task, name)]
         return sorted(passes, key=lambda one: (one.start, one.stop, one.with_memory))
+
+    def proposals(self, name: str, frame: int) -> dict[bool, Box | None]:
+        """The box of the best pass at a frame that is not a keyframe, for each direction: True is forwards.
+
+        The best one has the highest score there. A direction without a pass is left out.
+        """
+        boxes: dict[bool, Box | None] = {}
+        drawn = self.keyframes[name]
+        for stretch in self._stretches():
+            if stretch.object == name and stretch.start <= frame < stretch.stop:
+                for start, stop in self._ways(stretch):
+                    parts = (one.part(start, stop, drawn) for one in self.passes(name))
+                    place = abs(frame - start) - 1
+                    best = max(filter(None, parts), key=lambda part: part.scores[place], default=None)
+                    if best is not None:
+                        box = best.boxes[place]
+                        boxes[stop > start] = None if np.isnan(box[0]) else Box(*box.tolist())
+        return boxes
 
     def next_frame(self) -> NextFrame | None:
         """The first of `next_frames`; None if all frames are checked."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from contextlib import closing
@@ -28,6 +29,7 @@ class DecodedFrames:
     times  time of each frame in seconds
     rate   frames per second of the video
     name   that of the results
+    count  file to which a byte is appended for each frame that is read; without it, reading is an OSError
     """
 
     path: Path
@@ -35,14 +37,19 @@ class DecodedFrames:
     times: list[float]
     rate: float
     name: str
+    count: Path | None = None
 
     def __len__(self) -> int:
         return len(self.times)
 
     def __getitem__(self, number: int) -> UInt8:
+        if self.count is not None:
+            file = os.open(self.count, os.O_WRONLY | os.O_APPEND)
+            os.write(file, b".")
+            os.close(file)
         width, height = self.size
-        count = height * width * 3
-        return np.fromfile(self.path, np.uint8, count, offset=number * count).reshape(height, width, 3)
+        pixels = 3 * height * width
+        return np.fromfile(self.path, np.uint8, pixels, offset=number * pixels).reshape(height, width, 3)
 
 
 def open_frames(

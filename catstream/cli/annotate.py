@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +15,8 @@ from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
-from catstream.errors import VideoError
+from catstream.cli.view import HostPort, with_listen, with_token
+from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import Results
 
 if TYPE_CHECKING:
@@ -31,8 +34,10 @@ if TYPE_CHECKING:
     help="A box at a keyframe, in pixels; may be repeated.",
 )
 @click.option("--boxes", "csv_file", type=PATH, help="CSV file of boxes: frame,object,x,y,w,h.")
-@click.option("--output", type=FOLDER, required=True, help="Folder for the results.")
+@click.option("--output", type=FOLDER, help="Folder for the results; by default, NAME-annotation.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, that of the cores.")
+@with_listen
+@with_token()
 @with_overwrite
 @with_overrides
 @with_reading
@@ -41,20 +46,28 @@ def annotate(
     video: str,
     texts: tuple[str, ...],
     csv_file: Path | None,
-    output: Path,
+    output: Path | None,
     jobs: int | None,
+    listen: HostPort,
+    token: str | None,
     overwrite: bool,
 ) -> None:
     """Track objects between boxes at keyframes, and say which frames are right.
 
-    VIDEO is a file or a folder of images. Frames count from 0. A box is absent
-    where the object is not in the frame: anna@412=absent. An object without a
-    name is @FRAME=X,Y,W,H. One box of each object is enough to begin with.
+    VIDEO is a file or a folder of images. Without boxes, the command serves a
+    page on which they are drawn, see --listen and --token of catstream view;
+    each box is saved at once, and the same command continues. Ctrl-C or the
+    button Done ends it.
+
+    With boxes, it tracks and ends. Frames count from 0. A box is absent where
+    the object is not in the frame: anna@412=absent. An object without a name is
+    @FRAME=X,Y,W,H. One box of each object is enough to begin with. The command
+    prints the frame to look at next: add its box, and run the command again
+    with --boxes OUTPUT/keyframes.csv --overwrite.
 
     Each stretch between two keyframes is tracked from both of its ends. A frame
     is checked if the two agree so well that its box is right with a probability
-    of 96 %. The command prints the frame to look at next: add its box, and run
-    the command again with --boxes OUTPUT/keyframes.csv --overwrite.
+    of 96 %.
 
     \b
     OUTPUT
@@ -67,43 +80,77 @@ def annotate(
 
     \b
     EXAMPLES
+      catstream annotate walk.mp4
       catstream annotate walk.mp4 --box anna@0=120,80,64,48 --output out
       catstream annotate walk.mp4 --boxes out/keyframes.csv --box anna@412=300,90,60,50 --output out --overwrite
     """
     # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.annotation.annotation import Annotation
-        from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes, write_keyframes
+        from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes
 
     drawn = by_object([*([] if csv_file is None else read_keyframes(csv_file)), *map(parse_keyframe, texts)])
     if not drawn:
-        raise click.UsageError("missing box: pass --box NAME@FRAME=X,Y,W,H or --boxes FILE.csv")
-    # Checked before the work, which takes minutes.
-    boxes, following = output / "keyframes.csv", output / "next.csv"
-    for table in (boxes, following):
-        if table.exists() and not overwrite:
-            raise VideoError(f"{table} exists already: pass --overwrite, or another --output")
+        require_extra("view")
+    jobs = jobs or len(os.sched_getaffinity(0))
     bar = line_of(messages(), text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
+    settings = Settings.from_values(overrides)
+    with Annotation(
+        video, drawn, settings, jobs=jobs if drawn else 2 * jobs, progress=lambda *done: _show(bar, *done)
+    ) as annotation:
+        results = _ResultFiles(annotation, video, output or Path(f"{annotation.frames.name}-annotation"))
+        if drawn:
+            results.check(overwrite=overwrite)
+            interrupted = _track(annotation, results, bar)
+        else:
+            continues = results.keyframes.exists()
+            results.check(overwrite=overwrite or continues)
+            if continues:
+                annotation.set_boxes(by_object(read_keyframes(results.keyframes)))
+            interrupted = _serve(annotation, jobs, results, listen, token)
+    _report(annotation)
+    click.echo(f"results: {results.folder}")
+    if interrupted:
+        stopped(f"the results so far are in {results.folder}")
+
+
+def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool:
+    """Track between all boxes, and write the results; return whether it was interrupted."""
     interrupted = False
     with bar:
         bar.add_task("decoding", total=None)
-        with Annotation(
-            video, drawn, Settings.from_values(overrides), jobs=jobs, progress=lambda *done: _show(bar, *done)
-        ) as annotation:
-            annotation.decode()
-            files = _files(annotation, video, output, overwrite=overwrite)
-            files.make_folder()
-            write_keyframes(boxes, annotation.keyframes)
-            try:
-                annotation.track()
-            except KeyboardInterrupt:
-                interrupted = True
-            with INTERRUPTS.deferred():
-                _write(annotation, files, following)
-    _report(annotation)
-    click.echo(f"results: {output}")
-    if interrupted:
-        stopped(f"the results so far are in {output}")
+        annotation.decode()
+        results.save()
+        try:
+            annotation.track()
+        except KeyboardInterrupt:
+            interrupted = True
+        with INTERRUPTS.deferred():
+            results.write()
+    return interrupted
+
+
+def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: HostPort, token: str | None) -> bool:
+    """Serve the page until it is done or interrupted, and write the results; return whether it was interrupted."""
+    from catstream.annotation.session import Session
+    from catstream.web.annotator import AnnotationSite
+    from catstream.web.server import Server
+
+    with Session(annotation, jobs, results.save, results.write) as session:
+        server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
+        results.save()
+        with server.in_background():
+            for url in server.urls:
+                click.echo(url)
+            with suppress(KeyboardInterrupt):
+                session.finished.wait()
+    interrupted = not session.finished.is_set()
+    if interrupted and session.decoded:
+        with INTERRUPTS.deferred():
+            results.write()
+    if session.problem is not None:
+        raise session.problem
+    return interrupted
 
 
 def _show(bar: Progress, work: str, done: int, total: int | None) -> None:
@@ -113,30 +160,47 @@ def _show(bar: Progress, work: str, done: int, total: int | None) -> None:
     bar.update(task.id, description=work, completed=done, total=total)
 
 
-def _files(annotation: Annotation, video: str, output: Path, *, overwrite: bool) -> RunFiles:
-    """The log of the tracks; raise VideoError if it could not be written."""
-    from catstream.sinks.destinations import Head, Origin
-    from catstream.sinks.track_log import RunFiles, places_of
+class _ResultFiles:
+    """The log of the tracks, the keyframes, and the frames to look at next, in a folder."""
 
-    frames = annotation.frames
-    changed = tuple(annotation.settings.changed())
-    head = Head(source=video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
-    origin = Origin(video, image_rate=frames.rate, head=head)
-    files = RunFiles(origin, output, places_of(frames.name, Results(output=output)))
-    files.check(overwrite=overwrite, earlier=[])
-    return files
+    def __init__(self, annotation: Annotation, video: str, folder: Path) -> None:
+        self._annotation, self._video, self.folder = annotation, video, folder
+        self.keyframes, self._next = folder / "keyframes.csv", folder / "next.csv"
 
+    def check(self, *, overwrite: bool) -> None:
+        """Raise VideoError if a file could not be written, or is there and should not be overwritten."""
+        for table in (self.keyframes, self._next):
+            if table.exists() and not overwrite:
+                raise VideoError(f"{table} exists already: pass --overwrite, or another --output")
+        self._log().check(overwrite=overwrite, earlier=[])
 
-def _write(annotation: Annotation, files: RunFiles, following: Path) -> None:
-    """Write the log, and the table of the frames to look at next."""
-    from catstream.sinks.destinations import TrackedFrame
+    def save(self) -> None:
+        """Write the keyframes."""
+        from catstream.annotation.keyframes import write_keyframes
 
-    with files.opened("") as write:
-        for tracks in zip(*annotation.tracks.values(), strict=True):
-            write(TrackedFrame(list(tracks)))
-    rows = [f"{frame},{name},{errors:.1f}\n" for frame, name, errors in annotation.next_frames()]
-    with writing(following, VideoError):
-        write_atomically(following, "".join(["frame,object,errors\n", *rows]).encode())
+        self._log().make_folder()
+        write_keyframes(self.keyframes, self._annotation.keyframes)
+
+    def write(self) -> None:
+        """Write the log, and the table of the frames to look at next."""
+        from catstream.sinks.destinations import TrackedFrame
+
+        with self._log().opened("") as write:
+            for tracks in zip(*self._annotation.tracks.values(), strict=True):
+                write(TrackedFrame(list(tracks)))
+        rows = [f"{frame},{name},{errors:.1f}\n" for frame, name, errors in self._annotation.next_frames()]
+        with writing(self._next, VideoError):
+            write_atomically(self._next, "".join(["frame,object,errors\n", *rows]).encode())
+
+    def _log(self) -> RunFiles:
+        from catstream.sinks.destinations import Head, Origin
+        from catstream.sinks.track_log import RunFiles, places_of
+
+        frames = self._annotation.frames
+        changed = tuple(self._annotation.settings.changed())
+        head = Head(source=self._video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
+        origin = Origin(self._video, image_rate=frames.rate, head=head)
+        return RunFiles(origin, self.folder, places_of(frames.name, Results(output=self.folder)))
 
 
 def _report(annotation: Annotation) -> None:

@@ -81,7 +81,8 @@ def with_token(prefix: str = "") -> Decorator:
     )
 
 
-_with_listen = click.option(
+#: Adds `--listen`.
+with_listen = click.option(
     "--listen",
     default=f"127.0.0.1:{PORT}",
     show_default=True,
@@ -92,7 +93,7 @@ _with_listen = click.option(
 
 @click.command()
 @with_address
-@_with_listen
+@with_listen
 @with_token()
 def view(address: Address, listen: HostPort, token: str | None) -> None:
     """Watch and control a running pipeline in a browser.
@@ -123,7 +124,7 @@ def view(address: Address, listen: HostPort, token: str | None) -> None:
 
 @click.command("view")
 @with_fleet_address
-@_with_listen
+@with_listen
 @with_token()
 def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
     """Watch all streams of a fleet in a browser.

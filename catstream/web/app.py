@@ -20,7 +20,7 @@ from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Literal
+from typing import Literal, TypeVar
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -38,7 +38,9 @@ from catstream.web import prometheus
 from catstream.web.feed import Feed, FleetFeed, PipelineFeed
 from catstream.wire.codec import decode_json
 
-_PAGE = Path(__file__).with_name("page")
+_Kind = TypeVar("_Kind")
+
+PAGE = Path(__file__).with_name("page")
 
 UPDATE_SECONDS = 0.1  #: between two updates
 COMMENT_SECONDS = 5.0  #: without an update, after which a comment is sent, which detects closed connections
@@ -78,7 +80,7 @@ class Site:
             Route("/metrics", self._metrics),
             Route("/healthz", self._healthz),
             Route("/readyz", self._readyz),
-            Mount("/page", StaticFiles(directory=_PAGE)),
+            Mount("/page", StaticFiles(directory=PAGE)),
         ]
         routes = [
             *common,
@@ -88,7 +90,7 @@ class Site:
         ]
         if isinstance(feed, FleetFeed):
             routes = [*common, Mount("/streams/{stream}", routes=routes)]
-        handlers = {CatstreamError: _failed}
+        handlers = {CatstreamError: failed}
         self.app = Starlette(lifespan=self._lifespan, routes=routes, exception_handlers=handlers)
 
     def close(self) -> None:
@@ -103,10 +105,10 @@ class Site:
 
     async def _index(self, request: Request) -> Response:
         self._feed_of(request)
-        return FileResponse(_PAGE / "index.html")
+        return FileResponse(PAGE / "index.html")
 
     async def _events(self, request: Request) -> Response:
-        return _endless(request, self._updates(self._feed_of(request)), "text/event-stream")
+        return endless(request, self._updates(self._feed_of(request)), "text/event-stream")
 
     async def _metrics(self, request: Request) -> Response:
         text = prometheus.text(self._feed_of(request))
@@ -127,18 +129,11 @@ class Site:
 
     async def _live(self, request: Request) -> Response:
         pictures = self._annotated_pictures(self._pipeline(request))
-        return _endless(request, pictures, "multipart/x-mixed-replace; boundary=picture")
+        return endless(request, pictures, "multipart/x-mixed-replace; boundary=picture")
 
     async def _control(self, request: Request) -> Response:
         feed = self._pipeline(request)
-        # A page of another origin cannot send this content type without a CORS preflight request.
-        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-            raise HTTPException(415, "expected application/json\n")
-        body = b""
-        async for part in request.stream():
-            if len(body := body + part) > _MAX_BODY:
-                raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
-        command = decode_json(body, Command)
+        command = await json_of(request, Command)
         box = Box(*command.box) if command.box is not None else None
         try:
             answer = await run_in_threadpool(feed.execute, **asdict(command) | {"box": box})
@@ -164,12 +159,12 @@ class Site:
             while not self._closed:
                 if parts := feed.dashboard.updates(revisions):
                     last_sent = monotonic()
-                    yield _event(parts)
+                    yield event(parts)
                 elif monotonic() - last_sent > COMMENT_SECONDS:
                     last_sent = monotonic()
                     yield ":\n\n"
                 await asyncio.sleep(UPDATE_SECONDS)
-            yield _event({**feed.dashboard.updates(revisions), "closed": True})
+            yield event({**feed.dashboard.updates(revisions), "closed": True})
 
     async def _annotated_pictures(self, feed: PipelineFeed) -> AsyncIterator[bytes]:
         last = None
@@ -186,12 +181,24 @@ class Site:
                 await asyncio.sleep(UPDATE_SECONDS)
 
 
-def _endless(request: Request, parts: AsyncIterator[str] | AsyncIterator[bytes], media_type: str) -> Response:
+async def json_of(request: Request, kind: type[_Kind]) -> _Kind:
+    """The message in the body of a request; ProtocolError if it is too long or not valid."""
+    # A page of another origin cannot send this content type without a CORS preflight request.
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        raise HTTPException(415, "expected application/json\n")
+    body = b""
+    async for part in request.stream():
+        if len(body := body + part) > _MAX_BODY:
+            raise ProtocolError(f"expected at most {_MAX_BODY} bytes, got more")
+    return decode_json(body, kind)
+
+
+def endless(request: Request, parts: AsyncIterator[str] | AsyncIterator[bytes], media_type: str) -> Response:
     """Return the response to a request, which ends only for a HEAD request: its response has no parts."""
     return StreamingResponse(iter(()) if request.method == "HEAD" else parts, media_type=media_type)
 
 
-def _event(parts: dict[str, object]) -> str:
+def event(parts: dict[str, object]) -> str:
     return f"data: {json.dumps(parts, separators=(',', ':'))}\n\n"
 
 
@@ -207,6 +214,6 @@ class Command:
     time: float | None = None
 
 
-def _failed(_: Request, error: Exception) -> Response:
+def failed(_: Request, error: Exception) -> Response:
     code = next(code for kind, code in _CODES.items() if isinstance(error, kind))
     return JSONResponse({"done": False, "reason": str(error)}, code)

@@ -21,6 +21,7 @@ from starlette.responses import FileResponse, PlainTextResponse, RedirectRespons
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from catstream.errors import ServiceError
+from catstream.web.annotator import AnnotationSite
 from catstream.web.app import Site
 
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
@@ -58,7 +59,9 @@ class Server:
     short, or the port is in use.
     """
 
-    def __init__(self, site: Site, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None) -> None:
+    def __init__(
+        self, site: Site | AnnotationSite, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None
+    ) -> None:
         if token is None and host not in _LOOPBACK:
             raise ServiceError(
                 f"{host} can be reached from other machines, and anyone who opens the page may control the pipeline: "

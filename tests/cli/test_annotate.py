@@ -59,7 +59,6 @@ def test_the_log_of_an_annotation_is_exported_as_that_of_a_run(demo, succeed, tm
         (["anna@99=1,2,30,40"], f"anna: frame 99 is not in the video, which has {FRAMES} frames"),
         (["anna@0=900,2,30,40"], "outside the frame"),
         (["anna=1,2,30,40"], "expected NAME@FRAME=X,Y,W,H"),
-        ([], "missing box: pass --box NAME@FRAME=X,Y,W,H or --boxes FILE.csv"),
     ],
 )
 def test_boxes_that_cannot_be_used_are_an_error_of_one_line(demo, fail, tmp_path, boxes, message):
@@ -89,3 +88,13 @@ def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, mo
     assert (code, errors) == (130, f"stopped: the results so far are in {tmp_path / 'out'}\n")
     assert len(rows(tmp_path / "out" / "keyframes.csv")) == 1
     assert len(rows(tmp_path / "out" / "demo.csv")) == FRAMES
+
+
+def test_the_page_without_its_extra_is_an_error_with_the_install_command(demo, fail, tmp_path, monkeypatch):
+    monkeypatch.setattr("catstream.errors.find_spec", lambda _: None)
+    assert 'install "catstream[view]"' in fail("annotate", demo[0], "--output", tmp_path / "out")
+
+
+def test_the_page_does_not_replace_the_results_of_another_run(demo, fail, tmp_path):
+    (tmp_path / "demo.ndjson").write_text("{}\n")
+    assert "demo.ndjson exists already" in fail("annotate", demo[0], "--output", tmp_path)

@@ -47,7 +47,7 @@ export class Stage {
     while (this.next) {
       const [wanted, turn, image] = [this.next, this.turn, new Image()];
       this.next = null;
-      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: `pictures/${wanted.time}.jpg?${Date.now()}` });
+      Object.assign(image, { id: this.image.id, alt: "", draggable: false, src: this.url(wanted) });
       const loaded = await image.decode().then(() => true, () => false);
       // A picture of the previous pipeline is not shown, nor a newer one than that on which a box is drawn.
       if (!loaded || turn !== this.turn || (this.still && this.still.frame < wanted.frame)) continue;
@@ -56,6 +56,10 @@ export class Stage {
       this.draw();
     }
     this.loading = false;
+  }
+
+  url({ time }) {
+    return `pictures/${time}.jpg?${Date.now()}`;
   }
 
   /** Hold the picture, and begin to draw a box. */

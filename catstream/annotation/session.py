@@ -1,0 +1,191 @@
+"""An annotation that a person changes while its passes run: what the page of `catstream annotate` shows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Self
+
+from catstream.annotation.annotation import Annotation, NextFrame, Task
+from catstream.base.box import Box
+from catstream.errors import CatstreamError, VideoError
+from catstream.messages.kinds import Track
+
+#: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
+_LONG = 600
+
+
+class _StoppedError(Exception):
+    pass
+
+
+class Session:
+    """Changes the boxes of an annotation, while a thread decodes the video and tracks what is missing.
+
+    The passes of the newest box run first. The methods may be called from any thread. Use it in a `with`; the owner
+    of the annotation closes it afterwards.
+
+    Parameters
+    ----------
+    annotation : Annotation that is not decoded yet
+    jobs : number of passes that run at a time, and as many long ones beside them
+    save : function that is called after each change of the keyframes
+    write : function that is called by `finish`, for the results
+
+    Attributes
+    ----------
+    revision : number of changes of what follows
+    decoded : whether the frames of the video are decoded
+    tracks : the newest tracks of the objects, by name
+    next_frames : frames to look at next, but those in stretches that are tracked at present
+    problem : error that ended decoding or tracking; None if there is none
+    finished : event that `finish` sets
+    lock : held while the annotation changes
+    """
+
+    def __init__(
+        self, annotation: Annotation, jobs: int, save: Callable[[], object], write: Callable[[], object]
+    ) -> None:
+        self.annotation, self._jobs, self._save, self._write = annotation, jobs, save, write
+        self.revision, self.decoded = 0, False
+        self.tracks: dict[str, list[Track]] = {}
+        self.next_frames: list[NextFrame] = []
+        self.problem: CatstreamError | None = None
+        self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())
+        self._history: list[tuple[str, int, dict[str, dict[int, Box | None]]]] = []  # object, frame, boxes before
+        self._newest: tuple[str, int] | None = None  # object and frame of the last change
+        self._missing: list[Task] = []
+        self._running: dict[Future[Any], tuple[Task, Path]] = {}  # with the file that counts its frames
+        self._wakes, self._closed = True, False
+        self._thread = threading.Thread(target=self._run, name="session", daemon=True)
+        annotation.progress = self._decoded_one
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed = True
+        self._wake()
+        self._thread.join()
+
+    @property
+    def can_undo(self) -> bool:
+        return bool(self._history)
+
+    def draw(self, object: str, frame: int, box: Box | None) -> None:
+        """Add or replace the box of an object at a frame, None if it is absent there; errors as of `Annotation`."""
+        with self.lock:
+            before = self.annotation.keyframes
+            self._newest = object, frame
+            self._replace({**before, object: {**before.get(object, {}), frame: box}})
+            self._history.append((object, frame, before))
+
+    def undo(self) -> tuple[str, int] | None:
+        """Undo the last change of a box; return its object and frame, None if there is none."""
+        with self.lock:
+            if not self._history:
+                return None
+            object, frame, before = self._history.pop()
+            self._replace(before)
+            return object, frame
+
+    def rename(self, object: str, name: str) -> None:
+        """Rename an object, also in the changes that can be undone; ObjectError as of `Annotation.rename`."""
+        with self.lock:
+            self.annotation.rename(object, name)
+            self._save()
+            names = {object: name}
+            self._history = [
+                (names.get(one, one), frame, {names.get(each, each): drawn for each, drawn in before.items()})
+                for one, frame, before in self._history
+            ]
+            self._wake()
+
+    def finish(self) -> None:
+        """Write the results of what is tracked so far, and set `finished`. VideoError if they cannot be written."""
+        with self.lock:
+            if not self.decoded:
+                raise VideoError("the video is not decoded yet: wait, or press Ctrl-C where the command runs")
+            self._write()
+        self.finished.set()
+
+    def remaining(self) -> int:
+        """Number of frames that passes have to track, in both directions."""
+        with self.lock:
+            tracked = {task: count.stat().st_size for task, count in self._running.values()}
+            return sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing)
+
+    def _replace(self, keyframes: dict[str, dict[int, Box | None]]) -> None:
+        before = self.annotation.keyframes
+        self.annotation.set_boxes(keyframes)
+        try:
+            self._save()
+        except BaseException:
+            self.annotation.set_boxes(before)
+            raise
+        self._wake()
+
+    def _wake(self) -> None:
+        with self.lock:
+            self._wakes = True
+            self.lock.notify()
+
+    def _decoded_one(self, *_: object) -> None:
+        if self._closed:
+            raise _StoppedError
+
+    def _run(self) -> None:
+        try:
+            try:
+                self.annotation.decode()
+            except VideoError as error:  # the frames before it are annotated
+                self.problem = error
+            self.annotation.decode()
+            self.decoded = True
+            while True:
+                with self.lock:
+                    self.lock.wait_for(lambda: self._wakes or self._closed)
+                    if self._closed:
+                        return
+                    self._wakes = False
+                    self._schedule()
+        except CatstreamError as error:
+            self.problem = error
+        except _StoppedError:  # while it decodes
+            pass
+
+    def _schedule(self) -> None:
+        """Store the passes that ended, stop those that are not missing any more, and start others."""
+        for future in [each for each in self._running if each.done()]:
+            del self._running[future]
+            self.annotation.store(future)
+        self._missing = self.annotation.missing()
+        for future, (task, count) in [*self._running.items()]:
+            if task not in self._missing:
+                count.unlink()  # ends it
+                del self._running[future]
+        running = [task for task, _ in self._running.values()]
+        for task in sorted(self._missing, key=self._priority):
+            alike = [each for each in running if (each.frames > _LONG) == (task.frames > _LONG)]
+            if task not in running and len(alike) < self._jobs:
+                running.append(task)
+                future, count = self.annotation.submit(task)
+                self._running[future] = task, count
+                future.add_done_callback(lambda _: self._wake())
+        self.tracks = self.annotation.tracks
+        self.next_frames = [each for each in self.annotation.next_frames() if not self._is_tracked(each)]
+        self.revision += 1
+
+    def _priority(self, task: Task) -> tuple[bool, int]:
+        return (task.object, task.start) != self._newest and (task.object, task.stop) != self._newest, task.frames
+
+    def _is_tracked(self, following: NextFrame) -> bool:
+        """Whether passes are missing that may check the frame; none can at an end of the video without a box."""
+        frame, ends = following.frame, (0, len(self.annotation.frames) - 1)
+        around = (task for task in self._missing if task.object == following.object)
+        return frame not in ends and any(
+            min(each.start, each.stop) <= frame <= max(each.start, each.stop) for each in around
+        )

@@ -1,0 +1,167 @@
+"""The web application of `catstream annotate`: a page that shows a session, and changes its boxes.
+
+/                the page
+/events          the state of the session as server-sent events, at most ten per second
+/frames/N.jpg    the picture of a frame
+/frames/N        what the passes say about the objects in it
+/edit            POST a change: the fields of `Edit`
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Literal
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from catstream.annotation.session import Session
+from catstream.base.box import Box
+from catstream.base.names import check_name
+from catstream.errors import CatstreamError
+from catstream.messages.kinds import Track
+from catstream.video.drawing import PALETTE
+from catstream.video.frames import jpeg
+from catstream.web.app import PAGE, UPDATE_SECONDS, endless, event, failed, json_of
+
+_SIDE = 1920  #: longest side of a picture in pixels; a larger frame is scaled down
+
+
+class AnnotationSite:
+    """The web application of a session, `app`, without access control; `Server` serves it."""
+
+    def __init__(self, session: Session) -> None:
+        self._session, self._closed = session, False
+        routes = [
+            Route("/", lambda _: FileResponse(PAGE / "annotate.html")),
+            Route("/events", lambda request: endless(request, self._states(), "text/event-stream")),
+            Route("/frames/{number:int}.jpg", self._picture),
+            Route("/frames/{number:int}", self._frame),
+            Route("/edit", self._edit, methods=["POST"]),
+            Mount("/page", StaticFiles(directory=PAGE)),
+        ]
+        self.app = Starlette(routes=routes, exception_handlers={CatstreamError: failed})
+
+    def close(self) -> None:
+        """End the events of all open pages; called before the shutdown of a server, which waits for them."""
+        self._closed = True
+
+    def _picture(self, request: Request) -> Response:
+        return Response(
+            jpeg(self._session.annotation.frames[self._number(request)], _SIDE, 90), media_type="image/jpeg"
+        )
+
+    def _frame(self, request: Request) -> Response:
+        """The box of each object in a frame, and the proposals if it is unchecked."""
+        number, session = self._number(request), self._session
+        objects = {}
+        with session.lock:
+            for name, drawn in session.annotation.keyframes.items():
+                track = next(iter(session.tracks.get(name, [])[number : number + 1]), None)
+                box = track.box if track else None
+                check = track.checked if track else "unchecked"
+                proposals = session.annotation.proposals(name, number) if session.decoded else {}
+                objects[name] = {
+                    "box": _rounded(drawn.get(number, box)),
+                    "checked": "keyframe" if number in drawn else check,
+                    "proposals": [[_rounded(proposals[way])] if way in proposals else None for way in (True, False)],
+                }
+        return JSONResponse(objects)
+
+    def _number(self, request: Request) -> int:
+        number: int = request.path_params["number"]
+        if number >= len(self._session.annotation.frames):
+            raise HTTPException(404, f"frame {number} is not in the video, or not decoded yet\n")
+        return number
+
+    async def _edit(self, request: Request) -> Response:
+        edit = await json_of(request, Edit)
+        return JSONResponse({"done": True, **await run_in_threadpool(self._change, edit)})
+
+    def _change(self, edit: Edit) -> dict[str, object]:
+        if edit.verb == "undo":
+            undone = self._session.undo()
+            return {} if undone is None else {"object": undone[0], "frame": undone[1]}
+        if edit.verb == "rename":
+            self._session.rename(edit.object, edit.name)
+        elif edit.verb == "done":
+            self._session.finish()
+        else:
+            self._session.draw(check_name(edit.object), edit.frame, edit.box and Box(*edit.box))
+        return {}
+
+    async def _states(self) -> AsyncIterator[str]:
+        """Yield the state whenever it has changed, as server-sent events."""
+        last = None
+        while not self._closed:
+            state = await run_in_threadpool(self._state)
+            if state != last:
+                yield event(state)
+            last = state
+            await asyncio.sleep(UPDATE_SECONDS)
+        yield event({"closed": True})
+
+    def _state(self) -> dict[str, object]:
+        session, frames = self._session, self._session.annotation.frames
+        with session.lock:
+            objects = [
+                {
+                    "name": name,
+                    "colour": PALETTE[number % len(PALETTE)],
+                    "keyframes": sorted(drawn),
+                    "unchecked": [*_unchecked(session.tracks[name])]
+                    if name in session.tracks
+                    else [(0, len(frames) - 1)],
+                }
+                for number, (name, drawn) in enumerate(session.annotation.keyframes.items())
+            ]
+        return {
+            "video": frames.name,
+            "size": frames.size,
+            "frames": len(frames),
+            "decoded": session.decoded,
+            "objects": objects,
+            "next": [*session.next_frames[:99]],
+            "remaining": session.remaining(),
+            "revision": session.revision,
+            "undo": session.can_undo,
+            "problem": str(session.problem or ""),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A change of the page.
+
+    verb    "draw" a box at a frame, none if the object is absent; "undo" the last one; "rename" an object; "done"
+    object  name of the object
+    frame   number of the frame
+    box     x, y, w, h in pixels
+    name    the new name
+    """
+
+    verb: Literal["draw", "undo", "rename", "done"]
+    object: str = ""
+    frame: int = 0
+    box: tuple[float, float, float, float] | None = None
+    name: str = ""
+
+
+def _rounded(box: Box | None) -> list[float] | None:
+    return box and [round(side, 1) for side in box]
+
+
+def _unchecked(tracks: list[Track]) -> Iterator[tuple[int, int]]:
+    """Yield the first and the last number of neighbouring frames that are not checked."""
+    for check, group in groupby(tracks, key=lambda track: track.checked):
+        if check == "unchecked":
+            frames = [track.frame for track in group]
+            yield frames[0], frames[-1]

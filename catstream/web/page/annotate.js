@@ -1,0 +1,279 @@
+// The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
+
+import { $, add, Items, make, many, write } from "./dom.js";
+import { Stage } from "./stage.js";
+
+const JUMP = 25; // frames of a page key
+const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
+const CHECKS = { keyframe: "your box", checked: "checked", unchecked: "may be wrong" };
+const KEYS = { n: "next", Enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
+
+/** The picture of a frame; a box is saved as soon as it is drawn. */
+class FrameStage extends Stage {
+  url({ frame }) {
+    return `frames/${frame}.jpg`;
+  }
+
+  release(clicked) {
+    super.release(clicked);
+    if (this.box) this.accept().then(() => this.cancel());
+  }
+}
+
+class AnnotatePage {
+  constructor() {
+    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: false });
+    this.work = { began: 0, done: 0, remaining: 0 }; // time of the start of the passes that run, and their frames
+    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box), changed: () => {} });
+    this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
+    const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
+      first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
+      new: () => this.choose(null), done: () => this.done() };
+    for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
+    $("#slider").oninput = () => this.go(Number($("#slider").value));
+    $("#name").onchange = () => this.rename();
+    $("#naming").onsubmit = (event) => { event.preventDefault(); $("#name").blur(); };
+    addEventListener("keydown", (event) => this.key(event));
+    new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
+    const events = new EventSource("events");
+    events.onmessage = ({ data }) => this.receive(JSON.parse(data));
+    events.onerror = () => { this.silent = true; this.show(); };
+    this.choose(null);
+  }
+
+  /** Show another state of the server, or that it has ended. */
+  receive({ closed, ...state }) {
+    this.silent = Boolean(closed);
+    if (!closed) {
+      const { work } = this;
+      const before = this.state?.objects ?? [];
+      if (!work.remaining) Object.assign(work, { began: Date.now(), done: 0 });
+      work.done += Math.max(0, work.remaining - state.remaining);
+      work.remaining = state.remaining;
+      this.state = state;
+      if (!before.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
+      this.load();
+    }
+    this.show();
+  }
+
+  // The interface of the objects that a stage shows.
+  get single() {
+    return false;
+  }
+
+  get(name) {
+    return name in WAYS ? { colour: WAYS[name] } : this.state?.objects.find((one) => one.name === name);
+  }
+
+  /** Choose an object, null for a new one; a proposal is taken. */
+  choose(name) {
+    if (name in WAYS) return this.take(name);
+    this.chosen = name;
+    let number = 1;
+    while (this.get(`object-${number}`)) number += 1;
+    $("#name").value = name ?? `object-${number}`;
+    if (name === null && this.state?.objects.length) $("#name").select();
+    this.showBoxes();
+    this.show();
+  }
+
+  /** Go to a frame, and choose an object. */
+  go(frame, name = this.chosen) {
+    this.stage.cancel();
+    this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
+    if (name !== this.chosen) this.choose(name);
+    this.show();
+    this.load();
+  }
+
+  jump(frame, name) {
+    this.visited.push([this.frame, this.chosen]);
+    this.go(frame, name);
+  }
+
+  /** Load the boxes and the picture of the frame; of several frames in a row, the last one. */
+  async load() {
+    this.wanted = true;
+    if (this.loading) return;
+    this.loading = true;
+    while (this.wanted) {
+      this.wanted = false;
+      const { frame, state: { size: [width, height] } } = this;
+      const boxes = await fetch(`frames/${frame}`).then((answer) => answer.ok && answer.json(), () => null);
+      if (!boxes) continue;
+      this.boxes = boxes;
+      if (this.stage.picture?.frame !== frame) await this.stage.show({ frame, width, height, boxes: {} });
+      this.showBoxes();
+      this.show();
+    }
+    this.loading = false;
+  }
+
+  /** The proposals for the chosen object in this frame, by name: a box, null if it is absent. */
+  get proposals() {
+    const { checked, proposals } = this.boxes[this.chosen] ?? {};
+    if (checked !== "unchecked") return {};
+    return Object.fromEntries(Object.keys(WAYS).flatMap((name, way) => (proposals[way] ? [[name, proposals[way][0]]] : [])));
+  }
+
+  showBoxes() {
+    if (!this.stage.picture) return;
+    const proposed = Object.entries(this.proposals), known = Object.entries(this.boxes).map(([name, { box }]) => [name, box]);
+    const boxes = [...known.filter(([name]) => !proposed.length || name !== this.chosen), ...proposed];
+    this.stage.picture.boxes = Object.fromEntries(boxes.filter(([, box]) => box));
+    this.stage.draw();
+  }
+
+  /** Send a change; returns the answer, null if it was rejected, after showing the reason. */
+  async send(verb, more = {}) {
+    let answer;
+    try {
+      const response = await fetch("edit", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ verb, ...more }) });
+      const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
+      answer = json ? await response.json() : { done: false, reason: (await response.text()).trim() };
+    } catch {
+      answer = { done: false, reason: "the server of this page does not answer: the last change is not saved" };
+    }
+    write($("#message"), answer.reason ?? "");
+    return answer.done ? answer : null;
+  }
+
+  /** Save the box of the chosen object in this frame, or of a new one; null if it is absent. */
+  async set(box) {
+    const object = this.chosen ?? $("#name").value.trim();
+    const { frame } = this;
+    const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
+    if (answer && this.chosen === null) this.choose(object.normalize("NFC"));
+    return answer;
+  }
+
+  take(name) {
+    if (name in this.proposals) this.set(this.proposals[name]);
+  }
+
+  /** Begin with the box that is there, to change it with the keyboard. */
+  async draw() {
+    await this.stage.begin();
+    const { width, height } = this.stage.picture;
+    const [x, y, w, h] = this.boxes[this.chosen]?.box ?? [width * 0.4, height * 0.4, width * 0.2, height * 0.2];
+    this.stage.set(x, y, w, h);
+  }
+
+  async rename() {
+    const name = $("#name").value.trim().normalize("NFC");
+    if (this.chosen === null || name === this.chosen) return;
+    if (await this.send("rename", { object: this.chosen, name })) this.chosen = name;
+    else $("#name").value = this.chosen;
+  }
+
+  async undo() {
+    const { object, frame } = (await this.send("undo")) ?? {};
+    if (object !== undefined) this.go(frame, object);
+  }
+
+  async done() {
+    if (!(await this.send("done"))) return;
+    this.ended = true;
+    this.show();
+  }
+
+  /** The frames to look at next, but this one. */
+  get following() {
+    return (this.state?.next ?? []).filter(([frame, name]) => frame !== this.frame || name !== this.chosen);
+  }
+
+  next() {
+    const [[frame, name] = []] = this.following;
+    if (name !== undefined) this.jump(frame, name);
+  }
+
+  key(event) {
+    const { key, target } = event;
+    const steps = { ArrowLeft: -1, ArrowRight: 1, PageUp: -JUMP, PageDown: JUMP, Home: -Infinity, End: Infinity };
+    if (target.id === "name" || event.altKey || (event.ctrlKey || event.metaKey) !== (key === "z")) return;
+    if (this.stage.drawing) return this.stage.key(event);
+    if (key in steps) this.go(this.frame + steps[key]);
+    else if (key === "z") this.undo();
+    else if (key.length === 1 || target.tagName !== "BUTTON") $(`#${KEYS[key.length === 1 ? key.toLowerCase() : key]}`)?.click();
+    else return;
+    event.preventDefault();
+  }
+
+  makeRow(name) {
+    const element = document.createElement("li");
+    const choose = add(element, "button", { type: "button", onclick: () => this.choose(name) });
+    add(choose, "i", { className: "swatch" });
+    add(choose, "b", { textContent: name || "no name" });
+    const line = make("svg", { role: "img", preserveAspectRatio: "none" });
+    line.onclick = (event) => this.jump(Math.floor(this.state.frames * event.offsetX / line.clientWidth), name);
+    element.append(line);
+    return { element, choose, line, share: add(element, "span", { className: "share number" }) };
+  }
+
+  fillRow({ element, choose, line, share }, { name, colour, keyframes, unchecked, frames, frame, chosen }) {
+    element.style.setProperty("--colour", colour);
+    choose.setAttribute("aria-pressed", String(chosen));
+    const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, height: 1 });
+    const mark = (kind, place) => make("line", { class: kind, x1: place + 0.5, x2: place + 0.5, y2: 1 });
+    line.setAttribute("viewBox", `0 0 ${frames} 1`);
+    line.replaceChildren(bar("right", 0, frames - 1), ...unchecked.map(([first, last]) => bar("wrong", first, last)),
+      ...keyframes.map((place) => mark("", place)), mark("now", frame));
+    const wrong = unchecked.reduce((sum, [first, last]) => sum + last - first + 1, 0);
+    const percent = Math.floor(100 * (1 - wrong / frames));
+    write(share, `${percent}%`);
+    line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the frames checked`);
+  }
+
+  show() {
+    const { state, frame, chosen, boxes, ended, silent, following, proposals } = this;
+    const objects = state?.objects ?? [], known = this.get(chosen);
+    const [kind, words] = this.progress();
+    $("#state").dataset.state = kind;
+    write($("#state b"), words);
+    write($("#overlay"), this.overlay());
+    if (!state) return;
+    write($("#source"), state.video);
+    document.title = `${state.video} – catstream annotate`;
+    write($("#problem"), state.problem);
+    Object.assign($("#slider"), { max: state.frames - 1, value: frame });
+    write($("#frame"), `${frame} of ${state.frames}`);
+    $("#naming").style.setProperty("--colour", known?.colour ?? "transparent");
+    write($("#check"), boxes[chosen] ? `${chosen || "The object"} in frame ${frame}: ${boxes[chosen].box ? "" : "absent, "}${CHECKS[boxes[chosen].checked]}` : "A new object: draw its box");
+    for (const [id, name] of [["first", "1 forwards"], ["second", "2 backwards"]]) {
+      write($(`#${id} span`), `Take ${name.slice(2)}${name in proposals && !proposals[name] ? ": absent" : ""}`);
+      $(`#${id}`).disabled = !(name in proposals);
+    }
+    const [[place, name, errors] = []] = following;
+    const all = objects.length && state.decoded && !state.next.length && !state.remaining;
+    write($("#next span"), place !== undefined ? `Look next at frame ${place}, ${name || "the object"}: about ${many(Math.max(1, Math.round(errors)), "frame")} around it may be wrong`
+      : all ? "All frames are checked" : objects.length ? "Tracking" : "Draw the first box");
+    const off = silent || ended;
+    $("#next").disabled = off || place === undefined;
+    $("#absent").disabled = off || !known;
+    $("#undo").disabled = off || !state.undo;
+    $("#back").disabled = !this.visited.length;
+    for (const id of ["draw", "new", "done", "name"]) $(`#${id}`).disabled = off;
+    $("#objects").hidden = !objects.length;
+    this.rows.show(objects.map((one) => [one.name, { ...one, frames: state.frames, frame, chosen: one.name === chosen }]));
+  }
+
+  /** What the server does, as a state for its colour and in words. */
+  progress() {
+    const { state, ended, silent, work } = this;
+    if (ended) return ["ended", "done"];
+    if (silent || !state) return ["silent", silent ? "page stopped" : "connecting"];
+    if (!state.decoded) return ["bootstrapping", `decoding: ${many(state.frames, "frame")}`];
+    if (!state.remaining) return ["present", "all boxes saved"];
+    const seconds = work.done ? Math.ceil(state.remaining * (Date.now() - work.began) / work.done / 1000) : null;
+    return ["bootstrapping", `tracking${seconds === null ? "" : `: ${seconds} s left`}`];
+  }
+
+  overlay() {
+    if (this.ended) return "Done: the results are written, and the command has ended. This tab can be closed.";
+    if (this.silent) return "The server of this page does not answer. All boxes that were drawn are saved: run the same command to continue.";
+    return this.stage.picture ? "" : "Waiting for the first frame";
+  }
+}
+
+new AnnotatePage();

@@ -1,0 +1,127 @@
+"""A session: what a person changes is saved at once, tracked in the background, and undone."""
+
+import shutil
+
+import pytest
+
+from catstream.annotation import session as module
+from catstream.annotation.annotation import Annotation
+from catstream.annotation.session import Session
+from catstream.base.box import Box
+from catstream.errors import BoxError, ObjectError, ServiceError, VideoError
+
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def demo(demo_video):
+    return demo_video(FRAMES)
+
+
+@pytest.fixture
+def saved():
+    return []
+
+
+@pytest.fixture
+def session(demo, saved):
+    annotation = Annotation(demo[0], {}, jobs=2)
+    with annotation, Session(annotation, 1, lambda: saved.append(annotation.keyframes), lambda: None) as one:
+        yield one
+
+
+def test_boxes_are_saved_and_tracked_until_all_frames_are_checked(session, saved, demo, until):
+    truth = demo[1]
+    until(lambda: session.decoded)
+    session.draw("anna", 0, truth[0])
+    until(lambda: [each.frame for each in session.next_frames] == [FRAMES - 1])
+    session.draw("anna", FRAMES - 1, truth[-1])
+    assert saved[-1] == {"anna": {0: truth[0], FRAMES - 1: truth[-1]}}
+    until(lambda: session.remaining() == 0 and not session.next_frames)
+    assert {track.checked for track in session.tracks["anna"]} == {"keyframe", "checked"}
+
+
+def test_a_change_that_is_undone_brings_the_earlier_box_and_passes_back(session, saved, demo, until):
+    truth = demo[1]
+    until(lambda: session.decoded)
+    session.draw("anna", 0, truth[0])
+    until(lambda: session.annotation.passes("anna"))
+    before = session.annotation.passes("anna")
+    session.draw("anna", 0, truth[0].centred(60, 60))
+    assert session.annotation.passes("anna") == []
+    assert session.undo() == ("anna", 0)
+    assert session.annotation.passes("anna") == before
+    assert session.undo() == ("anna", 0)
+    assert saved[-1] == {}
+    assert session.undo() is None
+
+
+def test_a_renamed_object_keeps_its_passes_and_can_be_undone(session, demo, until):
+    until(lambda: session.decoded)
+    session.draw("anna", 0, demo[1][0])
+    until(lambda: session.annotation.passes("anna"))
+    session.rename("anna", "ben")
+    assert session.annotation.passes("ben")
+    session.draw("ben", 3, None)
+    assert session.undo() == ("ben", 3)
+    assert session.annotation.keyframes == {"ben": {0: demo[1][0]}}
+
+
+def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo, until, monkeypatch):
+    monkeypatch.setattr(module, "_LONG", 0)
+    until(lambda: session.decoded)
+    session.draw("anna", 0, demo[1][0].centred(60, 60))
+    until(session.remaining)
+    session.draw("anna", 0, demo[1][0])
+    until(lambda: session.annotation.passes("anna") and not session.remaining())
+    assert session.tracks["anna"][5].box.overlap(demo[1][5]) > 0.5
+    assert len(session.annotation.passes("anna")) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (("anna", 99, Box(1, 2, 30, 40)), BoxError),
+        (("anna", 0, Box(900, 2, 30, 40)), BoxError),
+        (("a b", 0, Box(1, 2, 30, 40)), ObjectError),
+        (("anna", 0, None), ObjectError),
+    ],
+)
+def test_a_change_that_is_not_valid_is_not_saved(session, saved, until, change, error):
+    until(lambda: session.decoded)
+    with pytest.raises(error):
+        session.draw(*change)
+    assert (saved, session.annotation.keyframes, session.can_undo) == ([], {}, False)
+
+
+def test_a_change_that_cannot_be_saved_is_undone(demo, until):
+    def full():
+        raise ServiceError("the disk is full")
+
+    with Annotation(demo[0], {}) as annotation, Session(annotation, 1, full, full) as session:
+        until(lambda: session.decoded)
+        with pytest.raises(ServiceError):
+            session.draw("anna", 0, demo[1][0])
+        assert annotation.keyframes == {}
+
+
+def test_the_frames_before_one_that_cannot_be_decoded_are_annotated(walk, until, tmp_path):
+    images = shutil.copytree(walk / "img", tmp_path / "img")
+    (images / "0006.png").write_bytes(b"no image")
+    with Annotation(images, {}) as annotation, Session(annotation, 1, lambda: None, lambda: None) as session:
+        until(lambda: session.decoded)
+        assert len(annotation.frames) == 5
+        assert "0006.png" in str(session.problem)
+        session.draw("anna", 4, Box(20, 20, 30, 30))
+        until(lambda: len(session.tracks.get("anna", [])) == 5)
+
+
+def test_a_session_that_ends_while_it_decodes_is_not_decoded(demo):
+    with Annotation(demo[0], {}) as annotation:
+        session = Session(annotation, 1, lambda: None, lambda: None)
+        session._closed = True
+        with session:
+            pass
+        assert (session.decoded, session.problem) == (False, None)
+        with pytest.raises(VideoError, match="not decoded yet"):
+            session.finish()

@@ -1,0 +1,156 @@
+"""The server of `catstream annotate`: its state, pictures of frames, changes, and what it rejects."""
+
+import json
+import os
+from contextlib import contextmanager
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from catstream.annotation.annotation import Annotation
+from catstream.annotation.session import Session
+from catstream.web.annotator import AnnotationSite
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def demo(demo_video):
+    return demo_video(FRAMES)
+
+
+@pytest.fixture
+def session(demo, until):
+    with Annotation(demo[0], {}, jobs=2) as annotation, Session(annotation, 1, lambda: None, lambda: None) as one:
+        until(lambda: one.decoded)
+        yield one
+
+
+@pytest.fixture
+def page(session, serve_site):
+    return serve_site(AnnotationSite(session))
+
+
+@pytest.fixture
+def edit(page):
+    def send(verb, **fields):
+        answer = page.post("/edit", json={"verb": verb, **fields})
+        return answer.status_code, answer.json()
+
+    return send
+
+
+def state(page):
+    with page.stream("GET", "/events") as events:
+        return json.loads(next(line for line in events.iter_lines() if line).removeprefix("data: "))
+
+
+def test_the_picture_of_a_frame_is_that_of_the_video(page, session):
+    picture = cv2.imdecode(np.frombuffer(page.get("/frames/7.jpg").content, np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(picture.astype(float) - session.annotation.frames[7]).mean() < 5
+    assert page.get(f"/frames/{FRAMES}.jpg").status_code == page.get(f"/frames/{FRAMES}").status_code == 404
+
+
+def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo):
+    truth = [[*box] for box in demo[1]]
+    assert edit("draw", object="anna", frame=0, box=truth[0]) == (200, {"done": True})
+    assert edit("draw", object="anna", frame=11) == (200, {"done": True})
+    assert edit("rename", object="anna", name="ben") == (200, {"done": True})
+    (ben,) = state(page)["objects"]
+    assert (ben["name"], ben["keyframes"]) == ("ben", [0, 11])
+    assert page.get("/frames/11").json()["ben"] == {"box": None, "checked": "keyframe", "proposals": [None, None]}
+    assert edit("undo") == (200, {"done": True, "object": "ben", "frame": 11})
+
+
+def test_an_unchecked_frame_has_the_proposals_of_both_directions(page, edit, demo, session, until):
+    edit("draw", object="anna", frame=0, box=[*demo[1][0]])
+    edit("draw", object="anna", frame=11, box=[*demo[1][0].centred(60, 60)])  # a wrong box
+    until(lambda: session.revision > 2 and not session.remaining())
+    (anna,) = state(page)["objects"]
+    assert anna["unchecked"]
+    forward, backward = page.get("/frames/6").json()["anna"]["proposals"]
+    assert forward != backward
+    assert [frame for frame, name, _ in state(page)["next"]] != []
+
+
+def test_all_frames_of_an_object_are_checked_between_right_boxes(page, edit, demo, session, until):
+    for frame in (0, 11):
+        edit("draw", object="anna", frame=frame, box=[*demo[1][frame]])
+    until(lambda: session.tracks and not session.next_frames and not session.remaining())
+    assert [state(page)[part] for part in ("next", "remaining", "problem")] == [[], 0, ""]
+    assert state(page)["objects"][0]["unchecked"] == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"object": "anna", "frame": 0, "box": [900, 2, 30, 40]}, "outside the frame"),
+        ({"object": "anna", "frame": 0, "box": [9, 2, 1, 1]}, "at least 2 pixels"),
+        ({"object": "anna", "frame": 99, "box": [9, 2, 30, 40]}, "frame 99 is not in the video"),
+        ({"object": "no name", "frame": 0, "box": [9, 2, 30, 40]}, "is not a name"),
+        ({"object": "anna", "frame": 0}, "anna has no box"),
+        ({"object": "anna", "frame": 0, "box": [9, 2, 30]}, "expected edit in JSON"),
+    ],
+)
+def test_a_change_that_is_not_valid_is_rejected_with_the_reason(edit, session, fields, reason):
+    code, answer = edit("draw", **fields)
+    assert (code, answer["done"]) == (400, False)
+    assert reason in answer["reason"]
+    assert session.annotation.keyframes == {}
+
+
+def test_a_second_box_in_the_same_frame_replaces_the_first(edit, session, demo):
+    for box in demo[1][:2]:
+        edit("draw", object="anna", frame=0, box=[*box])
+    assert session.annotation.keyframes == {"anna": {0: demo[1][1]}}
+
+
+def test_a_page_of_another_origin_changes_nothing(page, session):
+    body = {"verb": "draw", "object": "anna", "frame": 0, "box": [9, 2, 30, 40]}
+    assert page.post("/edit", json=body, headers={"origin": "https://example.org"}).status_code == 403
+    assert page.post("/edit", content=json.dumps(body), headers={"content-type": "text/plain"}).status_code == 415
+    assert session.annotation.keyframes == {}
+
+
+def test_done_ends_the_session(edit, session):
+    assert edit("done") == (200, {"done": True})
+    assert session.finished.is_set()
+
+
+@pytest.fixture
+def serving(catstream, demo, tmp_path):
+    """Starts the command: its process, and a client of its page."""
+
+    @contextmanager
+    def start():
+        process = catstream(
+            *("annotate", demo[0], "--output", tmp_path / "out", "--listen", 0, "--jobs", 1),
+            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        )
+        link = process.stdout.readline().strip()
+        with httpx.Client(base_url=link.partition("?")[0], timeout=60, follow_redirects=True) as client:
+            assert client.get(link).status_code == 200
+            yield process, client
+
+    return start
+
+
+def test_the_command_continues_where_it_was_interrupted_until_it_is_done(serving, demo, tmp_path, until):
+    box = [*demo[1][0]]
+    with serving() as (process, client):
+        until(lambda: state(client)["decoded"])
+        client.post("/edit", json={"verb": "draw", "object": "anna", "frame": 0, "box": box})
+        process.terminate()
+        assert process.wait(60) == 143
+    assert (tmp_path / "out" / "keyframes.csv").read_text().splitlines()[1].startswith("0,anna,")
+    assert (tmp_path / "out" / "demo.ndjson").exists()
+    with serving() as (process, client):
+        until(lambda: state(client)["decoded"])
+        assert [one["name"] for one in state(client)["objects"]] == ["anna"]
+        client.post("/edit", json={"verb": "draw", "object": "anna", "frame": FRAMES - 1})
+        assert client.post("/edit", json={"verb": "done"}).json() == {"done": True}
+        assert process.wait(60) == 0
+        assert "2 keyframes" in process.stdout.read()
+    assert len((tmp_path / "out" / "demo.csv").read_text().splitlines()) == FRAMES + 1
