@@ -6,6 +6,7 @@ import errno
 import io
 import os
 import sys
+from contextlib import suppress
 from importlib import import_module
 from typing import cast
 
@@ -13,7 +14,7 @@ import click
 
 from catstream.base.addresses import without_passwords
 from catstream.cli.common import INTERRUPTS, CommandGroup, complain, stopped
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, ServiceError
 
 #: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
 #: long; commands that belong together share one.
@@ -56,7 +57,12 @@ class _Commands(CommandGroup):
     def list_commands(self, _: click.Context) -> list[str]:
         return list(COMMANDS)
 
-    def get_command(self, _: click.Context, name: str) -> click.Command | None:
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        if name == "track" and not context.resilient_parsing:
+            from catstream.processes.start_server import start_server
+
+            with suppress(ServiceError):  # the pipeline raises it again
+                start_server()  # it imports while this process imports the command
         return load_command(name) if name in COMMANDS else None
 
     def invoke(self, context: click.Context) -> object:

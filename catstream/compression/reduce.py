@@ -6,12 +6,15 @@ The first n rows of S V' are optimal: no other n rows retain more of ||A||^2, th
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dsyrk, ssyrk
-from scipy.linalg.lapack import dsyevd, ssyevd
 
 from catstream.base.arrays import Float32, Float64
 
 _TINY = np.float32(1e-30)  # divisor in place of an energy of 0
+
+
+def prepare() -> None:
+    """Import scipy's linear algebra: a fifth of a second, which no client of a pipeline has to wait for."""
+    import scipy.linalg  # noqa: F401
 
 
 def energy(rows: np.ndarray) -> float:
@@ -31,6 +34,8 @@ def products(rows: np.ndarray) -> np.ndarray:
     array([[ 4.,  0.],
            [ 6., 10.]], dtype=float32)
     """
+    from scipy.linalg.blas import ssyrk
+
     gram: np.ndarray = ssyrk(1, rows.T, trans=1, lower=1)  # one triangle: the matrix is symmetric
     return gram
 
@@ -93,6 +98,8 @@ def _strongest(
     target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
     if rows.shape[1] < len(rows):
         return _strongest_of_short_rows(rows, count, target)
+    from scipy.linalg.lapack import ssyevd
+
     # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
     energies, vectors, failed = ssyevd(products(rows) if gram is None else gram, lower=1)
     if failed:
@@ -106,6 +113,9 @@ def _strongest(
 
 def _strongest_of_short_rows(rows: Float32, count: int, target: Float32) -> tuple[Float32, Float32]:
     """The same from A'A, d x d, in float64; zeros follow the d strongest."""
+    from scipy.linalg.blas import dsyrk
+    from scipy.linalg.lapack import dsyevd
+
     values, vectors, failed = dsyevd(dsyrk(1, rows.T.astype(np.float64), lower=1), lower=1)
     if failed:
         raise np.linalg.LinAlgError(f"the eigenvectors of A'A of {len(rows)} rows did not converge")

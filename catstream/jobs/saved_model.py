@@ -344,7 +344,7 @@ def _check_alike(parts: Sequence[SavedModel]) -> None:
 def _trained(
     trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings, network: str
 ) -> Model:
-    from catstream.training.trainer import Trainer  # with filterpy, whose second of imports no client has to pay
+    from catstream.training.trainer import Trainer
 
     with one_thread():  # as a pipeline's own trainer: the model has the same bits
         return Trainer(settings).train(sample_of(trees, version, 0, centres, name, network=network))

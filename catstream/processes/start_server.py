@@ -48,6 +48,8 @@ _LONGEST = 1 << 16  # bytes of a request
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
 _MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
+#: What numba imports if it is installed, for kernels that call BLAS or C: a sixth of a second. Ours do not.
+_NOT_CALLED = ("scipy.linalg.cython_blas", "cffi")
 
 
 def reset_process() -> None:
@@ -225,6 +227,17 @@ def _forget() -> None:
 after_fork(_forget)
 
 
+@contextmanager
+def _hidden(*modules: str) -> Iterator[None]:
+    """Let modules that were not imported yet appear not to be installed."""
+    sys.modules |= dict.fromkeys(modules)  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        for module in modules:
+            del sys.modules[module]
+
+
 def main(descriptor: int, program: int) -> None:
     """Start processes until the program ends, as the requests on a socket say; return in none of them."""
     if sys.stderr is None:  # the program has closed it
@@ -242,6 +255,8 @@ def main(descriptor: int, program: int) -> None:
     for readable in (requests.fileno(), has_ended, os.pidfd_open(program)):
         poll.register(readable, select.POLLIN)
     running: dict[int, socket.socket] = {}  # the sockets for the answers, by process id
+    with suppress(Exception), _hidden(*_NOT_CALLED):
+        import_module("catstream.features.kernels")
     to_import = [*NAMES]
     while True:
         ready = [readable for readable, _ in poll.poll(0 if to_import else None)]

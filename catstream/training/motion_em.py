@@ -17,6 +17,11 @@ PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
 
 
+def prepare() -> None:
+    """Import filterpy: most of a second, with scipy.stats. Otherwise the first estimate does."""
+    import filterpy.kalman  # noqa: F401
+
+
 def learn_motion(centres: np.ndarray, iterations: int = 5) -> Motion | None:
     """Estimate the covariances of the constant-velocity model from centres, by maximum likelihood.
 
@@ -68,7 +73,7 @@ def _smooth(
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
-    from filterpy.kalman import KalmanFilter  # most of a second, with scipy.stats
+    from filterpy.kalman import KalmanFilter
 
     kalman = KalmanFilter(dim_x=4, dim_z=2)
     kalman.F, kalman.H, kalman.Q, kalman.R = TRANSITION, OBSERVATION, motion.process, motion.observation

@@ -10,7 +10,7 @@ import click
 import pytest
 
 from catstream.base.settings import Settings, describe
-from catstream.cli import COMMANDS, load_command
+from catstream.cli import COMMANDS, group, load_command
 from catstream.processes.start_server import NAMES
 
 SERVICES = Path(__file__).parents[2] / "services"
@@ -44,6 +44,15 @@ def test_every_command_has_a_help_text_with_examples(help_of, command):
 
 def test_an_unknown_command_is_an_error(fail):
     assert fail("trakc").endswith("No such command 'trakc'. Did you mean 'track'?")
+
+
+def test_the_start_server_imports_while_the_command_track_is_imported(monkeypatch):
+    calls = []
+    monkeypatch.setattr("catstream.processes.start_server.start_server", lambda: calls.append("start_server"))
+    monkeypatch.setattr("catstream.cli.load_command", calls.append)
+    context = click.Context(group)
+    assert group.get_command(context, "track") is group.get_command(context, "status") is None
+    assert calls == ["start_server", "track", "status"]
 
 
 NUMBERS = [

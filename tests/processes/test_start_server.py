@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing, suppress
+from importlib import import_module
 from pathlib import Path
 
 import psutil
@@ -50,6 +51,12 @@ def start(folder, tmp_path, until):
         process.close()
         memory.close()
         log.close()
+
+
+def test_a_hidden_module_appears_not_to_be_installed():
+    with module._hidden("cffi"), pytest.raises(ImportError):
+        import_module("cffi")
+    assert import_module("cffi").FFI
 
 
 def opened(pid):
