@@ -13,8 +13,8 @@ from catstream.cli.options import PATH, with_overwrite
 from catstream.cli.write import with_table
 from catstream.errors import VideoError
 from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, About, Head, Row
-from catstream.sinks.track_log import LOGS, Log, is_log
+from catstream.sinks.destinations import EXPORTS, About, Head
+from catstream.sinks.track_log import Log, logs_of
 from catstream.video.source import VIDEOS, is_live, open_source
 
 
@@ -102,7 +102,10 @@ def export(
         raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
     if images and row is not EXPORTS["yolo"]:
         raise click.UsageError("--images requires --format yolo")
-    logs = _logs(log, row)
+    logs = logs_of(log)
+    if log.is_dir() and not row.appends:
+        formats = ", ".join(name for name, other in EXPORTS.items() if other.appends)
+        raise VideoError(f"{log} is a folder, and this format holds one video: pass --format, one of {formats}")
     destinations.check_export(dest, row, overwrite=overwrite, append=append, log=log)
     for path in logs:
         content = Log(path, skip_damaged=skip_damaged)
@@ -115,21 +118,6 @@ def export(
         if content.damaged:
             click.echo(f"{counted(content.damaged, 'damaged line')} of {path} skipped", err=True)
         append = True
-
-
-def _logs(path: Path, row: Row) -> list[Path]:
-    """The log, or the NDJSON logs in a folder; VideoError if there is none, or the format holds one video only."""
-    if not path.is_dir():
-        if not is_log(path) or not path.is_file():
-            problem = "is not the log of a run" if path.exists() else "does not exist"
-            raise VideoError(f"{path} {problem}: pass one of a run's files, {', '.join(LOGS)}")
-        return [path]
-    if not row.appends:
-        formats = ", ".join(name for name, other in EXPORTS.items() if other.appends)
-        raise VideoError(f"{path} is a folder, and this format holds one video: pass --format, one of {formats}")
-    if not (logs := sorted(path.glob("*.ndjson"))):
-        raise VideoError(f"{path} contains no .ndjson file: pass the output folder of a batch")
-    return logs
 
 
 def _with_source(about: About, log: Path, size: str | None, *, required: bool, useful: bool) -> About:

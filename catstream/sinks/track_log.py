@@ -175,6 +175,18 @@ def is_log(path: Path) -> bool:
     return path.suffix in LOGS
 
 
+def logs_of(path: Path) -> list[Path]:
+    """Return a log, or the NDJSON logs in a folder; VideoError if there is none."""
+    if path.is_dir():
+        if not (logs := sorted(path.glob("*.ndjson"))):
+            raise VideoError(f"{path} contains no .ndjson file: pass the output folder of a run or a batch")
+        return logs
+    if not is_log(path) or not path.is_file():
+        problem = "is not the log of a run" if path.exists() else "does not exist"
+        raise VideoError(f"{path} {problem}: pass one of a run's files, {', '.join(LOGS)}")
+    return [path]
+
+
 class Log:
     """A log, from which the tracks of a run are read. It may grow meanwhile.
 

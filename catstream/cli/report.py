@@ -1,0 +1,56 @@
+"""`catstream report`: an HTML page about the tracks of a run or of a batch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from catstream.cli.common import INTERRUPTS, complain, line_of, messages
+from catstream.cli.options import PATH, with_overwrite
+from catstream.errors import VideoError
+
+
+@click.command()
+@click.argument("log", type=PATH)
+@click.argument("page", type=PATH, required=False)
+@click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of a log.")
+@with_overwrite
+def report(log: Path, page: Path | None, skip_damaged: bool, overwrite: bool) -> None:
+    """Write an HTML page about the tracks of a run.
+
+    LOG is an .ndjson, .sqlite or .csv file, or a folder, for example that of
+    catstream batch, whose .ndjson files are reported together. PAGE is by default
+    LOG with the extension .html, or report.html in the folder.
+
+    The page shows a timeline of each object, its path over a picture of the
+    video, its speed, and the frames to look at. The video is read for the
+    pictures; without it, the page has none.
+
+    \b
+    EXAMPLES
+      catstream report out/walk.ndjson
+      catstream report out
+    """
+    # Imported here so that --help and the other commands start faster.
+    with INTERRUPTS.leaving():
+        from catstream.base.files import check_file
+        from catstream.reports.tracks import Section, write_report
+        from catstream.sinks.track_log import logs_of
+
+    logs = logs_of(log)
+    page = page or (log / "report.html" if log.is_dir() else log.with_suffix(".html"))
+    check_file(page, overwrite=overwrite, kind=VideoError)
+    sections = []
+    with line_of(messages()) as progress:
+        task = progress.add_task("reading", total=len(logs))
+        for path in logs:
+            section = Section(path, skip_damaged=skip_damaged)
+            section.add_pictures()
+            sections.append(section)
+            progress.advance(task)
+    write_report(page, sections)
+    for section in sections:
+        if section.problem:
+            complain(f"{section.name}: no pictures ({section.problem})")
+    click.echo(f"report: {page}")
