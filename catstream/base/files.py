@@ -101,7 +101,7 @@ def check_file(
         raise kind(f"{path} exists already: replace it with --overwrite, or give another name")
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
-        folder = next(each for each in (folder, *folder.parents) if each.exists())
+        folder = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):
             is_writable = not path.is_dir()
@@ -149,7 +149,7 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
 
 
 def is_locked(handle: int) -> bool:
-    """Whether another process has locked an open file; asked with a shared lock, so that two may ask at once."""
+    """Return True if another process has locked an open file; asked with a shared lock, so that two may ask at once."""
     return not _flock(handle, fcntl.LOCK_SH)
 
 
