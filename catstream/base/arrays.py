@@ -16,7 +16,7 @@ Int64 = npt.NDArray[np.int64]
 
 
 def is_finite(array: np.ndarray) -> bool:
-    """Return True if all numbers are finite, in one pass without a temporary array.
+    """Whether all numbers are finite, in one pass without a temporary array.
 
     >>> is_finite(np.array([1.0, 1e200])), is_finite(np.array([1.0, np.nan]))
     (True, False)

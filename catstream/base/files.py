@@ -101,7 +101,7 @@ def check_file(
         raise kind(f"{path} exists already: replace it with --overwrite, or give another name")
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
-        folder = next(parent for parent in (folder, *folder.parents) if parent.exists())
+        folder = next(each for each in (folder, *folder.parents) if each.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):
             is_writable = not path.is_dir()
@@ -149,7 +149,7 @@ def lock(handle: int, seconds: float = 0.0) -> bool:
 
 
 def is_locked(handle: int) -> bool:
-    """Return True if another process has locked an open file; asked with a shared lock, so that two may ask at once."""
+    """Whether another process has locked an open file; asked with a shared lock, so that two may ask at once."""
     return not _flock(handle, fcntl.LOCK_SH)
 
 
@@ -185,9 +185,21 @@ def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int
     return file
 
 
+@contextlib.contextmanager
+def locked_folder(folder: Path, kind: type[CatstreamError] = ServiceError, seconds: float = 0.0) -> Iterator[None]:
+    """Lock a folder, which is made, for a block; an error of this kind if another process keeps it for `seconds`."""
+    with contextlib.ExitStack() as stack:
+        with writing(folder, kind):
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
+        if not lock(handle, seconds):
+            raise kind(f"{folder} is being written by {_holder(folder)}: stop it, or pass another path")
+        yield
+
+
 def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> None:
     """Raise an error of this kind if another process has locked a file."""
-    with contextlib.suppress(OSError), descriptor(path) as handle:
+    with contextlib.suppress(OSError), descriptor(path, os.O_RDONLY | os.O_NONBLOCK) as handle:  # it may be a pipe
         if is_locked(handle):
             raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
 

@@ -21,7 +21,7 @@ def generation() -> int:
 
 
 def forked(since: int) -> bool:
-    """Return True if this process is a copy of the one in which `generation` returned `since`."""
+    """Whether this process is a copy of the one in which `generation` returned `since`."""
     return _generation != since
 
 

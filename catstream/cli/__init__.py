@@ -93,6 +93,11 @@ def group() -> None:
 def main() -> None:
     """Run the command line. The exit code is 1 after an error, which is one line, and 130 after Ctrl-C."""
     INTERRUPTS.install()
+    command = " ".join(sys.argv)
+    if (shown := without_passwords(command)) != command:
+        from catstream.base.workers import name_process
+
+        name_process("catstream", shown)
     os.environ["PYTHONSAFEPATH"] = "1"  # no child of this process imports a file of the current folder
     # FFmpeg asks a proxy, if the environment names one, for cameras on this machine too.
     os.environ["no_proxy"] = ",".join(filter(None, ("127.0.0.1,localhost", os.environ.get("no_proxy"))))

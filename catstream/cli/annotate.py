@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from catstream.base.files import write_atomically, writing
+from catstream.base.files import locked_folder, write_atomically, writing
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
@@ -120,6 +120,7 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
     with bar:
         bar.add_task("decoding", total=None)
         annotation.decode()
+        results.lock()
         results.save()
         try:
             annotation.track()
@@ -138,6 +139,7 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
 
     with Session(annotation, jobs, results.save, results.write) as session:
         server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
+        results.lock()
         results.save()
         with server.in_background():
             for url in server.urls:
@@ -174,11 +176,14 @@ class _ResultFiles:
                 raise VideoError(f"{table} exists already: pass --overwrite, or another --output")
         self._log().check(overwrite=overwrite, earlier=[])
 
+    def lock(self) -> None:
+        """Lock the folder, which is made, until the command ends; VideoError if another process has locked it."""
+        click.get_current_context().with_resource(locked_folder(self.folder, VideoError))
+
     def save(self) -> None:
         """Write the keyframes."""
         from catstream.annotation.keyframes import write_keyframes
 
-        self._log().make_folder()
         write_keyframes(self.keyframes, self._annotation.keyframes)
 
     def write(self) -> None:

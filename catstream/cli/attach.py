@@ -19,6 +19,7 @@ import numpy as np
 from rich.console import Console
 
 from catstream.base.box import Box
+from catstream.base.clock import STEP_SECONDS, RunningClock
 from catstream.base.files import check_file
 from catstream.base.names import UNNAMED, check_name, split_name
 from catstream.base.text import counted
@@ -40,7 +41,8 @@ from catstream.errors import ServiceError, SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
 from catstream.messages.kinds import Health, run_state
-from catstream.wire.channels import CHANNELS, PUBLIC
+from catstream.wire.channels import CHANNELS, HEALTH, PUBLIC
+from catstream.wire.monitor import silence
 
 _SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
 _OLD_SECONDS = 5.0  # age of what is read, from which they say that the reader is slow
@@ -243,21 +245,24 @@ def status(address: Address, as_json: bool, wait: float) -> None:
                 objects.add_row(name or "-", *("-" if cell is None else str(cell) for cell in cells.values()))
             screen().print("", objects, sep="\n")
     if silent := [name for name in _PROCESSES if name not in reports]:
-        removed = f": {REMOVED}" if not reports and address.resolve().lacks_sockets() else ""
-        complain(f"no health report at {address} within {wait:g} s from: {', '.join(silent)}{removed}")
+        at = address.resolve()
+        problem = "" if reports else f": {REMOVED if at.lacks_sockets() else silence(at.address(HEALTH))}"
+        complain(f"no health report at {address} within {wait:g} s from: {', '.join(silent)}{problem}")
         sys.exit(1)
 
 
 def _collect_reports(address: Address, seconds: float) -> dict[str, list[Health]]:
     """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
-    deadline = time.monotonic() + seconds
-    reports: dict[str, list[Health]] = {}
-    with subscribe(address, "health", timeout=seconds) as health, suppress(SilenceError):
-        for report in health:
-            reports.setdefault(report.process, []).append(report)
-            if len(reports) == len(_PROCESSES) and len(reports["detector"]) > 1:
+    clock, reports = RunningClock(), dict[str, list[Health]]()
+    with subscribe(address, "health") as health:
+        while len(reports) < len(_PROCESSES) or len(reports["detector"]) < 2:
+            if (remaining := seconds - clock()) <= 0:
                 break
-            health.timeout = max(0.0, deadline - time.monotonic())
+            health.timeout = min(remaining, STEP_SECONDS)
+            with suppress(SilenceError):
+                if (report := next(health, None)) is None:
+                    break
+                reports.setdefault(report.process, []).append(report)
     return reports
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import click
 
+from catstream.base.files import locked_folder
 from catstream.base.text import counted
 from catstream.cli.options import PATH, with_overwrite
 from catstream.cli.write import with_table
@@ -16,6 +18,7 @@ from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, About, Head
 from catstream.sinks.track_log import Log, logs_of
 from catstream.video.source import VIDEOS, is_live, open_source
+from catstream.video.writer import is_annotated
 
 
 def _printable(_: click.Context, __: click.Parameter, text: str) -> str:
@@ -106,6 +109,8 @@ def export(
     if log.is_dir() and not row.appends:
         formats = ", ".join(name for name, other in EXPORTS.items() if other.appends)
         raise VideoError(f"{log} is a folder, and this format holds one video: pass --format, one of {formats}")
+    if (append or not row.suffix) and dest.absolute().parent.is_dir():  # others that add to a data set wait meanwhile
+        click.get_current_context().with_resource(locked_folder(dest.absolute().parent, VideoError, math.inf))
     destinations.check_export(dest, row, overwrite=overwrite, append=append, log=log)
     for path in logs:
         content = Log(path, skip_damaged=skip_damaged)
@@ -113,6 +118,10 @@ def export(
             raise VideoError(f"{path} contains no tracks")
         about = About(path.stem, label=label, head=content.head() or Head(), classes=classes, append=append)
         about = _with_source(about, path, size, required=images, useful=row.images)
+        last = max(frame.tracks[0].source_frame for frame in content)
+        if about.frames is not None and last >= about.frames:  # of a long video, the number is an estimate
+            has = f"but {size or about.head.source} has {counted(about.frames, 'frame')}"
+            click.echo(f"warning: {path} has frame {last}, {has}: pass --size SOURCE if it is another one", err=True)
         if note := destinations.export(content, dest, row, about):
             click.echo(note, err=True)
         if content.damaged:
@@ -131,6 +140,10 @@ def _with_source(about: About, log: Path, size: str | None, *, required: bool, u
         frame_size = (int(stated[1]), int(stated[2]))
     elif size is not None:
         source = size
+        if is_annotated(source):
+            raise VideoError(
+                f"{size} is an annotated video, which is higher than its frames: pass the source of the run"
+            )
     if required and (not source or is_live(source)):
         raise VideoError(f"{log} names no source with images: pass --size SOURCE, or omit --images")
     if source == size or (useful and source and not is_live(source)):

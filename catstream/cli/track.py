@@ -190,7 +190,7 @@ class _Run:
         for line in self._doubts(pipeline):
             console.print(line)
         if self.resume is not None:
-            pipeline.first_frame = files.position(skip_damaged=pipeline.settings.run.skip_damaged)
+            pipeline.after = files.position(skip_damaged=pipeline.settings.run.skip_damaged)
         progress = RunProgress(pipeline)
         try:
             interrupted = self._run(pipeline, files, progress, console)
@@ -238,6 +238,8 @@ class _Run:
             )
         if self.write and self.no_write:
             raise click.UsageError("--write and --no-write are mutually exclusive")
+        if self.no_write and not (self.resume or self.continues):
+            raise click.UsageError("--no-write has no effect on a new run: omit it")
         if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
             raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
 
@@ -430,7 +432,7 @@ class RunProgress:
         self._pipeline = pipeline
         self._held, self._looked = 0.0, time.perf_counter()  # seconds while the run was held, and until when
         self._started = self._now()
-        self._first = self._refreshed = 0.0
+        self._first = self._shown = 0.0
         self.frames = 0
         self._objects: dict[str, _ObjectCounts] = {}
 
@@ -463,8 +465,8 @@ class RunProgress:
             counts.frames += 1
             counts.present += track.box is not None
             counts.version = track.model_version
-        if not line.disable and now - self._refreshed >= _REFRESH_SECONDS:
-            self._refreshed = now
+        if not line.disable and now - self._shown >= _REFRESH_SECONDS:
+            self._shown = now
             present = sum(track.box is not None for track in tracks.values())
             states = [track.state for track in tracks.values()]
             state = states[0] if len(states) == 1 else f"{present}/{len(states)} present"

@@ -24,7 +24,7 @@ _LARGEST_PORT = 65535
 
 
 class HostPort(NamedTuple):
-    """The address on which the web server listens."""
+    """What the web server listens on."""
 
     host: str
     port: int
@@ -41,7 +41,8 @@ class HostPortType(click.ParamType):  # type: ignore[type-arg]  # generic since 
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> HostPort:
         host, _, port = str(value).rpartition(":")
-        if not (port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT):
+        is_port = port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT
+        if not is_port or host.startswith("[") != host.endswith("]"):
             self.fail(f"expected [HOST:]PORT, for example 8000 or 0.0.0.0:8000, got {value!r}", param, ctx)
         return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from inspect import cleandoc
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +19,16 @@ from catstream.cli.attach import wait_for_pipeline, with_address, with_silence_w
 from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
 from catstream.client.address import Address
-from catstream.client.attach import subscribe
+from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SilenceError
 from catstream.jobs.job import SinkOptions
-from catstream.messages.kinds import Track
 from catstream.sinks import destinations
-from catstream.sinks.destinations import SINKS, Origin, Row, TrackedFrame
+from catstream.sinks.destinations import SINKS, Head, Origin, Row, TrackedFrame
 from catstream.sinks.events import KINDS, check_zones
 
 Command = Callable[..., Any]
+
+_REPORTS = 12  # of all processes, in which one of the detector says what it tracks: those of four seconds
 
 
 def with_table(rows: Mapping[str, Row]) -> Callable[[Command], Command]:
@@ -131,18 +134,18 @@ def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, 
         raise click.UsageError(f"--zone-margin {options.margin:g} is larger than the frame: no object can leave a zone")
 
 
-def _with_zone_check(tracks: Iterable[Track], zones: Mapping[str, Any], address: Address) -> Iterator[Track]:
-    """Yield tracks; SettingsError as soon as a picture of the pipeline shows that a zone is outside the frame."""
-    source = iter(tracks)
-    if zones:
-        with subscribe(address, "previews", timeout=0) as previews:
-            for track in source:
-                yield track
-                with suppress(SilenceError):
-                    if (preview := next(previews, None)) is not None:
-                        check_zones(zones, (preview.width, preview.height))
-                        break
-    yield from source
+def _head(address: Address) -> Head:
+    """The head of a log, as far as the detector of the pipeline reports the run."""
+    head = Head()
+    with subscribe(address, "health", timeout=REPORT_SECONDS) as reports, suppress(SilenceError):
+        for report in islice(reports, _REPORTS):
+            if report.process == "detector":
+                of = report.counters
+                head = Head(source=report.source)
+                if "width" in of:  # its source is open
+                    size, rate, stride = (int(of["width"]), int(of["height"])), of["rate"], int(of["stride"])
+                    return replace(head, size=size, rate=rate * stride, start=int(of["start"]), stride=stride)
+    return head
 
 
 @click.command()
@@ -184,11 +187,12 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
     with subscribe(address, "tracks") as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(address, wait)
-            origin = Origin(address=address, options=options)
+            origin = Origin(address=address, options=options, head=_head(address))
+            check_options(options, places, origin.head.size)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in _with_zone_check(with_silence_warnings(tracks), options.zones, address):
+            for track in with_silence_warnings(tracks):
                 run = run or tracks.run
                 if tracks.run != run and not address.stream:  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"

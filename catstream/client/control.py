@@ -27,6 +27,7 @@ from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.discovery import source_at
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.monitor import silence
 from catstream.wire.newest import Subscriber
 
 ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
@@ -156,8 +157,8 @@ class Control(AbstractContextManager["Control"]):
         command = Command(uuid4().hex, verb, box, keep, check_name(object), model, seconds, time)
         if (answer := self._commands.ask(command, self.timeout)) is None:
             raise SilenceError(
-                f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: is a pipeline running there? "
-                "Check it with catstream status"
+                f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: "
+                f"{silence(self.endpoint.address(CONTROL))} Check it with catstream status"
             )
         if not answer.done:
             raise CommandRejectedError(f"{verb}: {answer.reason}")

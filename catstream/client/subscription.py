@@ -23,6 +23,7 @@ from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Track, run_state
 from catstream.wire.channels import HEALTH, PUBLIC, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
+from catstream.wire.monitor import silence
 from catstream.wire.newest import GapCounter, Subscriber
 
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
@@ -271,8 +272,10 @@ class Subscription(Generic[Message]):
         """The reason why no message arrives, as far as it is known."""
         if self._connection is not None and self._connection.state:
             return f"the state of the pipeline is: {self._connection.state}"
-        removed = self.endpoint is not None and self.endpoint.lacks_sockets()
-        return REMOVED if removed else "is a pipeline running there?"
+        if self.endpoint is not None and self.endpoint.lacks_sockets():
+            return REMOVED
+        address = "" if self.endpoint is None else self.endpoint.address(self._channel)
+        return silence(address) if (self.timeout or 0.0) >= REASON_SECONDS else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
         """End after so many seconds."""

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.files import write_atomically, writing
+from catstream.base.files import open_locked, write_atomically, writing
 from catstream.base.text import counted
 from catstream.errors import ServiceError
 from catstream.finding.files import File, Reading
@@ -120,8 +120,8 @@ class SearchLog(AbstractContextManager["SearchLog"]):
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             good = 0 if overwrite or not path.exists() else self._load(path.read_bytes())
-            self._stream = path.open("ab")
-            self._stream.truncate(good)  # the last line of a process that was killed may be incomplete
+            # The last line of a process that was killed may be incomplete.
+            self._stream = open_locked(path, size=good, mode="ab")
             if not good:
                 self._write({"kind": _KIND, "search": search})
 

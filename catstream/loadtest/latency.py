@@ -1,4 +1,4 @@
-"""Observations of a stream under load, and their measures; and the use of processor and memory.
+"""What is observed of a stream under load, and the measures of it; and the use of processor and memory.
 
 Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
 one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
@@ -39,7 +39,7 @@ _SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a succe
 class Observations:
     """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
 
-    tracks  tracks in order of arrival; a restarted detector may repeat a number with another frame
+    tracks  tracks in order of arrival; a restarted detector may repeat a `seq` with another frame
     models  newest training frame of each model, numbered as the tracks were at its arrival
     health  health reports of all processes
     first_motion_version  version of the first model with a motion model, 0 before it
@@ -52,7 +52,7 @@ class Observations:
 
     @property
     def warmed_up(self) -> bool:
-        """True if the start-up phase is over: the detector uses a model with a motion model."""
+        """Whether the start-up phase is over: the detector uses a model with a motion model."""
         return (
             self.first_motion_version > 0
             and bool(self.tracks)

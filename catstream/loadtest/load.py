@@ -146,7 +146,7 @@ class Subscribers:
 
     @property
     def connected(self) -> bool:
-        """True if each subscriber has received a track."""
+        """Whether each subscriber has received a track."""
         return all(self._received[: self._readers])
 
     @property
@@ -172,7 +172,7 @@ class Subscribers:
         return list(self._received[: self._quick])
 
     def missed(self) -> list[int]:
-        """Return the number of frames whose tracks each fast subscriber has missed, by the gaps in `frame`."""
+        """Return the number of frames whose tracks each fast subscriber has missed, by the gaps in `seq`."""
         return list(self._missed[: self._quick])
 
     def __enter__(self) -> Self:

@@ -82,7 +82,7 @@ class DetectorLoop:
         self.beginnings = Beginnings(process, self.detectors, self.commands, self.outputs.previews)
         self._source: Source | None = None
         self._skipped = 0  # frames that were skipped because the run was paused or waited for a box
-        self._tracks = Tracks(0, {})  # the last ones
+        self._tracks = Tracks(0, 0, {})  # the last ones
 
     def turn(self) -> None:
         """Process acknowledgements, models and commands, serve late joiners, and publish the health."""
@@ -151,7 +151,7 @@ class DetectorLoop:
 
     @property
     def _held(self) -> bool:
-        """True if no frames are tracked: the stream ends, or the run is paused or waits for a box."""
+        """Whether no frames are tracked: the stream ends, or the run is paused or waits for a box."""
         return bool(self.process.ending.reason) or self.commands.hold
 
     def begin(self, frame: Frame) -> list[Beginning]:
@@ -170,7 +170,7 @@ class DetectorLoop:
         return beginnings
 
     def skips(self, beginnings: Sequence[Beginning]) -> bool:
-        """Return True if a frame is not tracked: the stream ends, or a live source is paused."""
+        """Whether a frame is not tracked: the stream ends, or a live source is paused."""
         skips = self._held and not beginnings
         self._skipped += skips and not self.process.ending.reason
         return skips
@@ -241,6 +241,9 @@ class DetectorLoop:
             "waiting": float(not self.commands.desired.objects),
             "ended": float(self.process.ending.ended),
         }
+        if self._source is not None:
+            (own["width"], own["height"]), own["rate"] = self._source.size, self._source.rate
+            own["start"], own["stride"] = self.process.job.part.start or 0, self.process.job.part.step or 1
         return own | self._source_counters()
 
     def _source_counters(self) -> dict[str, float]:

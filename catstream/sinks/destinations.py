@@ -8,6 +8,7 @@ function in a file of its own, and a line in docs/how-to/sinks.md.
 from __future__ import annotations
 
 import json
+import secrets
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ import msgspec
 
 from catstream.base.addresses import without_password
 from catstream.base.box import Box
-from catstream.base.files import check_file, check_unlocked, writing
+from catstream.base.files import check_file, check_unlocked, remove_parts, writing
 from catstream.client.address import Address
 from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
@@ -128,7 +129,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """The parameters of an export.
+    """What an export has to know beside the tracks.
 
     name     that of the log, for the files in a folder
     size     width and height of a frame in pixels; None if it is not known
@@ -321,7 +322,7 @@ def check_export(path: Path, row: Row, *, overwrite: bool, append: bool, log: Pa
 
 
 def _is_empty(folder: Path) -> bool:
-    """Return True if a folder has no files but the images of a data set, which may be there before its labels."""
+    """Whether a folder has no files but the images of a data set, which may be there before its labels."""
     entries = folder.iterdir() if folder.is_dir() else ()
     return all(entry.name == "images" or entry.name.startswith(".") for entry in entries)
 
@@ -340,7 +341,8 @@ def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -
             f"unknown size of the frames, required for {path}: pass --size WIDTHxHEIGHT, or --size SOURCE with the "
             "video or folder that was tracked"
         )
-    part = path.with_name(f"{path.name}.part")
+    remove_parts(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
     with writing(path, VideoError):
         try:
             if row.suffix and about.append and path.exists():

@@ -13,7 +13,7 @@ from catstream.sinks.destinations import Origin, Sink, TrackedFrame
 from catstream.video.drawing import Colours, draw, drawn_size, preview_image
 from catstream.video.frames import RATE
 from catstream.video.source import open_source
-from catstream.video.writer import VideoWriter
+from catstream.video.writer import ANNOTATED, VideoWriter
 
 _BACKLOG = 256  # frames whose tracks wait for their picture
 
@@ -36,7 +36,8 @@ class SourceVideo:
         self._colours = Colours()
         try:
             aspect = self._frames.pixel_aspect
-            self._video = VideoWriter(place, self._frames.rate, drawn_size(self._frames.size), pixel_aspect=aspect)
+            size, rate = drawn_size(self._frames.size), self._frames.rate
+            self._video = VideoWriter(place, rate, size, pixel_aspect=aspect, comment=ANNOTATED)
         except VideoError:
             self._frames.close()
             raise
@@ -98,7 +99,9 @@ class PictureVideo:
     def write(self, frame: TrackedFrame) -> None:
         if (drawn := self._pictures.update(frame)) is not None:
             image, time = drawn
-            self._video = self._video or VideoWriter(self._place, RATE, (image.shape[1], image.shape[0]))
+            self._video = self._video or VideoWriter(
+                self._place, RATE, (image.shape[1], image.shape[0]), comment=ANNOTATED
+            )
             self._video.write(image, time)
 
     def close(self) -> None:

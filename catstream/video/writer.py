@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from catstream.base.addresses import without_password
+from catstream.base.files import open_locked
 from catstream.errors import VideoError
 
 #: Steps of the time base per frame: the precision of time stamps if the frame rate is not constant.
@@ -31,6 +32,19 @@ _SERVERS: dict[str, tuple[str, dict[str, str]]] = {
     "rtsp": ("rtsp", {"rtsp_transport": "tcp", "timeout": "3000000"}),
     "rtmp": ("flv", {}),
 }
+
+
+#: Comment in a video of drawn tracks, which has a line of text below each frame.
+ANNOTATED = "annotated by catstream"
+
+
+def is_annotated(path: str) -> bool:
+    """Whether a file is a video of drawn tracks."""
+    import av
+
+    with contextlib.suppress(av.FFmpegError, OSError), av.open(path) as video:
+        return video.metadata.get("comment") == ANNOTATED
+    return False
 
 
 class Encoder:
@@ -98,20 +112,27 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
     """Writes images as H.264 to an MP4 file, or to an RTSP or RTMP server.
 
     A file grows in fragments of a second: if the process is killed or the disk is full, it is readable up to there.
-    Its folder is made. A file without a frame is removed, and so is one whose `with` block is left by an error or
-    Ctrl-C.
+    Its folder is made, and it is locked until it is closed. A file without a frame is removed, and so is one whose
+    `with` block is left by an error or Ctrl-C.
 
     FFmpeg blocks all threads of the process while it connects to a server, and `write` blocks while the server is slow.
 
     target : path of a file, or address of a server
     rate : average of frames per second
     size : width and height of the images in pixels
+    comment : stored in the file
 
     VideoError, also from the constructor, if the target cannot be written to.
     """
 
     def __init__(
-        self, target: str | Path, rate: float, size: tuple[int, int], *, pixel_aspect: Fraction = Fraction(1)
+        self,
+        target: str | Path,
+        rate: float,
+        size: tuple[int, int],
+        *,
+        pixel_aspect: Fraction = Fraction(1),
+        comment: str = "",
     ) -> None:
         import av
 
@@ -123,9 +144,12 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             if self._path is not None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
             self._container: Any = av.open(str(self._path or target), "w", format=form, container_options=options)
+            self._container.metadata["comment"] = comment
             self._encoder = Encoder(size, rate, self._container, pixel_aspect=pixel_aspect)
             if self._path is None:  # a file without a frame has no header: FFmpeg crashes if it completes one
                 self._container.start_encoding()
+            else:  # FFmpeg opens the file once more, for the first image
+                self._lock = open_locked(self._path, VideoError, mode="ab")
 
     def write(self, image: np.ndarray, time: float | None = None) -> None:
         """Add a frame, uint8 (h, w, 3), blue green red, of the size given to the constructor; times as in `Encoder`."""
@@ -144,9 +168,11 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             if self._path is not None:
                 raise
         finally:
-            if self._path is not None and not self.frames:
-                with contextlib.suppress(OSError):  # the disk may have become read-only
-                    self._path.unlink(missing_ok=True)
+            if self._path is not None:
+                if not self.frames:
+                    with contextlib.suppress(OSError):  # the disk may have become read-only
+                        self._path.unlink(missing_ok=True)
+                self._lock.close()
 
     @contextlib.contextmanager
     def _reporting_errors(self) -> Iterator[None]:

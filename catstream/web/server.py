@@ -139,7 +139,8 @@ def _listen(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port))
     except OSError as error:
         why = (error.strerror or str(error)).partition(" (while")[0]  # Python adds the address
-        raise ServiceError(f"cannot listen on {host}:{port} ({why}): choose another port or host") from None
+        at = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        raise ServiceError(f"cannot listen on {at} ({why}): choose another port or host") from None
 
 
 class Guard:

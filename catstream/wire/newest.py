@@ -54,7 +54,7 @@ class Publisher(ChannelSocket[Message]):
 
     @property
     def has_subscribers(self) -> bool:
-        """True if more than the end had a subscriber when `send` or `serve_late_joiners` was last called."""
+        """Whether more than the end had a subscriber when `send` or `serve_late_joiners` was last called."""
         return not self._subscribed <= {_END}
 
     def send(self, message: Message) -> None:
@@ -140,7 +140,7 @@ class Subscriber(ChannelSocket[Message]):
         self._connect()
 
     def pending(self) -> bool:
-        """Return True if something has arrived that was not received yet."""
+        """Whether something has arrived that was not received yet."""
         return bool(self._arrived) or super().pending()
 
     def receive(self, seconds: float) -> Message | None:
@@ -167,7 +167,7 @@ class Subscriber(ChannelSocket[Message]):
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
 
     def _is_repeat(self, message: Message, data: memoryview) -> bool:
-        """Return True if a message is the last one of its object or process, which is sent again now and then.
+        """Whether a message is the same as the last one of its object or process, which is sent again now and then.
 
         It is identified by its version. One that has none is small, and identified by all of its bytes.
         """
@@ -185,7 +185,7 @@ class Subscriber(ChannelSocket[Message]):
 
 
 class GapCounter:
-    """Counts lost frames of a stream by the gaps in the numbers of the frames of its messages, which start with 0.
+    """Counts lost frames of a stream by the gaps in the numbers `seq` of its messages, which start with 1.
 
     The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
 
@@ -194,7 +194,7 @@ class GapCounter:
     """
 
     def __init__(self, *, of_one_object: bool = False) -> None:
-        self.missed = self.before = self._next = 0
+        self.missed = self.before = self._seq = 0
         self._of_one_object = of_one_object
         self._began: int | None = None  # frame in which the one object began: there were no messages before
 
@@ -202,18 +202,18 @@ class GapCounter:
         """Count the frames missing before the next message."""
         if self._of_one_object and isinstance(message, Track) and message.began != self._began:
             self._began = message.began
-            self._next = message.frame + 1
+            self._seq = message.seq
         else:
-            self._count(message.frame)
+            self._count(message.seq)
 
     def end(self, end: End) -> None:
         """Count the frames missing before the end; one object may have been forgotten before it."""
-        if not self._of_one_object:
-            self._count(end.frame)
+        if end.seq and not self._of_one_object:
+            self._count(end.seq)
 
-    def _count(self, frame: int) -> None:
-        if self._next:
-            self.missed += max(0, frame - self._next)
+    def _count(self, seq: int) -> None:
+        if self._seq:
+            self.missed += max(0, seq - self._seq - 1)
         else:
-            self.before = frame
-        self._next = frame + 1
+            self.before = max(0, seq - 1)
+        self._seq = seq

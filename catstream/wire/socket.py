@@ -25,7 +25,7 @@ from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import public_key
-from catstream.wire.monitor import Event, Monitor, arrives, has_keys
+from catstream.wire.monitor import Event, Monitor, arrives, greeting, has_keys, other_program
 from catstream.wire.rejects import disconnected, reject
 from catstream.wire.zap import ZapHandler
 
@@ -51,6 +51,7 @@ _OPTIONS = {
 
 _FAILURES = 3  # failed handshakes in a row with a listener that has keys: they are those of another pipeline
 _PROBE_SECONDS = 0.4  # from one check of the listener to the next
+_PAUSE = 10  # or so many times as long as a check took, in which the program waits
 
 Message = TypeVar("Message")
 Kind = TypeVar("Kind")
@@ -87,7 +88,7 @@ def _too_many(error: zmq.ZMQError) -> ServiceError:
 
 
 def _remedy(error: zmq.ZMQError) -> str:
-    """The advice if a socket cannot listen."""
+    """What to do if a socket cannot listen."""
     match error.errno:
         case errno.EADDRINUSE:
             what = "another pipeline may be running there: wait for it, or choose"
@@ -192,7 +193,8 @@ class ChannelSocket(Generic[Message]):
             self._listens = True
         except zmq.ZMQError as error:
             self.close()
-            raise ServiceError(f"cannot listen on {address} ({error.strerror}): {_remedy(error)}") from None
+            why = zmq.strerror(error.errno or 0)  # `error.strerror` repeats the address
+            raise ServiceError(f"cannot listen on {address} ({why}): {_remedy(error)}") from None
         except ServiceError:
             self.close()
             raise
@@ -211,11 +213,11 @@ class ChannelSocket(Generic[Message]):
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
     def pending(self) -> bool:
-        """Return True if something has arrived that was not received yet."""
+        """Whether something has arrived that was not received yet."""
         return self._wait(0)
 
     def _wait(self, seconds: float) -> bool:
-        """Return True if something arrives within so many seconds; handles the events of connections first."""
+        """Whether something arrives within so many seconds; handles the events of connections first."""
         self._read_events()
         return arrives(self._socket, seconds)
 
@@ -265,6 +267,8 @@ class ChannelSocket(Generic[Message]):
                 self._connected()
             elif event is Event.DISCONNECTED:
                 self._disconnected()
+                if not self._listens:  # libzmq reports no other failure of a handshake with keys, if what listens
+                    self._handshake_failed(event)  # answers like an old version, and does not connect again
             elif event is not Event.STOPPED:
                 self._handshake_failed(event)
             if event is until:
@@ -301,16 +305,19 @@ class ChannelSocket(Generic[Message]):
                 f"the pipeline at {endpoint} requires authentication: pass a folder of keys that it allows "
                 "(--keys DIR, see catstream keys)"
             )
-        if keys is None:
-            return None
         if event is Event.OTHER_MECHANISM:
             return f"the pipeline at {endpoint} has no keys: connect without keys (omit --keys)"
         now = monotonic()
-        if now < self._probe_at or keys.server != public_key(keys.folder).encode():
+        if now < self._probe_at:
+            return None
+        answers = [greeting(endpoint.address(self.channel, sender)) for sender in self.channel.senders]
+        self._probe_at = monotonic() + max(_PROBE_SECONDS, _PAUSE * (monotonic() - now))
+        if said := next(filter(None, (other_program(answer) for answer in answers if answer)), ""):
+            return f"{endpoint} is not a pipeline, {said}: pass the endpoint of a running pipeline"
+        if keys is None or keys.server != public_key(keys.folder).encode():
             return None  # a stream of a fleet has another key wherever it runs next
-        self._probe_at = now + _PROBE_SECONDS
-        has_listener = any(has_keys(endpoint.address(self.channel, sender)) for sender in self.channel.senders)
-        self._failures = self._failures + 1 if has_listener else 0
+        if event is Event.FAILED:
+            self._failures = self._failures + 1 if any(map(has_keys, answers)) else 0
         if self._failures < _FAILURES:  # fewer may be from before the listener was there
             return None
         return (

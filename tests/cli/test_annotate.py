@@ -5,6 +5,8 @@ import json
 
 import pytest
 
+from catstream.base.files import locked_folder
+
 FRAMES = 12
 
 
@@ -50,6 +52,13 @@ def test_the_log_of_an_annotation_is_exported_as_that_of_a_run(demo, succeed, tm
     succeed("export", tmp_path / "out" / "demo.ndjson", tmp_path / "demo.coco.json")
     found = json.loads((tmp_path / "demo.coco.json").read_text())["annotations"]
     assert [box["attributes"]["doubtful"] for box in found] == [False, *[True] * (FRAMES - 1)]
+
+
+def test_the_output_of_a_running_annotation_is_refused_to_another_one(demo, fail, tmp_path):
+    video, boxes = demo
+    with locked_folder(tmp_path / "out"):
+        error = fail("annotate", video, "--box", f"@0={boxes[0]}", "--output", tmp_path / "out", "--overwrite")
+    assert "out is being written by process" in error
 
 
 @pytest.mark.parametrize(

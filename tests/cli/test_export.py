@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 
-def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, tmp_path):
+def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed, fail, tmp_path):
     log = whole_run / "out" / "demo.csv"
     succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
     with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
@@ -16,7 +16,7 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, succeed, fail, 
     succeed("export", log, tmp_path / "otb", "--format", "otb")
     for name in ("demo.txt", "demo_confidence.value", "times/demo_time.txt"):
         assert len((tmp_path / "otb" / name).read_text().splitlines()) == 32
-    for size in ("320x240", whole_run / "out" / "demo.mp4"):  # the second one has a line of text below
+    for size in ("320x240", video[0]):
         succeed("export", log, tmp_path / "t.json", "--size", size, "--label", "person", "--overwrite")
         coco = json.loads((tmp_path / "t.json").read_text())
         assert [each["name"] for each in coco["categories"]] == ["person"]
@@ -85,3 +85,34 @@ def test_the_images_of_a_data_set_are_those_of_the_tracked_frames(whole_run, suc
     images, labels = (sorted((tmp_path / "set" / name).iterdir()) for name in ("images", "labels"))
     assert [file.stem for file in images] == [file.stem for file in labels]
     assert (len(images), cv2.imread(str(images[0])).shape) == (32, (240, 320, 3))
+
+
+def test_exports_that_add_to_one_data_set_at_once_all_succeed(whole_run, catstream, tmp_path):
+    names = [f"{letter}.ndjson" for letter in "abc"]
+    for name in names:
+        (tmp_path / name).write_bytes((whole_run / "out" / "demo.ndjson").read_bytes())
+    options = {"coco": ["all.json"], "yolo": ["set", "--format", "yolo"]}
+    started = [
+        catstream("export", name, *dest, "--append", "--label", name[0], cwd=tmp_path)
+        for dest in options.values()
+        for name in names
+    ]
+    assert [(process.wait(60), process.stderr.read()) for process in started] == [(0, "")] * len(started)
+    coco = json.loads((tmp_path / "all.json").read_text())
+    assert len(coco["videos"]) == len(coco["categories"]) == 3
+    classes = (tmp_path / "set" / "data.yaml").read_text().split("names:")[1]
+    for number, name in (line.strip().split(": ") for line in classes.splitlines() if ":" in line):
+        labels = (tmp_path / "set" / "labels").glob(f"{json.loads(name)}_*.txt")
+        assert {line.split()[0] for file in labels for line in file.read_text().splitlines()} == {number}
+
+
+def test_an_annotated_video_is_refused_as_the_source_of_the_size(whole_run, fail, tmp_path):
+    log = whole_run / "out" / "demo.csv"
+    error = fail("export", log, tmp_path / "t.json", "--size", whole_run / "out" / "demo.mp4")
+    assert "is an annotated video, which is higher than its frames: pass the source" in error
+
+
+def test_a_log_that_is_longer_than_its_video_gives_a_warning(whole_run, demo_video, succeed, tmp_path):
+    video, _ = demo_video(12)
+    _, errors = succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.xml", "--size", video)
+    assert f"demo.ndjson has frame 31, but {video} has 12 frames" in errors

@@ -3,6 +3,7 @@
 import csv
 import json
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from threading import Event
 
 import pytest
@@ -140,3 +141,10 @@ def test_if_no_pipeline_runs_that_is_reported_in_one_line(fail, tmp_path, words)
 def test_at_an_endpoint_that_a_pipeline_has_left_no_command_is_answered(fail, tmp_path):
     error = fail("stop", "--endpoint", tmp_path, "--timeout", 1)
     assert error.startswith(f"catstream: no answer to stop from {tmp_path} within 1 s: is a pipeline running there?")
+
+
+def test_a_password_is_removed_from_the_command_line_that_others_can_read(catstream, tmp_path, until):
+    sink = catstream("sink", "mqtt://me:s3cret@127.0.0.1:9/yard", "--endpoint", tmp_path)
+    line = Path(f"/proc/{sink.pid}/cmdline")
+    until(lambda: b"mqtt://127.0.0.1:9/yard" in line.read_bytes())
+    assert b"s3cret" not in line.read_bytes()

@@ -5,6 +5,7 @@ import select
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 
 from mcap.reader import make_reader
 
@@ -48,7 +49,9 @@ def holds(folder):
 
 def written(folder, errors):
     """The frames whose tracks are there, in each of the files."""
-    frames = [json.loads(line)["frame"] for line in (folder / "tracks.ndjson").read_text().splitlines()[1:]]
+    head, *tracks = map(json.loads, (folder / "tracks.ndjson").read_text().splitlines())
+    assert (Path(head["source"]).name, head["size"], head["rate"]) == ("demo.mp4", [320, 240], 30)
+    frames = [track["frame"] for track in tracks]
     assert frames == list(range(frames[0], frames[0] + len(frames)))
     assert f"{counted(len(frames), 'track')}, {frames[0]} missed" in errors, "those before it came"
     assert len((folder / "t.csv").read_text().splitlines()) == len(frames) + 1
@@ -73,7 +76,7 @@ def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_si
             with Publisher(TRACKS, replace(endpoint, run=run)) as tracks:
                 until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
                 for frame in (frame for part in parts for frame in range(*part)):
-                    tracks.send(Track(frame, frame / 30, "absent", None, 0.0, 0))
+                    tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
                 until(lambda: len(file.read_text().splitlines()) == 1 + written, tracks.serve_late_joiners)
 
         follow("first", (0, 300), (205, 310), written=310)

@@ -143,6 +143,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "with the objects that it had": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
         "missing SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
         "missing --state DIR": ["track", source, "--continue"],
+        "--no-write has no effect on a new run": ["track", source, "--box", box, "--no-write"],
         "--continue and --overwrite are": [
             "track",
             source,

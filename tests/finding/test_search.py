@@ -103,6 +103,15 @@ def test_the_log_of_another_search_is_not_continued(search, tmp_path):
         assert not log.results
 
 
+def test_the_log_of_a_running_search_is_refused_to_another_one(search, tmp_path):
+    with SearchLog(tmp_path / "log", search.description):
+        for overwrite in (False, True):
+            with pytest.raises(ServiceError, match="log is being written by process"):
+                SearchLog(tmp_path / "log", search.description, overwrite=overwrite)
+    with SearchLog(tmp_path / "log", search.description) as log:
+        assert not log.results
+
+
 @pytest.mark.parametrize(
     "content", ["[]\n", '{"kind":"catstream find 3"}\n', "no json\n", '{"kind":"catstream find 4"}\n']
 )

@@ -27,7 +27,7 @@ BOX = Box(40, 30, 60, 40)
 
 
 def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Track:
-    return Track(frame, 0.0, state, box, 0.8, 3)
+    return Track(frame + 1, frame, 0.0, state, box, 0.8, 3)
 
 
 @pytest.mark.parametrize("state", ["bootstrapping", "present", "absent"])
@@ -105,6 +105,17 @@ def test_a_video_without_frames_leaves_no_file(tmp_path):
     with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_is_being_written_is_refused_to_another_writer(tmp_path):
+    path, image = tmp_path / "out.mp4", np.zeros((64, 64, 3), np.uint8)
+    with VideoWriter(path, 25, (64, 64)) as video:
+        for _ in range(3):
+            video.write(image)
+            with pytest.raises(VideoError, match=r"out\.mp4 is being written by process"):
+                VideoWriter(path, 25, (64, 64))
+    with open_source(path) as source:
+        assert sum(1 for _ in source) == 3
 
 
 def test_an_interrupted_rendering_leaves_no_file(tmp_path):
