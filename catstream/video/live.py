@@ -8,6 +8,8 @@ camera that still sends audio but no video is lost, too. `catstream.video.reconn
 HTTP has three special cases. The address of a still picture is polled. MJPEG that FFmpeg's demuxer for it rejects,
 because a part has another content type or none, is read by the demuxer that searches for JPEGs only. HLS delivers
 segments of some seconds at once; their frames are returned at the pace of their time stamps.
+
+H.264 over RTSP is decoded without FFmpeg's parser, which would delay it by one frame: see `catstream.video.nal_units`.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from catstream.base.addresses import without_password
 from catstream.base.settings import RunSettings
 from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
+from catstream.video.nal_units import OPTIONS, NalUnits
 from catstream.video.reconnect import Attempt, Loss, next_attempt
 
 if TYPE_CHECKING:
@@ -43,6 +46,7 @@ _SILENT, _NO_FRAME = f"no data: {_SLOW}", f"data without video frames: {_SLOW}"
 
 # TCP first, because over UDP a lost packet damages the picture; a camera without TCP is still received over UDP.
 _OPTIONS = {"rtsp_flags": "prefer_tcp", "analyzeduration": "500000"}
+_UNPARSED_OPTIONS = _OPTIONS | OPTIONS
 #: For the demuxer that searches for JPEGs: FFmpeg would wait for several of them, and invent time stamps.
 _JPEG_OPTIONS = {"probesize": "32", "analyzeduration": "1", "fflags": "nofillin"}
 
@@ -69,6 +73,7 @@ class LiveSource(Source):
         protocol, mark, path = text.partition("://")
         self._text = protocol.lower() + mark + path  # FFmpeg's names of protocols are in lower case
         self._address, self._settings = without_password(text), settings
+        self._parses = not self._text.startswith("rtsp") or bool(settings.hwaccel)  # by FFmpeg's parser
         self._paced = (-math.inf, 0.0)  # time stamp of the last frame of a segment, and when it was returned
         self._number, self._zero, self._idle = start, since, idle
         self._upright = UprightConverter()
@@ -189,19 +194,41 @@ class LiveSource(Source):
         return Loss("ended", frames, _ENDED)
 
     def _decoded(self, attempt: Attempt, begin: float) -> Iterator[VideoFrame]:
-        """Yield the undamaged frames of one connection, until it ends.
+        """Yield the undamaged frames of one connection, or of two if the first shows that a parser is necessary."""
+        import av
 
-        While it is unknown whether FFmpeg's probing succeeds, a part of the time is reserved for the other demuxer.
-        TimeoutError, with the reason, if data arrives without frames, or a packet was cut off because nothing arrives.
+        if not self._parses:
+            try:
+                yield from self._received(attempt, begin, NalUnits())
+                return
+            except (av.InvalidDataError, TimeoutError, ValueError):
+                self._parses = True
+        yield from self._received(attempt, begin, None)
+
+    def _received(self, attempt: Attempt, begin: float, units: NalUnits | None) -> Iterator[VideoFrame]:
+        """Yield the undamaged frames of one connection, until it ends. Without `units`, FFmpeg parses the stream.
+
+        While it is unknown whether FFmpeg's probing succeeds, a part of the time is reserved for the other demuxer, or
+        for the parser. ValueError if H.264 cannot be decoded without the parser, or it is not H.264. TimeoutError, with
+        the reason, if data arrives without frames, or a packet was cut off because nothing arrives.
         """
+        from av.codec.context import Flags2
+
         settings, due = self._settings, begin + self._settings.open_timeout_seconds
         if _is_http(self._text) and not attempt.demuxer and not attempt.proven:
             due -= settings.open_timeout_seconds / 5
+        elif units is not None and not attempt.proven:
+            due -= settings.open_timeout_seconds / 2
         read_timeout = settings.read_timeout_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
         timeouts = max(1.0, due - monotonic()), read_timeout
-        with _open_container(self._text, attempt.demuxer, timeouts, settings.hwaccel) as container:
+        options = _JPEG_OPTIONS if attempt.demuxer else _OPTIONS if units is None else _UNPARSED_OPTIONS
+        with _open_container(self._text, attempt.demuxer, options, timeouts, settings.hwaccel) as container:
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
+            if units is not None:
+                if stream.codec_context.name != "h264":
+                    raise ValueError(f"{stream.codec_context.name} needs the parser")
+                stream.codec_context.flags2 |= Flags2.chunks
             self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
             now, backlog = monotonic(), Backlog()
             for packet in container.demux():
@@ -212,16 +239,17 @@ class LiveSource(Source):
                     raise TimeoutError(_SILENT if now - before > 0.9 * settings.read_timeout_seconds else _NO_FRAME)
                 if packet.stream_index != stream.index:  # audio, which may continue without the video
                     continue
-                sent = None if packet.pts is None or is_segmented else float(packet.pts * packet.time_base)
-                if backlog.drops(now, sent, is_key=packet.is_keyframe):
-                    self.skipped += 1
-                    due = now + settings.read_timeout_seconds
-                    continue
-                for frame in _undamaged(stream, packet):
-                    if not is_segmented or self._is_next(frame):
-                        yield frame
-                    due = monotonic() + settings.read_timeout_seconds + is_segmented * _LONGEST_SEGMENT
-                backlog.is_decoded(monotonic())
+                for unit in [packet] if units is None else units.take(packet):
+                    sent = None if unit.pts is None or is_segmented else float(unit.pts * unit.time_base)
+                    if backlog.drops(now, sent, is_key=unit.is_keyframe):
+                        self.skipped += 1
+                        due = now + settings.read_timeout_seconds
+                        continue
+                    for frame in _undamaged(stream, unit):
+                        if not is_segmented or self._is_next(frame):
+                            yield frame
+                        due = monotonic() + settings.read_timeout_seconds + is_segmented * _LONGEST_SEGMENT
+                    backlog.is_decoded(monotonic())
 
     def _is_next(self, frame: VideoFrame) -> bool:
         """Wait until a frame of a segment is due. Returns False for a frame that was returned with the same segment."""
@@ -313,14 +341,16 @@ def _is_http(text: str) -> bool:
     return text.startswith(("http:", "https:"))
 
 
-def _open_container(text: str, demuxer: str | None, timeouts: tuple[float, float], hwaccel: str) -> InputContainer:
+def _open_container(
+    text: str, demuxer: str | None, options: dict[str, str], timeouts: tuple[float, float], hwaccel: str
+) -> InputContainer:
     """Open a camera or a stream. Raises PyAV's errors, and VideoError if it has no live video."""
     is_address = "://" in text
     container = open_video(
         f"/dev/video{text}" if text.isdigit() else text,
         hwaccel,
         format=demuxer if is_address else "v4l2",
-        options=_JPEG_OPTIONS if demuxer else _OPTIONS,
+        options=options,
         timeout=timeouts,
     )
     problem = ""

@@ -1,0 +1,127 @@
+"""H.264 without FFmpeg's parser: fragments are joined, and no frame waits for the next one."""
+
+import re
+import threading
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from catstream.loadtest import rtsp
+from catstream.loadtest.camera import Broadcast
+from catstream.video.nal_units import NalUnits
+from catstream.video.source import open_source
+
+START = b"\0\0\0\1"
+LONGEST = 100  # bytes of a fragment
+
+
+def unit(size, kind=1):
+    return START + bytes([kind]) + b"\x55" * size
+
+
+def fragments(whole):
+    """The packets of FFmpeg's demuxer: the start and the header of the unit are in the first one."""
+    first = len(START) + 1 + LONGEST
+    return [whole[:first], *(whole[at : at + LONGEST] for at in range(first, len(whole), LONGEST))]
+
+
+def packet(content, pts=0):
+    made = av.Packet(content)
+    made.pts, made.time_base = pts, Fraction(1, 25)
+    return made
+
+
+def taken(units, *parts):
+    return [[bytes(whole) for whole in units.take(packet(part))] for part in parts]
+
+
+def test_a_unit_is_whole_with_the_fragment_that_is_shorter():
+    units, one = NalUnits(), unit(250)
+    assert taken(units, *fragments(one)) == [[], [], [one]]
+    assert taken(units, unit(40)) == [[unit(40)]]
+
+
+def test_a_unit_whose_fragments_all_have_one_length_is_whole_when_the_next_begins():
+    units, one, other = NalUnits(), unit(200), unit(150)
+    assert taken(units, *fragments(one), *fragments(other)) == [[], [], [one], [other]]
+
+
+def test_a_unit_that_continues_after_a_shorter_fragment_is_an_error():
+    units = NalUnits()
+    taken(units, *fragments(unit(250)))
+    with pytest.raises(ValueError, match="shorter"):
+        taken(units, b"\x55" * 10)
+
+
+def test_a_unit_has_the_time_of_its_first_fragment_and_says_whether_it_is_key():
+    units, found = NalUnits(), []
+    for pts, kind in enumerate((7, 8, 5, 1)):
+        for part in fragments(unit(200, kind)):
+            found += units.take(packet(part, pts))
+    assert [(whole.pts, whole.is_keyframe) for whole in found] == [(0, True), (1, True), (2, True)]
+
+
+@pytest.fixture
+def pictures(rng):
+    """JPEGs that do not fit into one packet."""
+    noise = rng.integers(0, 256, (12, 160, 240, 3), np.uint8)
+    encoder = av.CodecContext.create("mjpeg", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 240, 160, "yuvj420p", Fraction(1, 25)
+    return [bytes(packet) for image in noise for packet in encoder.encode(av.VideoFrame.from_ndarray(image, "bgr24"))]
+
+
+class _Patient(Broadcast):
+    """Sends a frame when the one before was received."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.received = threading.Semaphore(1)
+
+    def frames(self, _):
+        for number, access_unit in enumerate(self._files):
+            self.received.acquire(timeout=20)
+            yield 1 + number / 25, access_unit
+
+
+@pytest.fixture
+def access_units(pictures):
+    """One for each picture, all of them larger than a packet."""
+    return rtsp.encode(pictures, (240, 160), lambda _: None)
+
+
+def test_no_frame_over_rtsp_waits_for_the_next_one(access_units):
+    assert min(map(len, access_units)) > 1400
+    with (
+        _Patient(access_units, (240, 160), source="h264") as camera,
+        open_source(*camera.urls, read_timeout_seconds=15) as source,
+    ):
+        seen = []
+        for frame in source:
+            seen.append(round((frame.pts or 1) * 25 - 25))
+            camera.received.release()
+            if len(seen) == len(access_units):
+                break
+    assert seen == [*range(len(access_units))]
+
+
+def test_a_camera_whose_fragments_have_several_lengths_is_read_with_the_parser(access_units, monkeypatch):
+    monkeypatch.setattr(rtsp, "payloads", shrinking)
+    with (
+        Broadcast(access_units, (240, 160), source="h264") as camera,
+        open_source(*camera.urls) as source,
+    ):
+        assert next(source).image.shape == (160, 240, 3)
+        assert source._parses
+        assert source.reconnects == 0
+
+
+def shrinking(access_unit):
+    """The RTP payloads of an access unit whose NAL units are split into ever shorter fragments."""
+    for nal in re.split(rb"\x00{2,3}\x01", access_unit)[1:]:
+        begin, length = 1, 200
+        while begin < len(nal):
+            flags = (begin == 1) << 7 | (begin + length >= len(nal)) << 6
+            yield bytes([nal[0] & 0xE0 | 28, flags | nal[0] & 0x1F]) + nal[begin : begin + length]
+            begin, length = begin + length, max(length - 1, 20)
