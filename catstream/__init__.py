@@ -16,6 +16,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from catstream.errors import require_linux
+
 if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation, annotate
     from catstream.base.box import Box
@@ -87,6 +89,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name at its first use, so that a process loads only the modules that it needs."""
     if name not in _HOMES:
         raise AttributeError(f"module 'catstream' has no attribute {name!r}")
+    if _HOMES[name].startswith(("pipeline", "client", "fleet")):
+        require_linux()
     return getattr(import_module(f"catstream.{_HOMES[name]}"), name)
 
 

@@ -91,6 +91,15 @@ EXTRAS = {
 }
 
 
+def require_linux() -> None:
+    """Raise ServiceError on another system, which lacks what the processes of a pipeline need."""
+    if sys.platform != "linux":
+        raise ServiceError(
+            "a pipeline requires Linux: use catstream.Tracker, MultiTracker, annotate and find, or the commands batch, "
+            "annotate, find, evaluate, export and report"
+        )
+
+
 def require_extra(extra: str) -> None:
     """Check that the modules of an extra are installed, without importing them.
 

@@ -76,7 +76,7 @@ def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames, together)
 
 def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, together, monkeypatch):
     for cores in (1, 4):
-        monkeypatch.setattr(threads, "_cores", lambda cores=cores: cores)
+        monkeypatch.setattr(threads, "cores", lambda cores=cores: cores)
         threads._pool.cache_clear()
         assert followed(frames, STEPS) == together
     threads._pool.cache_clear()

@@ -22,6 +22,7 @@ from catstream.base.box import Box
 from catstream.base.names import UNNAMED, check_count, check_name, errors_about
 from catstream.base.settings import Settings
 from catstream.base.text import listed
+from catstream.base.threads import cores
 from catstream.base.workers import Workers
 from catstream.errors import BoxError, ObjectError
 from catstream.messages.kinds import Check, Track
@@ -117,7 +118,7 @@ class Annotation:
         progress: Progress = lambda *_: None,
     ) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
-        self._jobs, self.progress = jobs or len(os.sched_getaffinity(0)), progress
+        self._jobs, self.progress = jobs or cores(), progress
         self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import glob
 import os
 import re
@@ -19,6 +18,11 @@ from typing import IO, Any
 
 from catstream.base.forks import after_fork, forked, generation
 from catstream.errors import CatstreamError, ServiceError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 ABANDONED_SECONDS = 600.0  #: after which nothing writes a part of a file any more
 
@@ -124,7 +128,7 @@ def descriptor(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
     finally:
         if not forked(since):
             _descriptors.remove(handle)
-            _flock(handle, fcntl.LOCK_UN)  # a copy that is just beginning may have it yet
+            _flock(handle, "LOCK_UN")  # a copy that is just beginning may have it yet
             os.close(handle)
 
 
@@ -143,23 +147,25 @@ after_fork(_close_descriptors)
 def lock(handle: int, seconds: float = 0.0) -> bool:
     """Lock an open file or folder until it is closed or this process ends; False if another keeps it for `seconds`."""
     deadline = time.monotonic() + seconds
-    while not (locked := _flock(handle, fcntl.LOCK_EX)) and time.monotonic() < deadline:
+    while not (locked := _flock(handle, "LOCK_EX")) and time.monotonic() < deadline:
         time.sleep(0.05)
     return locked
 
 
 def is_locked(handle: int) -> bool:
-    """Whether another process has locked an open file; asked with a shared lock, so that two may ask at once."""
-    return not _flock(handle, fcntl.LOCK_SH)
+    """Return True if another process has locked an open file; asked with a shared lock, so that two may ask at once."""
+    return not _flock(handle, "LOCK_SH")
 
 
-def _flock(handle: int, kind: int) -> bool:
+def _flock(handle: int, kind: str) -> bool:
     """Lock an open file or folder without waiting; returns False if another process has locked it.
 
-    A file system without locks, as some network drives, lets everybody lock.
+    A file system without locks, as some network drives, lets everybody lock, and so does a system without `fcntl`.
     """
+    if fcntl is None:
+        return True
     try:
-        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+        fcntl.flock(handle, getattr(fcntl, kind) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:
@@ -229,7 +235,9 @@ def check_distinct(files: Iterable[tuple[str, Path]], kind: type[CatstreamError]
 
 
 def sync(path: Path) -> None:
-    """Write the content of a file, or the entries of a folder, to disk."""
+    """Write the content of a file, or the entries of a folder, to disk; Windows has no descriptor of a folder."""
+    if os.name != "posix":
+        return
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -36,7 +36,8 @@ def check_not_forked(since: int) -> None:
 
 def after_fork(function: Callable[[], object]) -> None:
     """Call a function in each process that is forked from this one, before anything else."""
-    os.register_at_fork(after_in_child=function)
+    if hasattr(os, "register_at_fork"):  # Windows has no fork
+        os.register_at_fork(after_in_child=function)
 
 
 def _count() -> None:

@@ -120,7 +120,7 @@ def in_parallel(function: Callable[[_Item], _Result], items: Iterable[_Item]) ->
     [3, 2, 1]
     """
     waiting = list(items)
-    if len(waiting) < 2 or _cores() < 2:
+    if len(waiting) < 2 or cores() < 2:
         return [function(item) for item in waiting]
 
     def limited(item: _Item) -> _Result:
@@ -145,14 +145,14 @@ def one_at_a_time(function: Callable[[_Item], _Result]) -> Callable[[_Item], _Re
 
 
 @cache
-def _cores() -> int:
+def cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_cores(), "catstream")
+    return ThreadPoolExecutor(cores(), "catstream")
 
 
 after_fork(_pool.cache_clear)  # threads do not survive a fork

@@ -10,6 +10,7 @@ import ctypes
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -35,6 +36,8 @@ SPAWN = multiprocessing.get_context("spawn")
 
 def die_with(parent: int) -> None:
     """Let the kernel kill this process when its parent ends, so that no orphan is left."""
+    if sys.platform != "linux":  # there, an orphan ends when it reads its next task
+        return
     ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # the parent ended before the call of prctl
         raise SystemExit(0)
@@ -61,6 +64,9 @@ def sigint_blocked() -> Iterator[None]:
     The mask alone does not hold it back: the signal arrives in another thread, and Python handles it in the main one. A
     process whose start is interrupted would wait for its arguments.
     """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
     resource_tracker.ensure_running()  # its start would unblock the signal
     received: list[int] = []
     is_main = threading.current_thread() is threading.main_thread()  # the thread in which Python handles signals

@@ -14,7 +14,7 @@ import click
 
 from catstream.base.addresses import without_passwords
 from catstream.cli.common import INTERRUPTS, CommandGroup, complain, stopped
-from catstream.errors import CatstreamError, ServiceError
+from catstream.errors import CatstreamError, ServiceError, require_linux
 
 #: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
 #: long; commands that belong together share one.
@@ -47,8 +47,14 @@ COMMANDS = {
 }
 
 
+#: Commands that run on every system; the others start or use the processes of a pipeline.
+_PORTABLE = {"annotate", "batch", "find", "evaluate", "export", "report", "merge", "network", "settings"}
+
+
 def load_command(name: str) -> click.Command:
     """Import the module of one of the `COMMANDS`, and return the click command."""
+    if name not in _PORTABLE:
+        require_linux()
     module = import_module(f"catstream.cli.{COMMANDS[name][0]}")
     command: click.Command = getattr(module, name.replace("-", "_"))
     return command

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from catstream.base.files import locked_folder, write_atomically, writing
 from catstream.base.settings import Settings
 from catstream.base.text import counted
+from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, with_listen, with_token
@@ -92,7 +92,7 @@ def annotate(
     drawn = by_object([*([] if csv_file is None else read_keyframes(csv_file)), *map(parse_keyframe, texts)])
     if not drawn:
         require_extra("view")
-    jobs = jobs or len(os.sched_getaffinity(0))
+    jobs = jobs or cores()
     bar = line_of(messages(), text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
     settings = Settings.from_values(overrides)
     with Annotation(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterable
 from contextlib import closing
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 
 from catstream.base.settings import Settings
 from catstream.base.text import counted
+from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, messages, screen, stopped, table, text
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.errors import CatstreamError
@@ -68,7 +68,7 @@ def batch(overrides: dict[str, object], boxes: Path, output: Path, jobs: int | N
     missing = [video for video in videos if (row := rows[video.name]) is None or row.boxes != video.boxes]
     rows |= dict.fromkeys((video.name for video in missing), None)
     write_summaries(path, filter(None, rows.values()))
-    jobs = min(jobs or len(os.sched_getaffinity(0)), max(len(missing), 1))
+    jobs = min(jobs or cores(), max(len(missing), 1))
     with tempfile.TemporaryDirectory(prefix="catstream-batch-") as folder:
         counts = Path(folder) / "counts"
         tracked = track_videos(missing, output, settings, jobs, counts)

@@ -23,7 +23,7 @@ from rich.table import Column, Table
 from catstream.base.addresses import without_passwords
 from catstream.errors import ServiceError
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 _WIDTH = 140  # columns of a table that is not printed to a terminal
 
 
@@ -93,7 +93,8 @@ class Interrupts:
         for number in _SIGNALS:
             if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._handle)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
     @contextmanager
     def leaving(self) -> Iterator[None]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from catstream.base.box import Box, Window
 from catstream.base.settings import RunSettings, Settings
-from catstream.base.threads import one_thread
+from catstream.base.threads import cores, one_thread
 from catstream.detection.context import FrameContext
 from catstream.detection.search import SAME_OVERLAP, fit_extent
 from catstream.detection.search import Detection as Candidate
@@ -383,7 +383,7 @@ def _several(values: _One | Iterable[_One]) -> Iterable[_One]:
 
 def _scanned(scan: Scan, frames: Iterator[NamedFrame]) -> Generator[tuple[NamedFrame, list[list[Match]]]]:
     """Scan frames in several threads, and yield the results in order; an error of the source comes after them."""
-    workers = len(os.sched_getaffinity(0))
+    workers = cores()
     pending: deque[tuple[NamedFrame, Future[list[list[Match]]]]] = deque()
     problem: VideoError | None = None
     with ThreadPoolExecutor(workers, "scan") as pool:

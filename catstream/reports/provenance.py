@@ -17,6 +17,7 @@ import cv2
 from threadpoolctl import threadpool_info
 
 from catstream.base.settings import Settings
+from catstream.base.threads import cores
 
 _ROOT = Path(__file__).parents[2]
 _LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "pyzmq")
@@ -48,7 +49,7 @@ def machine() -> dict[str, object]:
     }
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": cores(),
         "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9),
         "system": platform.system(),
         "python": platform.python_version(),

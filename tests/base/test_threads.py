@@ -93,7 +93,7 @@ def test_opencv_is_limited_only_if_requested():
 
 @pytest.fixture(params=[1, 3], ids="{} cores".format)
 def cores(request, monkeypatch):
-    monkeypatch.setattr(threads, "_cores", lambda: request.param)
+    monkeypatch.setattr(threads, "cores", lambda: request.param)
     threads._pool.cache_clear()
     yield request.param
     threads._pool.cache_clear()

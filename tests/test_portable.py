@@ -1,0 +1,79 @@
+"""The half of the library that starts no pipeline uses nothing that only Linux has."""
+
+import subprocess
+import sys
+
+import pytest
+
+import catstream
+from catstream.cli import load_command
+from catstream.errors import ServiceError
+
+#: Takes away what Windows or macOS lack, before anything is imported, and then runs this half.
+PROGRAM = """
+import os, signal, socket, sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name in ("fcntl", "grp", "pwd", "resource", "termios"):
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Missing())
+import multiprocessing.util  # imports from them at its first use
+for name in ("fcntl", "grp", "pwd", "resource", "termios"):
+    sys.modules.pop(name, None)
+for module, names in {
+    os: ("fork", "geteuid", "getuid", "memfd_create", "register_at_fork", "sched_getaffinity"),
+    signal: ("SIGHUP", "SIGSTOP", "pthread_sigmask"),
+    socket: ("AF_UNIX",),
+}.items():
+    for name in names:
+        delattr(module, name)
+
+from catstream.cli import main
+
+def run(*words):
+    sys.argv = ["catstream", *words]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code, (words, end.code)
+
+if __name__ == "__main__":
+    video, first, last = sys.argv[1:]
+    with open("boxes.csv", "w") as table:
+        table.write(f"file,object,x,y,w,h,frame\\n{video},anna,{first},0\\n")
+    run("batch", "boxes.csv", "--output", "batch", "--jobs", "1")
+    run("annotate", video, "--box", f"anna@0={first}", "--box", f"anna@11={last}", "--output", "annotated")
+    run("export", "annotated/demo.ndjson", "demo.csv")
+    run("report", "annotated")
+    import catstream
+    from catstream.video.source import open_source
+    tracker = catstream.Tracker()
+    with open_source(video) as source:
+        tracker.init(next(source).image, first)
+        for frame in source:
+            tracker.update(frame.image)
+    tracker.saved_model().save("anna.safetensors")
+    run("find", "--model", "anna.safetensors", video)
+    tree = catstream.CoresetTree(2)
+    print("all ran")
+"""
+
+
+def test_this_half_runs_without_what_only_linux_has(demo_video, tmp_path):
+    video, boxes = demo_video(12)
+    (tmp_path / "program.py").write_text(PROGRAM)
+    command = [sys.executable, tmp_path / "program.py", video, str(boxes[0]), str(boxes[-1])]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=150, check=False)
+    assert done.stdout.endswith("all ran\n"), done.stderr
+    assert (tmp_path / "annotated" / "report.html").exists()
+
+
+@pytest.mark.parametrize("system", ["win32", "darwin"])
+def test_a_pipeline_on_another_system_is_an_error_of_one_line(monkeypatch, system):
+    monkeypatch.setattr(sys, "platform", system)
+    for start in (lambda: catstream.Pipeline, lambda: catstream.subscribe, lambda: load_command("track")):
+        with pytest.raises(ServiceError, match="a pipeline requires Linux: use"):
+            start()
+    assert load_command("batch").name == "batch"
