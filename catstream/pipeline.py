@@ -170,7 +170,8 @@ class Pipeline:
             if self._state is not None:
                 stack.enter_context(locked_for_run(self._state, self._earlier, self._job))
             job = self._started(str(endpoint))
-            self.saved_models = stack.enter_context(saved(self._save_models, self._state or folder, settings))
+            state = self._state or folder
+            stack.enter_context(saved(self._save_models, state, settings, self.saved_models.append))
             self._supervisor = Supervisor(job, folder, self._start)
             stack.callback(self._supervisor.stop)  # before the models are saved, from the compressor's last checkpoint
             self._endpoint, self._stack = str(endpoint), stack.pop_all()

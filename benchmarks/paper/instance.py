@@ -324,7 +324,7 @@ def _images(path: Path, first: int, start: int, stop: int, step: int) -> list[np
 
 
 def _is_same_video(one: Sequence, other: Sequence) -> bool:
-    """Whether two sequences are of one video: then the object of one is in the other."""
+    """Return True if two sequences are of one video: then the object of one is in the other."""
     first, second = (_frames(each, slice(0, 1, 1))[0][0] for each in (one, other))
     return first.shape == second.shape and float(cv2.absdiff(first, second).mean()) < _SAME_VIDEO
 

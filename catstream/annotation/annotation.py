@@ -168,7 +168,7 @@ class Annotation:
         """Rename an object, and keep its passes. ObjectError if the name is not valid, or that of another object."""
         if check_name(name) in self.keyframes:
             raise ObjectError(f"there is an object {name} already: give another name")
-        self.keyframes = {name if each == object else each: drawn for each, drawn in self.keyframes.items()}
+        self.keyframes = {name if other == object else other: drawn for other, drawn in self.keyframes.items()}
         passes = self._passes.items()
         self._passes = {task._replace(object=name) if task.object == object else task: one for task, one in passes}
 
@@ -187,7 +187,7 @@ class Annotation:
         while tasks := self.missing():
             total, finished = sum(task.frames for task in tasks), 0
             work = [(task, self.frames, self.settings) for task in tasks]
-            results = self._workers.run(_work, work) if self._jobs > 1 else (_work(*each) for each in work)
+            results = self._workers.run(_work, work) if self._jobs > 1 else (_work(*task) for task in work)
             with closing(results):
                 for task, one in results:
                     self._passes[task] = one
@@ -246,7 +246,7 @@ class Annotation:
 
     @property
     def checked(self) -> dict[str, list[Check]]:
-        """Whether each frame is a keyframe, checked or unchecked, by the name of the object."""
+        """The check of each frame (keyframe, checked or unchecked), by the name of the object."""
         return {name: self._checks(name, probabilities) for name, probabilities in self.probabilities.items()}
 
     @property
@@ -326,7 +326,7 @@ class Annotation:
         return [way for way in ways if way[0] in drawn]
 
     def _is_valid(self, task: Task, name: str) -> bool:
-        """Whether a task is of this object, and the boxes that it began with are there."""
+        """Return True if a task is of this object, and the boxes that it began with are there."""
         return task.object == name and set(task.keyframes) <= self.keyframes.get(name, {}).items()
 
     def _missing_of(self, stretch: _Stretch, *, use_memory: bool) -> list[Task]:
@@ -342,7 +342,7 @@ class Annotation:
         return tasks
 
     def _checks(self, name: str, probabilities: Float64) -> list[Check]:
-        checks: list[Check] = ["checked" if each >= _CHECKED else "unchecked" for each in probabilities]
+        checks: list[Check] = ["checked" if value >= _CHECKED else "unchecked" for value in probabilities]
         for frame in self.keyframes[name]:
             checks[frame] = "keyframe"
         return checks

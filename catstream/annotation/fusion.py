@@ -39,7 +39,7 @@ def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) ->
     if not passes:
         return np.full((count, 4), np.nan), np.zeros(count), np.zeros(count)
     ordered = [_in_order(one, count) for one in passes]
-    boxes, scores = np.stack([each for each, _ in ordered]), np.stack([each for _, each in ordered])
+    boxes, scores = (np.stack(values) for values in zip(*ordered, strict=True))
     arrived = np.array([_arrives(one, keyframes) for one in passes])
     forward = np.array([one.is_forward for one in passes])
     way = np.arange(1, count + 1) / (count + 1)
@@ -69,7 +69,7 @@ def _in_order(one: Pass, count: int) -> tuple[Float64, Float64]:
 
 
 def _arrives(one: Pass, keyframes: Keyframes) -> bool:
-    """Whether a pass ends near the box of the keyframe at its end, or without a box where the object is absent."""
+    """Return True if a pass ends near the box of the keyframe at its end, or without a box if the object is absent."""
     return one.stop in keyframes and one.is_near(one.stop, keyframes[one.stop])
 
 

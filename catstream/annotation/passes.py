@@ -54,12 +54,12 @@ class Pass:
         return self.stop > self.start
 
     def covers(self, start: int, stop: int) -> bool:
-        """Whether it runs from `start` or before it, in the same direction, to `stop` or beyond it."""
+        """True if it runs from `start` or before it, in the same direction, to `stop` or beyond it."""
         way = 1 if self.is_forward else -1
         return way * self.start <= way * start < way * stop <= way * self.stop
 
     def is_near(self, frame: int, box: Box | None) -> bool:
-        """Whether it has the object at the box of a frame after its start, or rightly has no box there."""
+        """Return True if it has the object at the box of a frame after its start, or rightly has no box there."""
         drawn = np.array([np.nan] * 4 if box is None else box)
         return bool(iou(self.boxes[abs(frame - self.start) - 1], drawn) > _NEAR)
 
@@ -119,15 +119,15 @@ def _tracks(
     """Track from a box in the first image, or search for the object of a saved model without one."""
     detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
     for number, image in enumerate(images):
-        pyramid, begun, continued = detectors.pyramid(image), {}, {}
+        pyramid, results, continued = detectors.pyramid(image), {}, {}
         if number == 0:
             if learned is not None:
                 continued = {UNNAMED: learned.compressor(settings, detectors.network)}
             if box is not None:
-                begun = detectors.begin_all({UNNAMED: box}, pyramid)
+                results = detectors.begin_all({UNNAMED: box}, pyramid)
             elif learned is not None:
                 detectors.seek(UNNAMED, learned.model, learned.box, learned.similarity())
-        tracks, features = detectors.step(pyramid, 0.0, begun)
+        tracks, features = detectors.step(pyramid, 0.0, results)
         for sample in forest.take(features, continued):
             detectors.adopt(trainer.train(sample))
         yield tracks.tracks[UNNAMED]

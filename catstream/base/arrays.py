@@ -16,7 +16,7 @@ Int64 = npt.NDArray[np.int64]
 
 
 def is_finite(array: np.ndarray) -> bool:
-    """Whether all numbers are finite, in one pass without a temporary array.
+    """Return True if all numbers are finite, in one pass without a temporary array.
 
     >>> is_finite(np.array([1.0, 1e200])), is_finite(np.array([1.0, np.nan]))
     (True, False)

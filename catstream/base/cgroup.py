@@ -1,4 +1,4 @@
-"""What the kernel says of the control group of this process: how often it has killed a process for want of memory."""
+"""The control group of this process: how often the kernel has killed a process for lack of memory."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def check_file(
         raise kind(f"{path} exists already: replace it with --overwrite, or give another name")
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
-        folder = next(each for each in (folder, *folder.parents) if each.exists())
+        folder = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         with tempfile.TemporaryFile(dir=folder):
             is_writable = not path.is_dir()

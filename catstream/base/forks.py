@@ -21,7 +21,7 @@ def generation() -> int:
 
 
 def forked(since: int) -> bool:
-    """Whether this process is a copy of the one in which `generation` returned `since`."""
+    """Return True if this process is a copy of the one in which `generation` returned `since`."""
     return _generation != since
 
 

@@ -559,7 +559,7 @@ def _find(name: str, variable: str = "") -> Setting:
 
 
 def _is_foreign(name: str) -> bool:
-    """Whether a variable with our prefix is no setting: its name is similar to none, or that of an orchestrator.
+    """Return True if a variable with our prefix is no setting: its name is similar to none, or that of an orchestrator.
 
     Kubernetes sets CATSTREAM_SERVICE_HOST and others for a service named catstream.
     """

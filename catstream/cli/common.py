@@ -1,4 +1,4 @@
-"""What the commands share: tables, errors and progress lines on the terminal, Ctrl-C, and checks of the files to write.
+"""Shared by the commands: tables, errors and progress lines on the terminal, Ctrl-C, and checks of the files to write.
 
 `catstream --help` imports this module: what takes long is imported in the functions that need it.
 """

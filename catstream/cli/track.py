@@ -432,7 +432,7 @@ class RunProgress:
         self._pipeline = pipeline
         self._held, self._looked = 0.0, time.perf_counter()  # seconds while the run was held, and until when
         self._started = self._now()
-        self._first = self._shown = 0.0
+        self._first = self._refreshed = 0.0
         self.frames = 0
         self._objects: dict[str, _ObjectCounts] = {}
 
@@ -465,8 +465,8 @@ class RunProgress:
             counts.frames += 1
             counts.present += track.box is not None
             counts.version = track.model_version
-        if not line.disable and now - self._shown >= _REFRESH_SECONDS:
-            self._shown = now
+        if not line.disable and now - self._refreshed >= _REFRESH_SECONDS:
+            self._refreshed = now
             present = sum(track.box is not None for track in tracks.values())
             states = [track.state for track in tracks.values()]
             state = states[0] if len(states) == 1 else f"{present}/{len(states)} present"

@@ -24,7 +24,7 @@ _LARGEST_PORT = 65535
 
 
 class HostPort(NamedTuple):
-    """What the web server listens on."""
+    """The address on which the web server listens."""
 
     host: str
     port: int

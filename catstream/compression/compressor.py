@@ -187,7 +187,7 @@ class Compressor:
             self._path = []
 
     def _due(self) -> bool:
-        """Whether there is a new leaf, and the trees have grown by an eighth or the interval is over."""
+        """Return True if there is a new leaf, and the trees have grown by an eighth or the interval is over."""
         if not all(self.trees[name].nodes for name, tree in TREES.items() if tree.required):
             return False
         leaves = self.leaves

@@ -215,14 +215,14 @@ class CoresetTree:
         self.nodes = nodes  # one assignment: Ctrl-C during a reduction loses no node
 
     def _to_merge(self, older: Node, newer: Node) -> bool:
-        """Whether to merge two neighbouring nodes into one."""
+        """Return True if two neighbouring nodes are to be merged into one."""
         return older.level == newer.level
 
     def _merged(self, older: Node, newer: Node) -> Node:
         return older.merged(newer)
 
     def _is_count(self, count: int, level: int) -> bool:
-        """Whether a node of this level can summarise this number of rows."""
+        """Return True if a node of this level can summarise this number of rows."""
         return count == self.size << level
 
     def _checked(self, rows: np.ndarray) -> np.ndarray:

@@ -96,7 +96,7 @@ def update_level(state: DetectorState, score: float, redetected: bool, belief: B
 
 
 def is_redetection(score: float, local_score: float, belief: BeliefSettings) -> bool:
-    """Whether the best window elsewhere replaces the local one: it is confident, and leads by the margin."""
+    """Return True if the best window elsewhere replaces the local one: it is confident, and leads by the margin."""
     return score > belief.confident_score and score > local_score + belief.redetection_margin
 
 

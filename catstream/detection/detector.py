@@ -128,7 +128,7 @@ class Detector:
         return FrameContext(frame, self.model, self.settings, seq, self.similarity)
 
     def _is_explained(self, detection: Detection, seq: int) -> bool:
-        """Whether the score is high enough to skip training on this frame (docs/paper.md)."""
+        """Return True if the score is high enough to skip training on this frame (docs/paper.md)."""
         state = self._current_state()
         if not self.model.version or state.level != "confident" or seq - state.first_frame <= _FIRST_FRAMES:
             return False
@@ -139,7 +139,7 @@ class Detector:
         return detection.score >= _EXPLAINED and not is_due
 
     def _is_still(self, detection: Detection, seq: int) -> bool:
-        """Whether the surroundings of the object have not changed since a recent training frame (docs/paper.md)."""
+        """Return True if the surroundings of the object are as in a recent training frame (docs/paper.md)."""
         if detection.around is None or self._last_training is None or not self.model.version:
             return False
         number, cells = self._last_training

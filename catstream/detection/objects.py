@@ -187,7 +187,7 @@ def assign(
 
 
 def _are_exclusive(one: tuple[int, Box], other: tuple[int, Box]) -> bool:
-    """Whether two objects cannot be at the same position, by their first frames and initial boxes."""
+    """Return True if two objects cannot be at the same position, by their first frames and initial boxes."""
     (frame, box), (other_frame, other_box) = one, other
     return frame != other_frame or box.overlap(other_box) <= _INITIAL_OVERLAP
 

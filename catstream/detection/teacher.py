@@ -227,7 +227,7 @@ def affine_copies(
 
 
 def _is_moved(number: int, share: float) -> bool:
-    """Whether copy `number` is put on another background, as a `share` of all copies is, but never the first one."""
+    """Return True if copy `number` gets another background, as a `share` of all copies does; never the first one."""
     return number > 0 and number * share % 1 < share
 
 

@@ -140,7 +140,7 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _is_there(file: Path) -> bool:
-    """Whether there is such a file, or a dead link, which is an error when it is read."""
+    """Return True if there is such a file, or a dead link, which is an error when it is read."""
     return file.is_file() or _is_dead_link(file)
 
 
@@ -218,7 +218,7 @@ def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
 
 
 def _look_like_corners(sequence: Sequence) -> bool:
-    """Whether x,y,w,h are rather x1,y1,x2,y2.
+    """Return True if x,y,w,h are rather x1,y1,x2,y2.
 
     Then w > x and h > y in each frame, and w and h change with x and y, or reach out of the frame.
     """

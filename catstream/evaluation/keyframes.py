@@ -103,8 +103,8 @@ def mean_by_boxes(rows: list[KeyframeRow]) -> list[KeyframeRow]:
     means = []
     for boxes in sorted({row.boxes for row in rows}):
         group = [dataclasses.asdict(row) for row in rows if row.boxes == boxes]
-        known = {field: [row[field] for row in group if row[field] is not None] for field in MEASURES}
-        shares: dict[str, Any] = {field: fmean(values) if values else None for field, values in known.items()}
+        measured = {field: [row[field] for row in group if row[field] is not None] for field in MEASURES}
+        shares: dict[str, Any] = {field: fmean(values) if values else None for field, values in measured.items()}
         means.append(KeyframeRow("mean", boxes, **shares))
     return means
 
@@ -177,8 +177,8 @@ def _right(boxes: Float64, truth: Float64) -> Bool:
 def _interpolated(keyframes: dict[int, Box | None], count: int) -> Float64:
     """Boxes between the keyframes, linear in all four numbers; before the first and after the last one, its box."""
     present = sorted(frame for frame, box in keyframes.items() if box is not None)
-    known = np.array([keyframes[frame] for frame in present])
-    boxes = np.column_stack([np.interp(np.arange(count), present, known[:, side]) for side in range(4)])
+    drawn = np.array([keyframes[frame] for frame in present])
+    boxes = np.column_stack([np.interp(np.arange(count), present, drawn[:, side]) for side in range(4)])
     boxes[[frame for frame, box in keyframes.items() if box is None]] = np.nan
     return boxes
 
@@ -199,7 +199,7 @@ def _box(row: Float64) -> Box | None:
 
 
 def _is_usable(row: Float64, size: tuple[int, int]) -> bool:
-    """Whether a person could draw this: a box that tracking can start with, or that the object is absent."""
+    """Return True if a person could draw this: a box that tracking can start with, or that the object is absent."""
     box = _box(row)
     try:
         return box is None or bool(box.validated(*size))

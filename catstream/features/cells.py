@@ -66,7 +66,7 @@ class Cells:
         return rows, columns
 
     def differs_by_noise(self, other: Cells) -> bool:
-        """Whether this differs from another image of the same size only by the noise of a camera.
+        """Return True if this differs from another image of the same size only by the noise of a camera.
 
         Noise changes the gradients everywhere, but hardly the mean colour of a cell; motion changes the colours.
         """

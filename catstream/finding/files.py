@@ -143,7 +143,7 @@ class _Walk:
         return files
 
     def _is_new(self, path: Path) -> bool:
-        """Whether a file or folder was not visited before, by any name; a dead link is new."""
+        """Return True if a file or folder was not visited before, by any name; a dead link is new."""
         try:
             state = path.stat()
         except OSError:

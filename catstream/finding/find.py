@@ -207,7 +207,7 @@ def _window(size: int, aspect: int) -> Window:
 
 
 def _is_searchable(window: Window, size: tuple[int, int]) -> bool:
-    """Whether windows of a size are neither too small to show anything nor too large for a frame."""
+    """Return True if windows of a size are neither too small to show anything nor too large for a frame."""
     (width, height), side = size, WINDOW * CELL
     if window.w > _WIDEST * width or window.h > _WIDEST * height or window.area < _SMALLEST**2:
         return False

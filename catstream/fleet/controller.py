@@ -377,7 +377,7 @@ def named_actors() -> list[str]:
 
 
 def actors(fleet: str) -> dict[str, str]:
-    """What the actor of each stream of a fleet was started for, by stream."""
+    """The specification for which the actor of each stream of a fleet was started, by stream."""
     prefix = actor_name(fleet, "stream") + "/"
     parts = (name.removeprefix(prefix).partition("/") for name in named_actors() if name.startswith(prefix))
     return {stream: order for stream, _, order in parts}

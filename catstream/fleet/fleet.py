@@ -119,7 +119,7 @@ class Fleet(AbstractContextManager["Fleet"]):
 
     @property
     def is_owner(self) -> bool:
-        """Whether the fleet ends with this object, because `up` started Ray for it."""
+        """True if the fleet ends with this object, because `up` started Ray for it."""
         return self._owned is not None
 
     def up(self) -> list[str]:
@@ -225,7 +225,7 @@ class Fleet(AbstractContextManager["Fleet"]):
 
     @property
     def is_running(self) -> bool:
-        """Whether its controller runs."""
+        """True if its controller runs."""
         self._connect()
         return actor_name(self.name, "controller") in named_actors()
 
@@ -430,7 +430,7 @@ def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
 
 
 def _learned(store: Store, stream: str, name: str, *, named: bool) -> SavedModel | None:
-    """What the newest state of a stream in the store has learned of an object; None if that is nothing."""
+    """The saved model of an object in the newest state of a stream in the store; None if there is none."""
     try:
         if (newest := store.stream(stream).newest()) is None:
             raise FleetError("there is no state of it in the store yet")
@@ -465,7 +465,7 @@ def _fleets_folder() -> Path:
 
 
 def _is_up(folder: Path) -> bool:
-    """Whether a process has, or starts, the node of Ray of a fleet on this machine."""
+    """Return True if a process has, or starts, the node of Ray of a fleet on this machine."""
     with suppress(OSError), (folder / "lock").open() as file:
         return is_locked(file.fileno())
     return False

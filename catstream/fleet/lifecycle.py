@@ -77,7 +77,7 @@ class Node:
     draining: bool = False
 
     def suits(self, spec: StreamSpec) -> bool:
-        """Whether a stream may run here."""
+        """Return True if a stream may run here."""
         return not self.draining and spec.labels.items() <= self.labels.items()
 
 
@@ -123,13 +123,13 @@ def selector(spec: StreamSpec, nodes: Collection[Node]) -> dict[str, str]:
 
 
 def order(spec: StreamSpec, nodes: Collection[Node]) -> str:
-    """What an actor is started for: the digest of its stream, its cores, and a digest of the labels of its node."""
+    """The key of an actor: the digest of its stream, its cores, and a digest of the labels of its node."""
     labels = json.dumps(selector(spec, nodes), sort_keys=True).encode()
     return f"{spec.digest}/{spec.cores:g}/{hashlib.sha256(labels).hexdigest()[:8]}"
 
 
 def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: float) -> Event | None:
-    """What happens to a stream now, None for nothing; it should not run if there is no spec of it.
+    """The next action for a stream, None for none; it should not run if there is no spec of it.
 
     >>> gate = StreamSpec("gate", "demo:1")
     >>> event(gate, Actor(), [], 0.0)
@@ -152,7 +152,7 @@ def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: f
 
 
 def matches_spec(spec: StreamSpec, actor: Actor, nodes: Collection[Node]) -> bool:
-    """Whether an actor was started for this spec, and runs, or will be placed, on a node that suits it."""
+    """Return True if an actor was started for this spec, and runs, or will be placed, on a node that suits it."""
     expected = order(spec, nodes)
     node = next((node for node in nodes if node.id == actor.node and node.alive), None)
     if node is None:

@@ -196,7 +196,7 @@ class Store:
 
 
 def _credentials() -> Any:
-    """What reads ~/.aws: profiles, roles, sessions; None if there is nothing, or the environment has a key."""
+    """The credentials of ~/.aws: profiles, roles, sessions; None if there is nothing, or the environment has a key."""
     variables = {"AWS_SHARED_CREDENTIALS_FILE": "~/.aws/credentials", "AWS_CONFIG_FILE": "~/.aws/config"}
     # `Path.expanduser` would raise for a user without a home directory.
     files = [Path(os.path.expanduser(os.environ.get(name, usual))) for name, usual in variables.items()]  # noqa: PTH111
@@ -254,7 +254,7 @@ class _Version(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What is below the folder of a stream.
+    """The names below the folder of a stream.
 
     claims  tokens of the claims
     states  versions of the states
@@ -335,7 +335,7 @@ class StateStore:
             self.remove_up_to(claim.token, self.listed(), keep=1)
 
     def listed(self) -> Contents:
-        """What is below the folder now."""
+        """The names below the folder now."""
         return Contents.of(self._objects.names(self.folder))
 
     def holder(self, token: int) -> str:

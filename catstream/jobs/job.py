@@ -254,7 +254,7 @@ def files_by_name(files: Models | None) -> dict[str, Path]:
 def _plain(value: object) -> object:
     """A value in the types of JSON, if it is of a type that `msgspec` does not know."""
     if isinstance(value, slice):
-        return [None if each is None else int(each) for each in (value.start, value.stop, value.step)]
+        return [None if number is None else int(number) for number in (value.start, value.stop, value.step)]
     return str(value)
 
 

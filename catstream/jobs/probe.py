@@ -1,4 +1,4 @@
-"""What a job needs to know of its source before its processes start."""
+"""The facts about a source that a job needs before its processes start."""
 
 from __future__ import annotations
 

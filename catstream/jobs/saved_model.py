@@ -75,7 +75,7 @@ class SavedModel:
             raise ServiceError("the object of the saved model was not found yet, so there is nothing new to save")
         if compressor.box is None or state is None or not compressor.version:
             raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
-        trees = {each: tree.copy() for each, tree in compressor.trees.items()}
+        trees = {label: tree.copy() for label, tree in compressor.trees.items()}
         centres, name = compressor.centres, compressor.name
         model = _trained(trees, centres, compressor.version, name, settings, compressor.network)
         return cls(name, trees, centres, compressor.origins, compressor.box, model, settings)
@@ -97,7 +97,7 @@ class SavedModel:
     def check_network(self, network: str, one: str = "the saved model", other: str = "this run has") -> None:
         """Raise SettingsError unless it was learned with the network of this digest; empty is none."""
         if (own := self.model.network) != network:
-            ours, theirs = (f"the network of digest {each}" if each else "no network" for each in (own, network))
+            ours, theirs = (f"the network of digest {one}" if one else "no network" for one in (own, network))
             raise SettingsError(f"{one} was learned with {ours}, {other} {theirs}: give the same file features.network")
 
     @one_thread()
@@ -352,7 +352,7 @@ def _trained(
 
 def _check_same(ours: Settings, theirs: Settings, one: str, other: str) -> None:
     """Raise SettingsError if settings that both sides share differ."""
-    known, given = ours.texts(), theirs.texts()
+    own, others = ours.texts(), theirs.texts()
     for name in _SAME:
-        if known[name] != given[name]:
-            raise SettingsError(f"{one} with {name}={known[name]}, {other} {name}={given[name]}: use the same setting")
+        if own[name] != others[name]:
+            raise SettingsError(f"{one} with {name}={own[name]}, {other} {name}={others[name]}: use the same setting")

@@ -16,7 +16,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
 
@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 
 
 def contains_run(folder: Path) -> bool:
-    """Whether a folder contains a run that can be resumed, whether or not that is complete."""
+    """Return True if a folder contains a run that can be resumed, whether or not that is complete."""
     return (folder / _SMALL[0]).exists()
 
 
@@ -138,21 +138,22 @@ def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None
 
 
 @contextlib.contextmanager
-def saved(files: Mapping[str, Path], state: Path, settings: Settings) -> Iterator[list[Path]]:
-    """Save what was learned of each object to its file afterwards; an error of the run comes before those of saving.
+def saved(
+    files: Mapping[str, Path], state: Path, settings: Settings, report: Callable[[Path], object]
+) -> Iterator[None]:
+    """Save what was learned of each object to its file afterwards, and report each file that was saved.
 
-    Yields the list of the files that were saved, filled afterwards.
+    An error of the run comes before those of saving.
     """
-    done: list[Path] = []
     errors: list[CatstreamError] = []
     since = generation()
     try:
-        yield done
+        yield
     finally:
         for name, file in files.items() if not forked(since) else ():
             try:
                 learned(state, settings, name).save(file)
-                done.append(file)
+                report(file)
             except CatstreamError as error:
                 errors.append(error)
         for problem in errors[0 if sys.exception() else 1 :]:

@@ -1,4 +1,4 @@
-"""What is observed of a stream under load, and the measures of it; and the use of processor and memory.
+"""Observations of a stream under load, and their measures; and the use of processor and memory.
 
 Every due frame counts once, tracked or skipped. Its track latency ends with the first track of this frame or a newer
 one; its model latency ends with the first model whose training sample includes this frame or a newer one. Thus a
@@ -52,7 +52,7 @@ class Observations:
 
     @property
     def warmed_up(self) -> bool:
-        """Whether the start-up phase is over: the detector uses a model with a motion model."""
+        """True if the start-up phase is over: the detector uses a model with a motion model."""
         return (
             self.first_motion_version > 0
             and bool(self.tracks)

@@ -146,7 +146,7 @@ class Subscribers:
 
     @property
     def connected(self) -> bool:
-        """Whether each subscriber has received a track."""
+        """True if each subscriber has received a track."""
         return all(self._received[: self._readers])
 
     @property

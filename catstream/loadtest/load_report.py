@@ -192,7 +192,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
 
 
 def _verdict(result: Result) -> tuple[str, bool]:
-    """Whether every stream was tracked at its rate, or where and when most frames were skipped."""
+    """A sentence: every stream was tracked at its rate, or where and when most frames were skipped."""
     worst, measures = max(enumerate(result.streams), key=lambda stream: stream[1].skipped_share)
     rate = f"{counted(len(result.streams), 'stream')} of {result.plan.rate:g} frames/s"
     skipped = f"{100 * measures.skipped_share:.1f} %"

@@ -105,7 +105,7 @@ class DetectorState:
 
     @property
     def is_sought(self) -> bool:
-        """Whether the object of a saved model has not been found yet."""
+        """True if the object of a saved model has not been found yet."""
         return self.first_window is None
 
 

@@ -105,7 +105,7 @@ class Field:
 
     @property
     def is_name(self) -> bool:
-        """Whether it is the name of an object."""
+        """True if it is the name of an object."""
         return self.meta is not None and self.meta.pattern is not None
 
 
@@ -132,7 +132,7 @@ def _field(name: str, hint: Any) -> Field:
             (hint,) = (part for part in get_args(hint) if part is not NoneType)
         else:
             break
-    keys, values = (_field(name, each) for each in get_args(hint)) if get_origin(hint) is dict else (None, None)
+    keys, values = (_field(name, part) for part in get_args(hint)) if get_origin(hint) is dict else (None, None)
     is_message, array = dataclasses.is_dataclass(hint), _first(limits, Array)
     has_arrays = (
         any(field.has_arrays for field in fields(hint))
@@ -166,9 +166,9 @@ def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths 
     if value is None:
         return None
     if field.values is not None:
-        found = {name: _check(field.values, entry, lengths, where) for name, entry in value.items()}
+        lengths_of = {name: _check(field.values, entry, lengths, where) for name, entry in value.items()}
         if field.named is not None:
-            _check_names(found, field.named, where)
+            _check_names(lengths_of, field.named, where)
     elif field.is_message:
         return check_message(value)
     elif field.array is not None:
@@ -176,15 +176,15 @@ def _check(field: Field, value: Any, lengths: _Lengths, where: str) -> _Lengths 
     return None
 
 
-def _check_names(found: dict[str, _Lengths | None], named: Named, where: str) -> None:
+def _check_names(lengths_of: dict[str, _Lengths | None], named: Named, where: str) -> None:
     """Check the names of a map, and that its messages have rows of d columns, each with those that its name adds.
 
-    The lengths found in an array are None: it shares those of the message around it.
+    The lengths of an array are None: it shares those of the message around it.
     """
-    if not named.required <= found.keys() <= named.columns.keys():
+    if not named.required <= lengths_of.keys() <= named.columns.keys():
         expected = ", ".join(f"{name} (always)" if name in named.required else name for name in named.columns)
-        raise ProtocolError(f"{where}: expected {expected}, got {', '.join(found) or 'none'}")
-    widths = {name: lengths["d"] - named.columns[name] for name, lengths in found.items() if lengths}
+        raise ProtocolError(f"{where}: expected {expected}, got {', '.join(lengths_of) or 'none'}")
+    widths = {name: lengths["d"] - named.columns[name] for name, lengths in lengths_of.items() if lengths}
     if len(set(widths.values())) > 1:
         raise ProtocolError(f"{where}: expected rows of one length, got {widths} without their labels")
 

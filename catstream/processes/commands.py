@@ -63,17 +63,17 @@ class Commands(AbstractContextManager["Commands"]):
 
     @property
     def apply(self) -> bool:
-        """Whether commands and pauses apply: the frames of an earlier detector were repeated."""
+        """True if commands and pauses apply: the frames of an earlier detector were repeated."""
         return self._detectors.seq >= self._repeated
 
     @property
     def paused(self) -> bool:
-        """Whether the run is paused, until a command or for a time."""
+        """True if the run is paused, until a command or for a time."""
         return self.desired.paused or monotonic() < self._paused_until
 
     @property
     def hold(self) -> bool:
-        """Whether no frames are tracked because the run is paused, or waits for a box."""
+        """True if no frames are tracked because the run is paused, or waits for a box."""
         return self.apply and (self.paused or not self.desired.objects)
 
     def resume(self, start: Start) -> None:

@@ -69,7 +69,7 @@ class CompressorLoop:
 
     @property
     def must_stop(self) -> bool:
-        """Whether the process was asked to end, and a connected detector did not send its end in time."""
+        """True if the process was asked to end, and a connected detector did not send its end in time."""
         window = self._features.window
         seconds = _SENDER_SECONDS if window.connected and not window.ended else 0
         return self._process.ending.seconds_since_signal >= seconds

@@ -1,4 +1,4 @@
-"""What a command changes, and what it is answered: pure functions."""
+"""The effects of commands, and their answers: pure functions."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def check_room(name: str, desired: DesiredState, most: int) -> None:
 
 
 def continues(command: Command, name: str, desired: DesiredState, detectors: Detectors) -> bool:
-    """Whether a box continues the same object; one without a model begins again."""
+    """Return True if a box continues the same object; one without a model begins again."""
     detector, current = detectors.detectors.get(name), desired.objects.get(name)
     return command.keep and bool(detector and detector.model.version and current and current.begins <= detectors.seq)
 

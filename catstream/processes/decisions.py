@@ -127,7 +127,7 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, cont
 
 
 def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str, int]) -> bool:
-    """Whether the models have arrived that were trained from the compressor's newest samples, by their versions.
+    """Return True if the models have arrived that were trained from the compressor's newest samples, by their versions.
 
     Either of compressor and trainer may have been restarted too, and then repeats its last steps.
     """
@@ -189,7 +189,7 @@ class TrainingLag:
 
 
 def checkpoint_is_due(since: float, took: float, interval: float) -> bool:
-    """Whether the interval is over `since` seconds after the last attempt to write a checkpoint, which `took` seconds.
+    """Return True if the interval is over, `since` seconds after the last checkpoint was tried, which `took` seconds.
 
     It grows with the trees: at most a tenth of the time is spent.
 

@@ -151,7 +151,7 @@ class DetectorLoop:
 
     @property
     def _held(self) -> bool:
-        """Whether no frames are tracked: the stream ends, or the run is paused or waits for a box."""
+        """True if no frames are tracked: the stream ends, or the run is paused or waits for a box."""
         return bool(self.process.ending.reason) or self.commands.hold
 
     def begin(self, frame: Frame) -> list[Beginning]:
@@ -170,7 +170,7 @@ class DetectorLoop:
         return beginnings
 
     def skips(self, beginnings: Sequence[Beginning]) -> bool:
-        """Whether a frame is not tracked: the stream ends, or a live source is paused."""
+        """Return True if a frame is not tracked: the stream ends, or a live source is paused."""
         skips = self._held and not beginnings
         self._skipped += skips and not self.process.ending.reason
         return skips

@@ -43,7 +43,7 @@ class Ending:
 
     @property
     def signalled(self) -> bool:
-        """Whether a signal has asked the process to end."""
+        """True if a signal has asked the process to end."""
         return self.seconds_since_signal >= 0
 
     @property

@@ -1,4 +1,4 @@
-"""What a detector sends: tracks and features of each frame, pictures of some, and the end."""
+"""The outputs of a detector: tracks and features of each frame, pictures of some, and the end."""
 
 from __future__ import annotations
 

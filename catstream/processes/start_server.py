@@ -151,7 +151,7 @@ class StartServer:
         self.pid = self._process.pid
 
     def runs(self) -> bool:
-        """Whether it has not ended; ServiceError if it has ended with an error."""
+        """Return True if it has not ended; ServiceError if it has ended with an error."""
         if (code := self._process.poll()) is not None and code > 0:
             raise ServiceError(
                 f"{sys.executable} did not start the processes of a pipeline (exit code {code}): its error is above"

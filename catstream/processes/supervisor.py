@@ -348,7 +348,7 @@ class Supervisor:
             child.due = now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1)
 
     def _is_late(self, deadline: float) -> bool:
-        """Whether no process is waited for any longer."""
+        """Return True if no process is waited for any longer."""
         return self._hurries.is_set() or self._clock() >= deadline
 
     def _shut_down(self) -> None:

@@ -201,8 +201,8 @@ def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) ->
 def _yaml_names(file: Path) -> dict[str, int]:
     """Return the classes of a YOLO data set; raise VideoError if they cannot be read."""
     names: dict[str, int] = {}
-    found = _YAML_NAMES.search(file.read_text(encoding="utf-8")) if file.exists() else None
-    entries = (found[1].split(",") if found[2] is None else found[2].splitlines()) if found else []
+    match = _YAML_NAMES.search(file.read_text(encoding="utf-8")) if file.exists() else None
+    entries = (match[1].split(",") if match[2] is None else match[2].splitlines()) if match else []
     for entry in (entry for entry in entries if entry.strip() and not entry.lstrip().startswith("#")):
         parsed = _YAML_NAME.fullmatch(entry)
         if parsed is None:

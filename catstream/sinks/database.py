@@ -152,9 +152,9 @@ def read_database(path: Path) -> Iterator[TrackedFrame]:
     with _errors(path, "read"), closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as database:
         if not database.execute("SELECT 1 FROM sqlite_master").fetchone():  # killed before it made the table
             return
-        found = database.execute(f"SELECT {_NAMES} FROM tracks ORDER BY frame, rowid")  # nosec B608
-        for _, each in groupby(map(_track, found), lambda track: track.frame):
-            yield TrackedFrame([*each])
+        rows = database.execute(f"SELECT {_NAMES} FROM tracks ORDER BY frame, rowid")  # nosec B608
+        for _, tracks in groupby(map(_track, rows), lambda track: track.frame):
+            yield TrackedFrame([*tracks])
 
 
 def read_database_head(path: Path) -> Head | None:

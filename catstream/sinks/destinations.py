@@ -129,7 +129,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What an export has to know beside the tracks.
+    """The parameters of an export.
 
     name     that of the log, for the files in a folder
     size     width and height of a frame in pixels; None if it is not known
@@ -322,7 +322,7 @@ def check_export(path: Path, row: Row, *, overwrite: bool, append: bool, log: Pa
 
 
 def _is_empty(folder: Path) -> bool:
-    """Whether a folder has no files but the images of a data set, which may be there before its labels."""
+    """Return True if a folder has no files but the images of a data set, which may be there before its labels."""
     entries = folder.iterdir() if folder.is_dir() else ()
     return all(entry.name == "images" or entry.name.startswith(".") for entry in entries)
 

@@ -108,7 +108,7 @@ class Events:
         return self._selected([event for name in [*self._objects] for event in self._end(name)])
 
     def status(self, name: str) -> dict[str, Any] | None:
-        """Whether an object is present, that is found and not lost, and the names of its zones; None if it ended."""
+        """The status of an object: whether it is present, and the names of its zones; None if it ended."""
         item = self._objects.get(name)
         if item is None:
             return None
@@ -188,7 +188,7 @@ def _defect(corners: np.ndarray, size: tuple[int, int] | None) -> str:
 
 
 def _cross(start: np.ndarray, end: np.ndarray, other_start: np.ndarray, other_end: np.ndarray) -> bool:
-    """Whether two line segments cross at a point inside both."""
+    """Return True if two line segments cross at a point inside both."""
 
     def side(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
         return float(np.sign((b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0])))

@@ -74,9 +74,9 @@ def write_parquet(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
 
     kinds = {"INTEGER": arrow.int64(), "REAL": arrow.float64(), "TEXT": arrow.string()}
     schema = arrow.schema([(name, kinds[kind.split()[0]]) for name, kind in COLUMNS.items()])
-    found = rows(frames)
+    cells = rows(frames)
     with arrow.parquet.ParquetWriter(path, schema) as writer:
-        while batch := [*islice(found, _BATCH)]:
+        while batch := [*islice(cells, _BATCH)]:
             columns = zip(zip(*batch, strict=True), schema.types, strict=True)
             writer.write_batch(arrow.record_batch([arrow.array(*column) for column in columns], schema=schema))
 

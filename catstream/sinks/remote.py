@@ -1,4 +1,4 @@
-"""What destinations on the network share: events as JSON, warnings, and the check of an address."""
+"""Shared by the destinations on the network: events as JSON, warnings, and the check of an address."""
 
 from __future__ import annotations
 

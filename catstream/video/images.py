@@ -138,7 +138,7 @@ def _batch(path: Path, number: int) -> Sequence[np.ndarray]:
 
 
 def _is_cut_off(data: bytes) -> bool:
-    """Whether this is a JPEG in which no end of the image (FF D9) follows its first scan (FF DA)."""
+    """Return True if this is a JPEG in which no end of the image (FF D9) follows its first scan (FF DA)."""
     place = 2
     while data[place : place + 1] == b"\xff" and data[place + 1 : place + 2] != b"\xda":
         place += 2 + int.from_bytes(data[place + 2 : place + 4])

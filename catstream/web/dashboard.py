@@ -188,7 +188,7 @@ class Dashboard(Parts):
 
     @property
     def _holds(self) -> bool:
-        """Whether no frames are tracked: where the objects are is not known."""
+        """True if no frames are tracked: where the objects are is not known."""
         return self.state[0] in ("lost", "waiting", "paused")
 
     def rate(self, now: float) -> float:

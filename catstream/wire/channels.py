@@ -82,7 +82,7 @@ class Channel(Generic[Message]):
 
     @property
     def by_object(self) -> bool:
-        """Whether each message is about one object."""
+        """True if each message is about one object."""
         return any(field.name == "object" for field in fields(self.messages[0]))
 
     @property

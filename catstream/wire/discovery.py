@@ -157,7 +157,7 @@ def source_at(endpoint: Endpoint) -> str:
 
 
 def _has_source(endpoint: Endpoint, source: str) -> bool:
-    """Whether a pipeline has this source: the same text, the same file, or a file of that name."""
+    """Return True if a pipeline has this source: the same text, the same file, or a file of that name."""
     return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 

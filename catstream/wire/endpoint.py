@@ -114,18 +114,18 @@ class Endpoint:
 
     @property
     def is_ipv6(self) -> bool:
-        """Whether the host has addresses of IPv6 only; ZeroMQ would not look for them."""
+        """True if the host has addresses of IPv6 only; ZeroMQ would not look for them."""
         return self.folder is None and [*_resolved(self.host)] == [socket.AF_INET6]
 
     def is_in_use(self, channel: Channel[object], sender: str | None = None) -> bool:
-        """Whether a process listens at a channel's Unix socket; ZeroMQ would replace it without an error."""
+        """Return True if a process listens at a channel's Unix socket; ZeroMQ would replace it without an error."""
         if self.folder is None:
             return False
         with socket.socket(socket.AF_UNIX) as probe:
             return probe.connect_ex(self.address(channel, sender).removeprefix("ipc://")) == 0
 
     def lacks_sockets(self) -> bool:
-        """Whether it is a folder without any socket: a pipeline removes all of its own at its end."""
+        """Return True if it is a folder without any socket: a pipeline removes all of its own at its end."""
         return self.folder is not None and not any(file.exists() for file in socket_files(self.folder))
 
     def check_access(self) -> None:
@@ -161,7 +161,7 @@ def _file(channel: Channel[object], sender: str) -> str:
 
 
 def is_too_long(folder: Path) -> bool:
-    """Whether the kernel does not take the names of Unix sockets in a folder."""
+    """Return True if the kernel does not take the names of Unix sockets in a folder."""
     return any(len(os.fsencode(file)) > _MAX_PATH_BYTES for file in socket_files(folder))
 
 

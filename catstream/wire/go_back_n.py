@@ -63,14 +63,14 @@ class SendWindow:
 
     @property
     def full(self) -> bool:
-        """Whether no message can be pushed now."""
+        """True if no message can be pushed now."""
         return len(self._unacknowledged) >= self._size or self._bytes >= _MOST_BYTES
 
     def push(self, seq: int, frame: bytes) -> None:
         """Accept the next message for transmission; ValueError if the window is full."""
         if self.full:
-            kept = f"{len(self._unacknowledged)} of {self._bytes} bytes"
-            raise ValueError(f"message {seq} of {self._channel} was pushed while {kept} are not acknowledged")
+            waiting = f"{len(self._unacknowledged)} of {self._bytes} bytes"
+            raise ValueError(f"message {seq} of {self._channel} was pushed while {waiting} are not acknowledged")
         self._unacknowledged.append((seq, frame))
         self._bytes += len(frame)
         self.sent = seq
@@ -82,7 +82,7 @@ class SendWindow:
             self._in_flight += 1
 
     def must_ask(self, now: float) -> bool:
-        """Whether to ask for the position: messages wait, and the last reply or question is `PATIENCE_SECONDS` ago."""
+        """Return True if a question is due: messages wait, and the last reply or question is `PATIENCE_SECONDS` ago."""
         return bool(self._unacknowledged) and now - self._last_reply > PATIENCE_SECONDS
 
     def asked(self, now: float) -> None:
@@ -149,7 +149,7 @@ class ReceiveWindow:
 
     @property
     def half_full(self) -> bool:
-        """Whether half of the sender's window is not stored yet: the sender waits while its window is full."""
+        """True if half of the sender's window is not stored yet: the sender waits while its window is full."""
         return 2 * (self.processed - self._position.seq) >= self._size or 2 * self._bytes >= _MOST_BYTES
 
     def asked(self, peer: bytes) -> Position:

@@ -1,4 +1,4 @@
-"""What ZeroMQ reports of the connections of a socket, and what listens at an address."""
+"""Events of the connections of a socket, as ZeroMQ reports them, and a probe of a listener."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(52, b"\0")
 
 
 class Event(Enum):
-    """What ZeroMQ reports of a connection."""
+    """An event of a connection, as ZeroMQ reports it."""
 
     STOPPED = "the socket is closed: nothing is reported after it"
     CONNECTED = "the handshake succeeded"
@@ -75,7 +75,7 @@ class Monitor:
 
 
 def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
-    """Whether a socket has a message, or gets one within so many seconds."""
+    """Return True if a socket has a message, or gets one within so many seconds."""
     # To look costs half as much as `poll`, and most sockets that are looked at have no message.
     has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
     return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))

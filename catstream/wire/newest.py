@@ -54,7 +54,7 @@ class Publisher(ChannelSocket[Message]):
 
     @property
     def has_subscribers(self) -> bool:
-        """Whether more than the end had a subscriber when `send` or `serve_late_joiners` was last called."""
+        """True if more than the end had a subscriber when `send` or `serve_late_joiners` was last called."""
         return not self._subscribed <= {_END}
 
     def send(self, message: Message) -> None:
@@ -140,7 +140,7 @@ class Subscriber(ChannelSocket[Message]):
         self._connect()
 
     def pending(self) -> bool:
-        """Whether something has arrived that was not received yet."""
+        """Return True if something has arrived that was not received yet."""
         return bool(self._arrived) or super().pending()
 
     def receive(self, seconds: float) -> Message | None:
@@ -167,7 +167,7 @@ class Subscriber(ChannelSocket[Message]):
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
 
     def _is_repeat(self, message: Message, data: memoryview) -> bool:
-        """Whether a message is the same as the last one of its object or process, which is sent again now and then.
+        """Return True if a message is the last one of its object or process, which is sent again now and then.
 
         It is identified by its version. One that has none is small, and identified by all of its bytes.
         """

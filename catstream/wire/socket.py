@@ -88,7 +88,7 @@ def _too_many(error: zmq.ZMQError) -> ServiceError:
 
 
 def _remedy(error: zmq.ZMQError) -> str:
-    """What to do if a socket cannot listen."""
+    """The advice if a socket cannot listen."""
     match error.errno:
         case errno.EADDRINUSE:
             what = "another pipeline may be running there: wait for it, or choose"
@@ -213,11 +213,11 @@ class ChannelSocket(Generic[Message]):
             self._socket.connect(self._endpoint.address(self.channel, sender))
 
     def pending(self) -> bool:
-        """Whether something has arrived that was not received yet."""
+        """Return True if something has arrived that was not received yet."""
         return self._wait(0)
 
     def _wait(self, seconds: float) -> bool:
-        """Whether something arrives within so many seconds; handles the events of connections first."""
+        """Return True if something arrives within so many seconds; handles the events of connections first."""
         self._read_events()
         return arrives(self._socket, seconds)
 

@@ -39,7 +39,7 @@ class Pipeline:
     def next(self):
         for each in (self._tracks, self._previews):
             each.serve_late_joiners()
-        track = Track(self.frame + 1, self.frame, self.frame / 20, "present", BOX, 0.9, 1)
+        track = Track(self.frame, self.frame / 20, "present", BOX, 0.9, 1)
         picture = jpeg(self._noise[self.frame % 9])
         self._previews.send(Preview(self.frame, track.time, 640, 480, {"": BOX}, picture))
         self._tracks.send(track)

@@ -21,7 +21,7 @@ PUBLISHED = [name for name, channel in CHANNELS.items() if channel.receiver is N
 
 def features(seq, width=5):
     training = {"appearance": TrainingRows.labelled(np.ones((3, width)), 1)}
-    return Features(seq, seq, 0.0, {"anna": ObjectFeatures(None, training)})
+    return Features(seq - 1, 0.0, {"anna": ObjectFeatures(None, training)})
 
 
 #: What may be wrong with a message of features: test_codec.py has all that its schema does not allow.

@@ -1,0 +1,91 @@
+"""Which objects begin in a frame: those of the job, of commands, and of a resume."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from catstream.base.box import Box
+from catstream.detection.objects import Detectors
+from catstream.jobs.job import Job
+from catstream.messages.kinds import Command
+from catstream.processes.beginnings import Beginnings
+from catstream.processes.commands import Commands
+from catstream.processes.decisions import DesiredObject, DesiredState, Start
+from catstream.processes.outputs import Previews
+from catstream.processes.process import Process
+from catstream.video.frames import Frame
+
+BOX, OTHER = Box(60, 50, 48, 40), Box(10, 20, 30, 30)
+
+
+class Stream:
+    """The objects that begin in the frames of one image, of a run that has the box of anna."""
+
+    def __init__(self, process, commands, detectors, previews, image):
+        self.commands, self.detectors, self._image = commands, detectors, image
+        self.beginnings = Beginnings(process, detectors, commands, previews)
+
+    def frame(self, held=False):
+        """The names of the objects that begin in the next frame; it is tracked unless there are none while held."""
+        number, answers = self.detectors.seq, []
+        self.commands.store_and_answer = lambda *answered: answers.extend(answered)
+        beginnings = self.beginnings.in_frame(Frame(number, number / 25, self._image), held=held)
+        if beginnings or not held:
+            results = {one.name: one.result for one in beginnings}
+            self.detectors.step(self.detectors.pyramid(self._image), number / 25, results)
+        self.answers = [(answered.object, answered.done) for answered in answers]
+        return [one.name for one in beginnings]
+
+
+@pytest.fixture
+def stream(folder, scene, monkeypatch):
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # the handlers of this process stay
+    job = Job("walk.mp4", {"anna": BOX}, endpoint=str(folder), run="one")
+    with closing(Process("detector", job)) as process:
+        detectors = Detectors(process.settings)
+        with Commands(process, detectors) as commands, Previews(process.endpoint) as previews:
+            yield Stream(process, commands, detectors, previews, scene((60, 50)))
+
+
+def set_box(number, name, box=OTHER, **more):
+    return Command(number, "set-box", box, object=name, **more)
+
+
+def test_the_object_of_the_job_begins_in_the_first_frame_alone(stream):
+    assert [stream.frame() for _ in range(3)] == [["anna"], [], []]
+
+
+def test_while_held_only_a_box_lets_objects_begin(stream):
+    assert stream.frame(held=True) == []
+    stream.commands.boxes.append(set_box("1", "ben"))
+    assert stream.frame(held=True) == ["ben", "anna"]
+
+
+def test_of_two_boxes_for_one_name_the_second_waits_for_the_next_frame(stream):
+    stream.frame()
+    stream.commands.boxes += [set_box("1", "ben"), set_box("2", "ben", BOX), set_box("3", "carl")]
+    assert stream.frame() == ["ben", "carl"]
+    assert stream.answers == [("ben", True), ("carl", True)]
+    assert stream.frame() == ["ben"]
+    assert stream.commands.desired.objects["ben"] == DesiredObject(BOX, begins=3)
+
+
+@pytest.mark.parametrize("box", [Box(900, 900, 20, 20), Box(10, 10, 1, 1)], ids=["outside", "too small"])
+def test_an_invalid_box_is_rejected_and_nothing_begins(stream, box):
+    stream.frame()
+    stream.commands.boxes.append(set_box("1", "ben", box))
+    assert stream.frame() == []
+    assert stream.answers == [("ben", False)]
+    assert list(stream.commands.desired.objects) == ["anna"]
+
+
+def test_after_a_resume_an_object_without_a_state_begins_again_where_it_was(stream):
+    objects = {"anna": DesiredObject(BOX, begins=8), "ben": DesiredObject(OTHER, begins=20)}
+    start = Start(7, 7, DesiredState(objects), {})
+    stream.detectors.seq = start.seq
+    stream.beginnings.resume(start, {})
+    stream.commands.resume(start)
+    assert stream.frame() == ["anna", "ben"], "of ben nothing is there"
+    assert stream.detectors.detectors["anna"].state.first_frame == 7
+    assert np.isclose(stream.detectors.detectors["anna"].box.overlap(BOX), 1, atol=0.05)
