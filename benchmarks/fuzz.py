@@ -116,7 +116,7 @@ def grown() -> Forest:
         rows = np.random.default_rng(seq).normal(size=(4, WIDTH)).astype("f4")
         training = dict.fromkeys(GROUPS, TrainingRows.labelled(rows, [1, 0, 1, 0]))
         part = ObjectFeatures(BOX, training, example(DetectorState))
-        forest.take(Features(seq, seq, 0.0, {"anna": part, "ben": part}))
+        forest.take(Features(seq - 1, 0.0, {"anna": part, "ben": part}))
     return forest
 
 

@@ -70,7 +70,7 @@ class Pipeline:
         State folder of an earlier run, which continues at the frame that it had reached. The folder also contains the
         source, the box, the part and the settings.
     after : int
-        With `resume`: `seq` of the last track that the caller has; the run continues with the next frame. If None, it
+        With `resume`: `frame` of the last track that the caller has; the run continues with the next one. If None, it
         continues after the last checkpoint, which may be ahead of the tracks that were read.
     paused : bool
         Whether the run starts paused: `catstream resume` continues it, for example once all subscribers are there.
@@ -153,7 +153,7 @@ class Pipeline:
         self.source, self.boxes, self.part, self.settings = job.source, job.boxes, job.part, job.settings
         self.results, self.earlier_results = job.results, self._earlier.results if self._earlier else Results()
         self.saved_models: list[Path] = []
-        self.after = after
+        self.first_frame = None if after is None else after + 1
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
         self._rows = 0
@@ -341,9 +341,9 @@ class Pipeline:
         if self._earlier is None or self._state is None:
             return 0
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.
-        if self.after is not None and not self.live:
-            return self.after
-        return max(last_seq(self._state), self.after or 0)
+        if self.first_frame is not None and not self.live:
+            return self.first_frame
+        return max(last_seq(self._state), self.first_frame or 0)
 
 
 def _check_exclusive(state: object, resume: object, box: object, model: object) -> None:

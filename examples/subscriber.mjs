@@ -49,7 +49,7 @@ function attach(endpoint, channel, options) {
 async function* messages(socket) {
   for await (const [data] of socket) {
     const [version, kind, , , fields] = decode(data);
-    if (version !== 4) throw new Error("this catstream speaks another protocol");
+    if (version !== 5) throw new Error("this catstream speaks another protocol");
     yield { kind, fields };
   }
 }
@@ -71,11 +71,11 @@ async function followModels(models) {
 }
 
 async function followTracks(tracks) {
-  let seq = 0;
+  let expected = 0; // number of the next frame
   let missed = 0;
   for await (const { kind, fields: track } of messages(tracks)) {
-    if (seq) missed += Math.max(0, track.seq - seq - 1); // all tracks of a frame have the same seq
-    seq = track.seq;
+    if (expected) missed += Math.max(0, track.frame - expected);
+    expected = track.frame + 1;
     if (kind === "end") {
       console.log(`end: ${track.reason}, ${missed} tracks missed`);
       return;

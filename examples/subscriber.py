@@ -47,7 +47,7 @@ def attach(endpoint: str, channel: str, keys: str) -> zmq.Socket[bytes]:
 def receive(socket: zmq.Socket[bytes]) -> tuple[str, dict[str, Any]]:
     """Receive the next message: its kind and its fields."""
     version, kind, _, _, fields = msgpack.unpackb(socket.recv())
-    if version != 4:
+    if version != 5:
         sys.exit("this catstream speaks another protocol")
     return kind, fields
 
@@ -65,7 +65,7 @@ def main(endpoint: str, keys: str = "") -> None:
     poller = zmq.Poller()
     poller.register(tracks)
     poller.register(models)
-    seq = missed = 0
+    expected = missed = 0  # number of the next frame
     versions: dict[str, int] = {}  # of the last model of each object
     while True:
         ready = dict(poller.poll())
@@ -78,9 +78,9 @@ def main(endpoint: str, keys: str = "") -> None:
                 print(f"model {version} of frame {model['frame']}, {length} {name}".rstrip(), flush=True)
         if tracks in ready:
             kind, track = receive(tracks)
-            if seq:  # tracks before the first received one are not counted; all tracks of a frame have the same seq
-                missed += max(0, track["seq"] - seq - 1)
-            seq = track["seq"]
+            if expected:  # tracks before the first received one are not counted
+                missed += max(0, track["frame"] - expected)
+            expected = track["frame"] + 1
             if kind == "end":
                 print(f"end: {track['reason']}, {missed} tracks missed")
                 return

@@ -181,8 +181,8 @@ def test_the_images_that_represent_a_folder_keep_the_energy_within_the_bounds(de
 def test_tracks_become_detections_of_supervision():
     pytest.importorskip("supervision")
     detections = runpy.run_path(str(EXAMPLES / "to_supervision.py"))["detections"]
-    track = Track(1, 0, 0.0, "present", catstream.Box(1, 2, 3, 4), 1.5, 0, object="anna")
-    found = detections([track, Track(1, 0, 0.0, "absent", None, 0.1, 0, object="ben")])
+    track = Track(0, 0.0, "present", catstream.Box(1, 2, 3, 4), 1.5, 0, object="anna")
+    found = detections([track, Track(0, 0.0, "absent", None, 0.1, 0, object="ben")])
     np.testing.assert_array_equal(found.xyxy, [[1, 2, 4, 6]])
     assert found.confidence.tolist() == [1.0]
     assert len(detections([])) == 0
@@ -252,7 +252,7 @@ def test_the_zone_counter_counts_the_visits_of_an_object_and_their_time(capsys):
     example = runpy.run_path(str(EXAMPLES / "zone_counter.py"))
     events, counter = example["Events"](example["SinkOptions"](zones={"door": DOOR})), example["Counter"]()
     for frame, x in enumerate([0, 60, 70, 0, 60, 0]):
-        track = Track(frame + 1, frame, frame / 2, "present", catstream.Box(x, 40, 20, 20), 0.9, 1, object="anna")
+        track = Track(frame, frame / 2, "present", catstream.Box(x, 40, 20, 20), 0.9, 1, object="anna")
         for event in events.update([track]):
             counter.take(event)
     assert dict(counter.visits)["door"] == [1.0, 0.5]

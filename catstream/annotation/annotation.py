@@ -231,7 +231,7 @@ class Annotation:
             boxes, probabilities, scores = self._fused(name)
             tracks[name] = [
                 Track(
-                    *(frame + 1, frame, self.frames.times[frame], "absent" if np.isnan(box[0]) else "present"),
+                    *(frame, self.frames.times[frame], "absent" if np.isnan(box[0]) else "present"),
                     None if np.isnan(box[0]) else Box(*box.tolist()),
                     float(scores[frame]),
                     model_version=0,

@@ -190,7 +190,7 @@ class _Run:
         for line in self._doubts(pipeline):
             console.print(line)
         if self.resume is not None:
-            pipeline.after = files.position(skip_damaged=pipeline.settings.run.skip_damaged)
+            pipeline.first_frame = files.position(skip_damaged=pipeline.settings.run.skip_damaged)
         progress = RunProgress(pipeline)
         try:
             interrupted = self._run(pipeline, files, progress, console)

@@ -129,7 +129,7 @@ class Forest:
         names = dict.fromkeys(name for counters in own for name in counters)
         highest = {name for name in names if name in ("version", "level")}
         total = {name: (max if name in highest else sum)(counters[name] for counters in own) for name in names}
-        return {"seq": self.seq, "objects": len(own)} | total | {"version": self.version}
+        return {"frames": self.seq, "objects": len(own)} | total | {"version": self.version}
 
     def object_counters(self) -> dict[str, dict[str, float]]:
         """Counters of each object, by name, for the health messages."""

@@ -198,7 +198,7 @@ class Detector:
         began = state.first_frame
         doubtful = state.level in ("weak", "redetected")
         track = Track(
-            *(seq, seq - 1, time, label, box, float(score), version), object=self.name, began=began, doubtful=doubtful
+            seq - 1, time, label, box, float(score), version, object=self.name, began=began, doubtful=doubtful
         )
         return track, ObjectFeatures(box, training, state, begins=began == seq - 1)
 

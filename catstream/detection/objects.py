@@ -132,7 +132,7 @@ class Detectors:
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         objects = {name: results[name][1] for name in names}
-        return Tracks(self.seq, self.seq - 1, tracks), Features(self.seq, self.seq - 1, time, objects, self.network)
+        return Tracks(self.seq - 1, tracks), Features(self.seq - 1, time, objects, self.network)
 
     def forget(self, name: str) -> None:
         """Stop tracking an object; ObjectError if there is none of this name."""

@@ -39,7 +39,7 @@ _SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a succe
 class Observations:
     """The messages of one pipeline with their arrival times by `time.monotonic`, oldest first.
 
-    tracks  tracks in order of arrival; a restarted detector may repeat a `seq` with another frame
+    tracks  tracks in order of arrival; a restarted detector may repeat a number with another frame
     models  newest training frame of each model, numbered as the tracks were at its arrival
     health  health reports of all processes
     first_motion_version  version of the first model with a motion model, 0 before it

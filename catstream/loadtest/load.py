@@ -172,7 +172,7 @@ class Subscribers:
         return list(self._received[: self._quick])
 
     def missed(self) -> list[int]:
-        """Return the number of frames whose tracks each fast subscriber has missed, by the gaps in `seq`."""
+        """Return the number of frames whose tracks each fast subscriber has missed, by the gaps in `frame`."""
         return list(self._missed[: self._quick])
 
     def __enter__(self) -> Self:

@@ -162,18 +162,28 @@ class ObjectFeatures:
     model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] = b""
 
 
-@dataclass(frozen=True, slots=True)
-class Features:
-    """The training rows of one frame, detector -> compressor.
+class _Numbered:
+    """A message of a frame."""
 
-    seq      1, 2, 3 ... without a gap, one message a frame
-    frame    number of the frame that the rows were cut from
+    __slots__ = ()
+    frame: int
+
+    @property
+    def seq(self) -> int:
+        """Number of the message in its channel: 1, 2, 3 ..."""
+        return self.frame + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Features(_Numbered):
+    """The training rows of one frame, detector -> compressor; one message a frame.
+
+    frame    number of the frame that the rows were cut from: 0, 1, 2 ... without a gap
     time     seconds since the start of the source, or of the run if the source is live
     objects  the part of each object that is tracked, by name
     network  digest of the network that computed a part of the rows, empty if there is none
     """
 
-    seq: Integer
     frame: Integer
     time: Number
     objects: ByObject[ObjectFeatures]
@@ -182,7 +192,7 @@ class Features:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """How far the receiver of an acknowledged channel is, receiver -> sender.
+    """How far the receiver of an acknowledged channel is, receiver -> sender. The message of frame n has number n + 1.
 
     seq        all messages up to this one are stored, except for the last `in_memory` ones: the sender drops its copies
     processed  all messages up to this one have been processed
@@ -272,12 +282,11 @@ class Model:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Track:
+class Track(_Numbered):
     """An object in one frame, detector -> anyone.
 
-    seq            1, 2, 3 ... over the frames of the run, the same for all objects in a frame. A gap means missed
-                   messages, or that the object was not tracked in between
-    frame          number of the frame: 0, 1, 2 ... over the tracked frames; skipped frames are not counted
+    frame          number of the frame: 0, 1, 2 ... over the tracked frames, the same for all objects; skipped frames
+                   are not counted. A gap means missed messages, or that the object was not tracked in between
     time           seconds since the start of the source, or of the run if the source is live
     state          "absent" if no box is reported. Otherwise "bootstrapping" while the model is that of the object's
                    first frame (version 0), then "present"
@@ -295,11 +304,10 @@ class Track:
                    agree, else "unchecked"; "" of any other run
     probability    of an annotation: probability that the box, or its absence, is right; None of any other run
 
-    >>> Track(13, 12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
+    >>> Track(12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
     """
 
-    seq: Integer
     frame: Integer
     time: Number
     state: State
@@ -331,11 +339,10 @@ class Track:
 
         `checked` and `probability` are fields of an annotation only.
 
-        >>> Track(13, 12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
+        >>> Track(12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
         True
         """
         fields = {
-            "seq": int(self.seq),
             "frame": int(self.frame),
             "time": float(self.time),
             "state": self.state,
@@ -352,15 +359,13 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class Tracks:
-    """The tracks of one frame, detector -> the owner of the run.
+class Tracks(_Numbered):
+    """The tracks of one frame, detector -> the owner of the run; one message a frame.
 
-    seq     1, 2, 3 ... without a gap, one message a frame
-    frame   number of the frame
+    frame   number of the frame: 0, 1, 2 ... without a gap
     tracks  the track of each object, by name
     """
 
-    seq: Integer
     frame: Integer
     tracks: ByObject[Track]
 
@@ -447,17 +452,17 @@ def run_state(counters: Mapping[str, float]) -> tuple[RunState, str]:
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class End(_Numbered):
     """The last message of a stream.
 
-    seq     number of the last message before it, plus one
+    frame   number of the last frame before it, plus one
     reason  description of why the stream ended
     failed  whether it ended because of an error
     totals  final counters, by name: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
             and the `reconnects` of a live source
     """
 
-    seq: Integer
+    frame: Integer
     reason: Text
     failed: bool = False
     totals: ByText[Number] = field(default_factory=dict)

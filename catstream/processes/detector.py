@@ -82,7 +82,7 @@ class DetectorLoop:
         self.beginnings = Beginnings(process, self.detectors, self.commands, self.outputs.previews)
         self._source: Source | None = None
         self._skipped = 0  # frames that were skipped because the run was paused or waited for a box
-        self._tracks = Tracks(0, 0, {})  # the last ones
+        self._tracks = Tracks(0, {})  # the last ones
 
     def turn(self) -> None:
         """Process acknowledgements, models and commands, serve late joiners, and publish the health."""

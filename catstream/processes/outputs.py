@@ -94,13 +94,13 @@ class Outputs(AbstractContextManager["Outputs"]):
         Returns it, with the `counters` of the source in its totals. There is no time limit unless a signal arrived.
         """
         ending, window = self._process.ending, self.features.window
-        self._send_features(End(seq + 1, ending.reason, ending.failed))
+        self._send_features(End(seq, ending.reason, ending.failed))
         while self._complete and window.acknowledged <= seq and ending.seconds_since_signal <= _FEATURES_END_SECONDS:
             self.features.poll(TURN_SECONDS)
             self._turn()
         totals = {"sent": float(seq), "stored": float(min(window.stored, seq))} | counters()
         totals.pop("lost_seconds", None)  # this one is of the moment
-        end = End(seq + 1, ending.reason, ending.failed, totals)
+        end = End(seq, ending.reason, ending.failed, totals)
         if self._owner is not None:
             self._owner.send(end)
             self._wait_for_owner(math.inf, _RESULTS_END_SECONDS)

@@ -23,7 +23,7 @@ from catstream.sinks.remote import Warnings
 #: stream; a box is in pixels, and NULL if the object is absent; `object` is '' for an object without a name. But for an
 #: annotation, `checked` is '' and `probability` NULL.
 COLUMNS = {
-    **{"frame": "INTEGER NOT NULL", "seq": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
+    **{"frame": "INTEGER NOT NULL", "seconds": "REAL NOT NULL", "state": "TEXT NOT NULL"},
     **{"x": "REAL", "y": "REAL", "w": "REAL", "h": "REAL", "score": "REAL NOT NULL"},
     **{"model_version": "INTEGER NOT NULL", "pts": "REAL", "object": "TEXT NOT NULL"},
     **{"began": "INTEGER NOT NULL", "doubtful": "INTEGER NOT NULL", "source_frame": "INTEGER NOT NULL"},
@@ -170,16 +170,16 @@ def rows(frames: Iterable[TrackedFrame]) -> Iterator[tuple[Any, ...]]:
     for track in (track for frame in frames for track in frame.tracks):
         box = track.box or [None] * 4
         yield (
-            *(track.frame, track.seq, track.time, track.state, *box, track.score),
+            *(track.frame, track.time, track.state, *box, track.score),
             *(track.model_version, track.pts, track.object, track.began, int(track.doubtful), track.source_frame),
             *(track.checked, track.probability),
         )
 
 
 def _track(row: tuple[Any, ...]) -> Track:
-    frame, seq, seconds, state, x, y, w, h, score, version, pts, name, began, doubtful, *rest = row
+    frame, seconds, state, x, y, w, h, score, version, pts, name, began, doubtful, *rest = row
     box = None if x is None else Box(x, y, w, h)
-    return Track(seq, frame, seconds, state, box, score, version, pts, name, began, bool(doubtful), *rest)
+    return Track(frame, seconds, state, box, score, version, pts, name, began, bool(doubtful), *rest)
 
 
 @contextmanager

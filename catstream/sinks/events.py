@@ -4,7 +4,7 @@
 >>> events = Events(SinkOptions(zones={"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, lost_seconds=1))
 >>> for frame, box in enumerate([Box(0, 40, 20, 20), Box(60, 40, 20, 20), None, None, Box(0, 40, 20, 20)]):
 ...     state = "absent" if box is None else "present"
-...     for event in events.update([Track(frame + 1, frame, frame / 2, state, box, 0.9, 1)]):
+...     for event in events.update([Track(frame, frame / 2, state, box, 0.9, 1)]):
 ...         print((event.track.time, event.kind, event.zone))
 (0.0, 'found', '')
 (0.5, 'entered', 'door')

@@ -314,7 +314,7 @@ def _parse_row(row: Mapping[str, str]) -> tuple[Track, float]:
     box = Box(*(_number(row[side]) for side in "xywh")) if row["x"] else None
     frame = _integer(row["frame"])
     track = Track(
-        *(frame + 1, frame, _number(row["seconds"]), _STATES[row["state"]], box, _number(row["score"])),
+        *(frame, _number(row["seconds"]), _STATES[row["state"]], box, _number(row["score"])),
         model_version=_integer(row["model_version"]),
         object=check_name(row["object"]),
         source_frame=_integer(row.get("source_frame") or "-1"),
@@ -389,7 +389,7 @@ class RunFiles:
                 check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
 
     def position(self, *, skip_damaged: bool = False) -> int | None:
-        """Return `seq` of the last frame that the log holds whole, 0 for none; None if there is to be no log.
+        """Return the number of the frame after the last whole one of the log; None if there is to be no log.
 
         VideoError if the log is damaged, unless damaged lines are skipped.
         """

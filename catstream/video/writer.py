@@ -39,7 +39,7 @@ ANNOTATED = "annotated by catstream"
 
 
 def is_annotated(path: str) -> bool:
-    """Whether a file is a video of drawn tracks."""
+    """Return True if a file is a video of drawn tracks."""
     import av
 
     with contextlib.suppress(av.FFmpegError, OSError), av.open(path) as video:

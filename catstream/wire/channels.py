@@ -5,7 +5,7 @@
     samples    only the newest of each object counts; a late joiner gets the last ones at once
     models     as samples
     tracks     every message, one for each object and frame, to any number of subscribers; a slow one misses some, and
-               sees by `seq` how many
+               sees by `frame` how many
     results    the tracks again, one message a frame, for the program that started the pipeline, its owner
     health     the newest of each process
     previews   small pictures of the newest frame; none is made while nobody subscribes

@@ -2,7 +2,7 @@
 
 A message is one frame of msgpack, `[version, kind, object, run, fields]`:
 
-    version   4; another one is rejected
+    version   5; another one is rejected
     kind      name of the message in small letters: "features", "track" ...
     object    name of the object that the message is about, "" if it is about none or about all
     run       id of the run that it is from: of one start of one pipeline, kept by processes that are restarted; "" if
@@ -36,7 +36,7 @@ from catstream.wire.channels import CHANNELS, REGISTRY
 Message = TypeVar("Message")
 
 #: Version of the envelope and of the meaning of the fields.
-VERSION = 4
+VERSION = 5
 
 #: Kinds of message, by their name on the wire: those of the channels, and the reply on an acknowledged one.
 KINDS: dict[str, type] = {
@@ -125,7 +125,7 @@ def topic_of(data: bytes | memoryview) -> Topic:
     """The topic of a message, by its first bytes; of no kind if they do not begin a message.
 
     >>> from catstream.messages.kinds import End
-    >>> topic_of(encode(End(1, "over")))
+    >>> topic_of(encode(End(0, "over")))
     Topic(kind='end', object='')
     """
     unpacker = msgpack.Unpacker(max_buffer_size=_TOPIC_BYTES)

@@ -113,7 +113,7 @@ def greeting(address: str) -> bytes | None:
 
 
 def has_keys(answer: bytes | None) -> bool:
-    """Whether a greeting is that of a socket of ZeroMQ with keys."""
+    """Return True if a greeting is that of a socket of ZeroMQ with keys."""
     return _is_zeromq(answer) and answer[12:32] == _GREETING[12:32]
 
 

@@ -185,7 +185,7 @@ class Subscriber(ChannelSocket[Message]):
 
 
 class GapCounter:
-    """Counts lost frames of a stream by the gaps in the numbers `seq` of its messages, which start with 1.
+    """Counts lost frames of a stream by the gaps in the numbers of the frames of its messages, which start with 0.
 
     The tracks of all objects in a frame have the same number. A restarted sender may repeat numbers.
 
@@ -194,7 +194,7 @@ class GapCounter:
     """
 
     def __init__(self, *, of_one_object: bool = False) -> None:
-        self.missed = self.before = self._seq = 0
+        self.missed = self.before = self._next = 0
         self._of_one_object = of_one_object
         self._began: int | None = None  # frame in which the one object began: there were no messages before
 
@@ -202,18 +202,18 @@ class GapCounter:
         """Count the frames missing before the next message."""
         if self._of_one_object and isinstance(message, Track) and message.began != self._began:
             self._began = message.began
-            self._seq = message.seq
+            self._next = message.frame + 1
         else:
-            self._count(message.seq)
+            self._count(message.frame)
 
     def end(self, end: End) -> None:
         """Count the frames missing before the end; one object may have been forgotten before it."""
-        if end.seq and not self._of_one_object:
-            self._count(end.seq)
+        if not self._of_one_object:
+            self._count(end.frame)
 
-    def _count(self, seq: int) -> None:
-        if self._seq:
-            self.missed += max(0, seq - self._seq - 1)
+    def _count(self, frame: int) -> None:
+        if self._next:
+            self.missed += max(0, frame - self._next)
         else:
-            self.before = max(0, seq - 1)
-        self._seq = seq
+            self.before = frame
+        self._next = frame + 1

@@ -1,7 +1,7 @@
 """The channel `results`: the tracks of each frame, for the program that owns the run.
 
 A PUSH socket connects to the PULL socket of the owner. Nothing is acknowledged: the owner has started the detector, and
-a detector that it starts again goes on after the last frame that the owner has. It drops what it has by `seq`. The
+a detector that it starts again goes on after the last frame that the owner has. It drops the frames that it has. The
 sender's queue has no limit of its own: a detector is at most `run.unstored_frames` ahead of what its owner has read.
 """
 

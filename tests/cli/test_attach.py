@@ -61,8 +61,8 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(l
 def two_objects(endpoint, turning):
     """The endpoint of a pipeline of anna and an object without a name, whose source ends after four frames."""
     frames = [(seq, name) for seq in range(1, 5) for name in ("anna", "")]
-    messages = [Track(seq, seq - 1, 0.1, "absent", None, 0.0, 0, object=name) for seq, name in frames]
-    messages.append(End(5, "the source has ended"))
+    messages = [Track(seq - 1, 0.1, "absent", None, 0.0, 0, object=name) for seq, name in frames]
+    messages.append(End(4, "the source has ended"))
 
     def turn():
         health.send(Health("detector", time.time()))
@@ -87,7 +87,7 @@ def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
 
 def test_a_line_has_the_fields_that_are_not_empty(two_objects, said):
     _, output, _ = said("watch", "tracks", "--endpoint", two_objects)
-    line = "seq 1  frame 0  time 0.1  state absent  score 0.0  model_version 0"
+    line = "frame 0  time 0.1  state absent  score 0.0  model_version 0"
     assert [each.partition("  began")[0] for each in output.splitlines()[:2]] == [f"{line}  object anna", line]
 
 
@@ -171,7 +171,10 @@ def test_status_fails_and_names_a_silent_process(resting, said):
 
 def test_the_lines_of_status_that_depend_on_the_source_and_the_trees():
     counters = {"sent": 9.0, "processed": 9.0, "stored": 9.0, "skipped": 2.0}
-    reports = {"detector": [Health("detector", 1.0, counters)], "compressor": [Health("compressor", 1.0, {"seq": 1.0})]}
+    reports = {
+        "detector": [Health("detector", 1.0, counters)],
+        "compressor": [Health("compressor", 1.0, {"frames": 1.0})],
+    }
     lines = _format(_summary("run", reports)).splitlines()
     assert "source     2 frames skipped" in lines, "a demo never reconnects"
     assert not [line for line in lines if line.startswith("trees")], "there are none before the first box"

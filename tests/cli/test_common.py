@@ -34,7 +34,7 @@ def shown(width, seen, **pipeline):
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
     health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
-    track = Track(1, 0, 0.0, "bootstrapping", None, -12.25, 12345)
+    track = Track(0, 0.0, "bootstrapping", None, -12.25, 12345)
     written, _ = shown(width, [{"": track}], live=live, frames=None if live else 30000, health=health)
     lines = [part for part in written.replace("\x1b[2K", "\r").split("\r") if "bootstrapping" in part]
     line = lines[-1].split("\n")[0].split("\x1b")[0].rstrip()
@@ -45,8 +45,8 @@ def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
 
 
 def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_each():
-    anna = [Track(1, 0, 0.0, "present", box, 0.9, 7, object="anna") for box in (Box(1, 2, 30, 40), None)]
-    ben = Track(1, 0, 0.0, "absent", None, 0.1, 4, object="ben")
+    anna = [Track(0, 0.0, "present", box, 0.9, 7, object="anna") for box in (Box(1, 2, 30, 40), None)]
+    ben = Track(0, 0.0, "absent", None, 0.1, 4, object="ben")
     written, run = shown(120, [{"anna": each, "ben": ben} for each in anna], live=False, frames=9, health={})
     assert "1/2 present" in written
     assert "anna +0.90  ben +0.10" in written

@@ -18,7 +18,7 @@ def write_log(path, source="", names=("anna",), size=(320, 240)):
         for name in names:
             box = None if state == "A" else Box(3 * number, 4 * number, 20, 30)
             shown = "absent" if box is None else "present"
-            track = Track(number + 1, number, number / 10, shown, box, 0.9, 1, object=name, doubtful=state == "D")
+            track = Track(number, number / 10, shown, box, 0.9, 1, object=name, doubtful=state == "D")
             lines.append(json.dumps(track.to_dict()))
     path.write_text("\n".join(lines) + "\n")
     return path

@@ -76,7 +76,7 @@ def test_repeated_frames_after_a_restart_are_skipped_and_another_run_ends_the_si
             with Publisher(TRACKS, replace(endpoint, run=run)) as tracks:
                 until(lambda: tracks.has_subscribers, tracks.serve_late_joiners)
                 for frame in (frame for part in parts for frame in range(*part)):
-                    tracks.send(Track(frame + 1, frame, frame / 30, "absent", None, 0.0, 0))
+                    tracks.send(Track(frame, frame / 30, "absent", None, 0.0, 0))
                 until(lambda: len(file.read_text().splitlines()) == 1 + written, tracks.serve_late_joiners)
 
         follow("first", (0, 300), (205, 310), written=310)

@@ -23,7 +23,7 @@ from catstream.wire.keys import allow, allowed, create, public_key, revoke, sync
 from catstream.wire.newest import Publisher
 from tests.wire.examples import present as track
 
-STOPPED = End(99, "it was stopped by a command")
+STOPPED = End(98, "it was stopped by a command")
 
 
 class Stream:
@@ -83,7 +83,7 @@ def test_frames_that_were_lost_between_two_nodes_are_counted_as_missed(stream, m
             stream.send(first, track(1), track(2))
             first.close()  # its node dies
             second = stream.runs()
-            stream.send(second, track(9), track(10), End(11, "the source has ended"))
+            stream.send(second, track(9), track(10), End(10, "the source has ended"))
             stream.update(state="ended")
             assert [message.seq for message in watched.result(60)] == [1, 2, 9, 10]
             assert tracks.missed == 6

@@ -24,7 +24,7 @@ from tests.wire.examples import present as track
 def features(seq):
     rows = np.full((2, 5), seq, np.float32)
     training = {"appearance": TrainingRows.labelled(rows, 0, seq)}
-    return Features(seq, seq - 1, 0.0, {"": ObjectFeatures(None, training)})
+    return Features(seq - 1, 0.0, {"": ObjectFeatures(None, training)})
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_tracks_arrive_in_order_until_the_end_and_each_gap_is_counted(endpoint, 
     with attached(endpoint, tracks) as subscription:
         for seq in seqs:
             tracks.send(track(seq))
-        tracks.send(End(end, "the source has ended", totals={"sent": 49.0}))
+        tracks.send(End(end - 1, "the source has ended", totals={"sent": 49.0}))
         assert list(subscription) == [track(seq) for seq in seqs]
         assert (subscription.missed, subscription.end.totals) == (missed, {"sent": 49})
         assert list(subscription) == [], "it stays ended"
@@ -81,7 +81,7 @@ def test_the_tracks_of_several_objects_in_a_frame_are_no_gap_and_no_repeat(endpo
     with attached(endpoint, tracks) as subscription:
         for name, seq in said:
             tracks.send(track(seq, name))
-        tracks.send(End(8, "the source has ended"))
+        tracks.send(End(7, "the source has ended"))
         assert [(message.object, message.seq) for message in subscription] == said
         assert subscription.missed == 2, "the frames 4 and 5"
 
@@ -92,7 +92,7 @@ def test_a_subscriber_to_one_object_receives_no_track_of_a_name_with_the_same_pr
         for seq in range(2, 20):
             for each in ("anna", "ann", "", "an", "annas" * 12):
                 tracks.send(track(seq, each))
-        tracks.send(End(20, "the source has ended"))
+        tracks.send(End(19, "the source has ended"))
         heard = list(subscription)
     assert [(message.object, message.seq) for message in heard] == [(name, seq) for seq in range(2, 20)]
     assert (subscription.end.seq, subscription.missed) == (20, 0)
@@ -113,7 +113,7 @@ def test_frames_in_which_an_object_was_not_there_are_not_missed(endpoint, tracks
         until(lambda: len(tracks._subscribed) == 2, tracks.serve_late_joiners)  # the end has a connection of its own
         for seq, began in said:
             tracks.send(replace(track(seq, "anna"), began=began))
-        tracks.send(End(100, "the source has ended"))
+        tracks.send(End(99, "the source has ended"))
         assert [message.seq for message in subscription] == [seq for seq, _ in said]
         assert (subscription.missed, subscription.missed_before) == (missed, 0)
 
@@ -144,7 +144,7 @@ def test_a_subscriber_whose_end_message_was_dropped_still_ends(endpoint, tracks)
     with attached(endpoint, tracks) as subscription:
         for seq in range(2, count):
             tracks.send(track(seq))
-        tracks.send(End(count, "the source has ended"))
+        tracks.send(End(count - 1, "the source has ended"))
         heard = [message.seq for message in subscription]
         assert 0 < len(heard) < count - 2, "this reader was too slow"
         assert len(heard) + subscription.missed == count - 2
@@ -156,7 +156,7 @@ def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(end
     def turn():
         models.serve_late_joiners()
         if seen:  # the subscriber is there
-            tracks.send(End(2, "the source has ended"))
+            tracks.send(End(1, "the source has ended"))
 
     with Publisher(MODELS, endpoint) as models:
         models.send(model(1))
@@ -195,7 +195,7 @@ def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(end
         until(lambda: training.has_subscribers, training.serve_late_joiners)
         for seq in (3, 4, 7):
             training.send(features(seq))
-        training.send(End(9, "the source has ended"))
+        training.send(End(8, "the source has ended"))
         subscription.timeout = 20
         heard = list(subscription)
     assert [message.seq for message in heard] == [3, 4, 7]
@@ -224,7 +224,7 @@ def test_iteration_may_continue_after_a_timeout_and_the_end_counts_missed_frames
             next(subscription)
         subscription.timeout = 20
         until(lambda: len(tracks._subscribed) == 2, tracks.serve_late_joiners)  # the end has a connection of its own
-        tracks.send(End(61, "the source has ended"))
+        tracks.send(End(60, "the source has ended"))
         assert list(subscription) == []
         assert (subscription.missed, subscription.missed_before) == (60, 60)
 
@@ -244,7 +244,7 @@ def test_async_for_gives_the_same_and_may_be_cancelled(endpoint, tracks):
         for seq in range(2, 40):
             tracks.send(track(seq))
             await asyncio.sleep(0)
-        tracks.send(End(42, "the source has ended"))
+        tracks.send(End(41, "the source has ended"))
         return await reading
 
     with attached(endpoint, tracks) as subscription:
@@ -280,7 +280,7 @@ def test_who_asks_for_the_newest_gets_that_of_each_object_and_then_the_end(endpo
         for seq in range(2, 50):
             for name in ("anna", "ben"):
                 tracks.send(track(seq, name))
-        tracks.send(End(50, "the source has ended"))
+        tracks.send(End(49, "the source has ended"))
         time.sleep(0.2)  # many of them are here
         heard = [(message.object, message.seq) for message in subscription]
     assert dict(heard) == {"anna": 49, "ben": 49}
@@ -304,7 +304,7 @@ def test_a_reader_that_never_waits_receives_the_end_of_a_restarted_pipeline(endp
 
         until(lambda: len(second._subscribed) == 2, read)
         assert heard[-1] < 899, "a track was there at each look"
-        second.send(End(921, "the source has ended"))
+        second.send(End(920, "the source has ended"))
         heard += [message.seq for message in subscription]
         assert heard == list(range(2, 900))
         assert (subscription.end.reason, subscription.missed) == ("the source has ended", 21)

@@ -23,7 +23,7 @@ def grow(rng):
         for seq in range(forest.seq + 1, forest.seq + count + 1):
             rows, labels = rng.normal(size=(4, 9)).astype(np.float32), np.float32([1, 0, 0, 0.5])
             training = {group: TrainingRows.labelled(rows, labels) for group in GROUPS}
-            forest.take(Features(seq, seq - 1, 0.0, {"": ObjectFeatures(None, training)}))
+            forest.take(Features(seq - 1, 0.0, {"": ObjectFeatures(None, training)}))
         return forest
 
     return take

@@ -51,7 +51,7 @@ def messages(rng) -> Iterator[Features]:
 
 
 def one_object(frame: int, part: ObjectFeatures, name: str = "") -> Features:
-    return Features(frame + 1, frame, frame / 25, {name: part})
+    return Features(frame, frame / 25, {name: part})
 
 
 def changed(message: Features, **changes: object) -> Features:
@@ -63,7 +63,7 @@ def changed(message: Features, **changes: object) -> Features:
 def merged(seq: int, **parts: Features) -> Features:
     """One message of several objects, by name."""
     objects = {name: message.objects[""] for name, message in parts.items()}
-    return Features(seq, seq - 1, (seq - 1) / 25, objects)
+    return Features(seq - 1, (seq - 1) / 25, objects)
 
 
 def take(forest: Forest, messages: Iterator[Features], count: int) -> list[Sample]:
@@ -203,7 +203,7 @@ def test_a_checkpoint_has_the_detector_states_after_the_last_256_messages(settin
     forest = Forest(settings)
     assert forest.states_at(5) == {}
     for seq, state in states.items():
-        forest.take(Features(seq, seq - 1, 0.0, {"anna": ObjectFeatures(None, detector=state)}))
+        forest.take(Features(seq - 1, 0.0, {"anna": ObjectFeatures(None, detector=state)}))
     forest.save(tmp_path / "state")
     for each in (forest, Forest.load(tmp_path / "state", settings)):
         known = [each.states_at(seq)["anna"].first_frame for seq in (1, 45, 46, 300, 1 << 62)]
@@ -249,7 +249,7 @@ def test_an_object_of_several_is_learned_as_alone(settings, messages):
     """Only the numbers of its samples and its name differ: all objects share one count."""
     several, alone, versions = Forest(settings), {"anna": Forest(settings), "ben": Forest(settings)}, []
     for seq in range(1, 80):
-        parts = {name: dataclasses.replace(next(messages), seq=seq, frame=seq - 1) for name in alone}
+        parts = {name: dataclasses.replace(next(messages), frame=seq - 1) for name in alone}
         others = {name: sample for name, part in parts.items() for sample in alone[name].take(part)}
         for sample in several.take(merged(seq, **parts)):
             other = others.pop(sample.object)

@@ -68,7 +68,7 @@ def put_state(tmp_path, name, seed, frames=12):
     Job(f"{name}.mp4", settings=SETTINGS).save(folder)
     forest = Forest(SETTINGS)
     for frame, each in enumerate(stream(seed, frames)):
-        forest.take(Features(frame + 1, frame, 0.0, {"anna": each}))
+        forest.take(Features(frame, 0.0, {"anna": each}))
     CheckpointStore(folder / "trees").save(forest)
     Store(str(tmp_path / "store")).stream(name).claim("here").write(files(folder), {})
 

@@ -27,7 +27,7 @@ def track(schedule) -> Callable[..., tuple[float, Track]]:
     def made(number: int, after: float, *, frame: int | None = None, box: Box | None = BOX) -> tuple[float, Track]:
         due = schedule.due(number)
         frame = number if frame is None else frame
-        return due + after, Track(frame + 1, frame, 0.0, "present", box, 0.9, 1, due)
+        return due + after, Track(frame, 0.0, "present", box, 0.9, 1, due)
 
     return made
 

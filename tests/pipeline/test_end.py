@@ -91,5 +91,5 @@ def test_a_subscriber_that_reads_nothing_from_a_restart_on_receives_the_end(vide
         list(pipeline)
         pipeline.close()
         rest = list(tracks)
-    assert [track.seq for track in [first, *rest]] == list(range(first.seq, first.seq + len(rest) + 1))
+    assert [track.frame for track in [first, *rest]] == list(range(first.frame, first.frame + len(rest) + 1))
     assert "did not receive its end" in tracks.end.reason

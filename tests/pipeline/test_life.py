@@ -173,7 +173,7 @@ def test_a_run_that_starts_paused_waits_with_its_first_frame(video, until):
 def prints_well_and_is_ready_for_json(track):
     """What a person sees of a track, and a program in another language."""
     assert repr(track).startswith("Track(frame=0, time=0.000, state='bootstrapping', box=(")
-    whole = {"seq": 1, "frame": 0, "time": 0.0, "state": "bootstrapping", "box": list(track.box), "score": track.score}
+    whole = {"frame": 0, "time": 0.0, "state": "bootstrapping", "box": list(track.box), "score": track.score}
     whole |= {"model_version": 0, "pts": None, "object": "", "began": 0, "doubtful": False}
     whole["source_frame"] = 0
     assert json.loads(json.dumps(track.to_dict())) == whole

@@ -71,7 +71,7 @@ def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(v
         last = steering.forget("ben").frame  # the detector waits: its window is full before the last frame
         while "ben" in tracks[-1]:
             tracks.append(next(frames))
-    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS, after=len(tracks)) as pipeline:
+    with Pipeline(resume=tmp_path / "kept", settings=SETTINGS, after=len(tracks) - 1) as pipeline:
         tracks += pipeline.by_frame()
     assert [each["anna"].frame for each in tracks] == list(range(FRAMES))
     assert [frame for frame, each in enumerate(tracks) if "ben" in each] == list(range(last + 1))

@@ -70,7 +70,7 @@ def test_a_run_continues_after_the_last_frame_that_the_program_has_whole(video, 
     with Pipeline(path, boxes, settings, state=tmp_path / "state") as pipeline:
         before = [*islice(pipeline, 2 * 8 + 1)]
         until(lambda: last_seq(tmp_path / "state") > 9)  # the checkpoint is ahead
-    with Pipeline(resume=tmp_path / "state", after=before[-1].seq - 1) as pipeline:
+    with Pipeline(resume=tmp_path / "state", after=before[-1].frame - 1) as pipeline:
         after = list(pipeline)
     missing = [(frame, name) for frame in range(8, len(truth)) for name in boxes]
     assert [(track.frame, track.object) for track in after] == missing

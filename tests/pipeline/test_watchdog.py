@@ -44,6 +44,6 @@ def test_a_compressor_counts_an_iteration_after_each_object_of_a_message(folder,
     job = Job("walk.mp4", {}, settings=Settings(coreset={"size": 8}), endpoint=str(folder))
     with closing(Process("compressor", job)) as process, ExitStack() as stack:
         loop = CompressorLoop(process, stack)
-        loop.insert(Features(1, 0, 0.0, objects))
+        loop.insert(Features(0, 0.0, objects))
         turns.append(process.watchdog.turns)
     assert len(turns) == len(set(turns)) == 4

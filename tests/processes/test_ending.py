@@ -46,5 +46,5 @@ def test_a_signal_is_a_reason_and_its_moment_is_that_of_the_first_one():
 
 def test_a_process_has_ended_once_the_end_was_received_with_its_reason():
     ending = Ending()
-    ending.receive(End(3, "cannot decode frame 2", failed=True))
+    ending.receive(End(2, "cannot decode frame 2", failed=True))
     assert (ending.reason, ending.failed, ending.ended) == ("cannot decode frame 2", True, True)

@@ -32,7 +32,7 @@ def test_a_detector_is_no_more_frames_ahead_of_its_owner_than_may_be_unstored(pr
     with owner, Outputs(process, turn, lambda *_: None) as outputs:
         outputs._send_features = lambda _: None  # the compressor has room
         for seq in range(1, 8):
-            outputs.send(Tracks(seq, seq - 1, {}), Features(seq, seq - 1, 0.0, {}))
+            outputs.send(Tracks(seq - 1, {}), Features(seq - 1, 0.0, {}))
         assert waits == [0, 1, 2], "frames 5, 6 and 7 wait for frames 1, 2 and 3"
         assert [owner.receive(60).seq for _ in range(7)] == list(range(1, 8))
 
@@ -41,8 +41,8 @@ def test_after_a_signal_a_detector_does_not_wait_and_sends_nothing_after_a_drop(
     process.ending._handle()
     with Outputs(process, lambda: pytest.fail("it waits"), lambda *_: None) as outputs:
         for seq in range(1, 9):
-            outputs.send(Tracks(seq, seq - 1, {}), Features(seq, seq - 1, 0.0, {}))
+            outputs.send(Tracks(seq - 1, {}), Features(seq - 1, 0.0, {}))
         assert outputs.features.window.sent == 4, "nobody has stored one"
         outputs.features.window._unacknowledged.clear()
-        outputs.send(Tracks(9, 8, {}), Features(9, 8, 0.0, {}))
+        outputs.send(Tracks(8, {}), Features(8, 0.0, {}))
         assert outputs.features.window.sent == 4

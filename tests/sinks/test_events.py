@@ -18,7 +18,7 @@ def tracks(history, name="", began=0, first=0):
     """A track a second: a digit is the box whose centre is at x = ten times the digit and y = 50, "." none."""
     for frame, x in enumerate(history, first):
         box = None if x == "." else Box(10 * int(x) - 5, 45, 10, 10)
-        yield Track(frame + 1, frame, frame, "present" if box else "absent", box, 0.9, 1, object=name, began=began)
+        yield Track(frame, frame, "present" if box else "absent", box, 0.9, 1, object=name, began=began)
 
 
 def told(events):

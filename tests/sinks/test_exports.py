@@ -25,7 +25,7 @@ BOX = Box(10.0, 20.0, 30.5, 40.0)
 
 def present(frame, name, box=BOX, **fields):
     state = "present" if box else "absent"
-    return Track(frame + 1, frame, frame / 25, state, box, 0.75, 4, 17.5 if frame else None, name, **fields)
+    return Track(frame, frame / 25, state, box, 0.75, 4, 17.5 if frame else None, name, **fields)
 
 
 LOG = [
@@ -77,10 +77,10 @@ def test_each_object_has_three_files_with_a_row_for_every_frame(tmp_path, layout
 
 def test_a_database_and_a_parquet_file_have_a_row_for_each_track(tmp_path):
     with closing(sqlite3.connect(made(tmp_path / "t.sqlite"))) as database:
-        columns = "frame, seq, seconds, state, x, w, score, model_version, pts, object"
+        columns = "frame, seconds, state, x, w, score, model_version, pts, object"
         assert database.execute(f"SELECT {columns} FROM tracks").fetchall()[1:3] == [
-            (0, 1, 0.0, "present", 10.0, 30.5, 0.75, 4, None, ""),
-            (2, 3, 0.08, "absent", None, None, 0.75, 4, 17.5, ""),
+            (0, 0.0, "present", 10.0, 30.5, 0.75, 4, None, ""),
+            (2, 0.08, "absent", None, None, 0.75, 4, 17.5, ""),
         ]
         with pytest.raises(sqlite3.IntegrityError):
             database.execute("INSERT INTO tracks SELECT * FROM tracks")

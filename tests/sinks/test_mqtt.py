@@ -24,7 +24,7 @@ from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
 needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
 DOOR = {"door": ((0, 0), (100, 0), (100, 100), (0, 100))}
-ANNA = Track(1, 0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
+ANNA = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
 
 
 class Broker:
@@ -112,7 +112,7 @@ def events(got):
 
 
 def lost(time):
-    return TrackedFrame([replace(ANNA, seq=time, frame=time, time=float(time), state="absent", box=None)])
+    return TrackedFrame([replace(ANNA, frame=time, time=float(time), state="absent", box=None)])
 
 
 @needs_broker
@@ -151,7 +151,7 @@ def test_states_come_at_the_chosen_rate(broker, until):
     with opened(broker.url, rate=1e6) as sink:
         online(sink, until)
         for frame in range(1, 21):
-            sink.write(TrackedFrame([replace(ANNA, seq=frame + 1, frame=frame, time=frame / 30)]))
+            sink.write(TrackedFrame([replace(ANNA, frame=frame, time=frame / 30)]))
     until(lambda: got.get("yard/cam/objects/anna", [None])[-1] == "")
     assert [json.loads(state)["frame"] for state in got["yard/cam/objects/anna"][-21:-1]] == [*range(1, 21)]
 
@@ -163,7 +163,7 @@ def test_the_sensors_of_an_object_that_was_forgotten_are_removed(broker, until):
     with opened(broker.url, events=("lost",)) as sink:
         online(sink, until)
         for frame in range(1, 5):
-            sink.write(TrackedFrame([replace(ANNA, seq=frame + 1, frame=frame, object="ben")]))
+            sink.write(TrackedFrame([replace(ANNA, frame=frame, object="ben")]))
         until(lambda: got.get("yard/cam/objects/anna", [None])[-1] == "")
         empty = [topic for topic, each in got.items() if each[-1] == "" and topic.startswith("homeassistant/")]
         assert [json.loads(got[topic][0])["name"] for topic in empty] == ["anna"]
@@ -177,7 +177,7 @@ def test_a_process_that_is_killed_is_offline_by_its_last_will(broker, until):
         "import os, sys, time; from catstream.sinks.destinations import *; from catstream.messages.kinds import *\n"
         "sink = open_sink(sys.argv[1], Origin())\n"
         "while sink._acknowledged < 4:\n"
-        "    sink.write(TrackedFrame([Track(1, 0, 0.0, 'absent', None, 0.0, 0)])); time.sleep(0.01)\n"
+        "    sink.write(TrackedFrame([Track(0, 0.0, 'absent', None, 0.0, 0)])); time.sleep(0.01)\n"
         "os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-P", "-c", killed, broker.url], check=False)

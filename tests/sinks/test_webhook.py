@@ -23,7 +23,7 @@ from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.newest import Publisher
 
-FOUND = Track(1, 0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
+FOUND = Track(0, 0.0, "present", Box(10, 20, 30, 40), 0.9, 1, object="anna")
 JPEG = b"\xff\xd8\xff a picture"
 
 
@@ -86,9 +86,9 @@ def sending(port, path="hook", user="", **options):
 def lose(sink, *times):
     """Write tracks without a box, and with one again: the events lost and returned, at each of these times."""
     for time in times:
-        lost = replace(FOUND, seq=10 * time, frame=10 * time, time=10.0 * time, state="absent", box=None)
+        lost = replace(FOUND, frame=10 * time, time=10.0 * time, state="absent", box=None)
         sink.write(TrackedFrame([lost]))
-        sink.write(TrackedFrame([replace(FOUND, seq=10 * time + 1, frame=10 * time + 1, time=10.0 * time + 1)]))
+        sink.write(TrackedFrame([replace(FOUND, frame=10 * time + 1, time=10.0 * time + 1)]))
 
 
 def told(receiver):

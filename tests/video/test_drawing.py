@@ -27,7 +27,7 @@ BOX = Box(40, 30, 60, 40)
 
 
 def track(state: State = "present", box: Box | None = BOX, frame: int = 7) -> Track:
-    return Track(frame + 1, frame, 0.0, state, box, 0.8, 3)
+    return Track(frame, 0.0, state, box, 0.8, 3)
 
 
 @pytest.mark.parametrize("state", ["bootstrapping", "present", "absent"])

@@ -28,7 +28,7 @@ class Facts:
     @staticmethod
     def track(frame, version=1, state="present", score=0.75, name="", began=0):
         box = None if state == "absent" else Box(4.0, 3.0, 20.0, 10.0)
-        return Track(frame + 1, frame, frame / 10, state, box, score, version, None, name, began)
+        return Track(frame, frame / 10, state, box, score, version, None, name, began)
 
     @staticmethod
     def model(version, frame, name="", began=0):

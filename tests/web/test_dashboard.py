@@ -61,7 +61,7 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     dashboard.mark_silent("nothing came", 5.0)
     assert dashboard.updates(told)["status"]["phase"] == "silent"
     dashboard.take(facts.track(0), 10.0)
-    dashboard.take(End(2, "the source has ended"), 11.0)
+    dashboard.take(End(1, "the source has ended"), 11.0)
     dashboard.mark_silent("nothing came", 15.0)
     status = dashboard.updates(told)["status"]
     assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
@@ -105,26 +105,26 @@ def test_a_pipeline_that_tracks_is_ready_until_a_process_is_silent_for_some_seco
         for name in names:
             feed.dashboard.take(Health(name, 1.0, {"sent": 1.0, **more}), monotonic() - ago)
         assert feed.problem_of() == problem
-    feed.dashboard.take(End(2, "cannot read /home/me/secret.mp4", failed=True), monotonic())
+    feed.dashboard.take(End(1, "cannot read /home/me/secret.mp4", failed=True), monotonic())
     assert feed.problem_of() == "ended", "who has no token is told no name of a file"
 
 
 def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, facts):
     dashboard.take(Health("detector", 1.0, {"sent": 7.0}), 9.0, "one")
-    dashboard.take(End(2, "the source has ended"), 10.0, "one")
+    dashboard.take(End(1, "the source has ended"), 10.0, "one")
     dashboard.take(Health("detector", 1.0, {"sent": 8.0}), 10.5, "one")
     dashboard.take(Health("compressor", 1.0, {}), 30.0, "one")
     assert dashboard.phase == "ended"
     dashboard.take(Health("compressor", 2.0, {}), 30.1, "two")
     assert dashboard.phase == "running"
     dashboard.take(facts.track(90, name="anna"), 30.2, "one")
-    dashboard.take(End(2, "the source has ended"), 30.3, "one")
+    dashboard.take(End(1, "the source has ended"), 30.3, "one")
     assert (dashboard.phase, names(dashboard)) == ("running", [])
 
 
 def test_the_trees_and_skipped_frames_of_the_last_reports_stay_after_the_end(dashboard):
     dashboard.take(Health("detector", 1.0, {"sent": 1.0, "skipped": 40.0}), 0.0)
-    dashboard.take(End(2, "the source has ended"), 10.0)
+    dashboard.take(End(1, "the source has ended"), 10.0)
     dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
     dashboard.mark_silent("no pipeline is running", 15.0)
     parts = dashboard.updates({})
@@ -156,7 +156,7 @@ def followed(dashboard, facts, endpoint, run="one"):
 def test_all_state_is_dropped_when_another_pipeline_appears(dashboard, facts, ended):
     told = followed(dashboard, facts, "a")
     if ended:
-        dashboard.take(End(52, "the source has ended"), 6.0, "one")
+        dashboard.take(End(51, "the source has ended"), 6.0, "one")
     dashboard.attach("b")
     assert dashboard.endpoint == "a"
     assert not set(dashboard.updates(told)) - {"status"}, "nothing goes before the other one is seen"

@@ -11,11 +11,11 @@ from catstream.wire.rejects import rejects
 
 
 def track(seq: int, name: str = "") -> Track:
-    return Track(seq, seq - 1, 0.0, "absent", None, 0.0, 0, object=name)
+    return Track(seq - 1, 0.0, "absent", None, 0.0, 0, object=name)
 
 
 def present(seq: int, name: str = "") -> Track:
-    return Track(seq, seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
+    return Track(seq - 1, seq / 30, "present", Box(1.0, 2.0, 3.0, 4.0), 0.9, 1, object=name)
 
 
 def model(version: int, name: str = "") -> Model:

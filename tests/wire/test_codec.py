@@ -40,7 +40,7 @@ def array(*shape: int, dtype: str = "<f4") -> np.ndarray:
 
 
 def features(rows: TrainingRows) -> Features:
-    return Features(3, 2, 0.08, {"": ObjectFeatures(BOX, {"appearance": rows})})
+    return Features(2, 0.08, {"": ObjectFeatures(BOX, {"appearance": rows})})
 
 
 BOX = Box(4.5, 3.0, 20.0, 10.0)
@@ -226,7 +226,7 @@ REJECTED = {
     "a track of a name that is no name": packed("track", about="../x", object="../x"),
     "another object in the envelope": packed("track", about="ann"),
     "an object in the envelope, and none in the fields": packed("position", about="anna"),
-    "lists in lists, as object": b"\x95\x04\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
+    "lists in lists, as object": b"\x95\x05\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
     "a number as object": packed("track", about=1, object=1),
     "more objects than a map may have": packed("position", versions={f"o{i}": 1 for i in range(257)}),
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
@@ -236,38 +236,38 @@ REJECTED = {
     "a box without width": packed("track", box=[1.0, 2.0, 0.0, 4.0]),
     "a box of three numbers": packed("track", box=[1.0, 2.0, 3.0]),
     "a state that does not exist": packed("track", state="asleep"),
-    "a negative seq": packed("track", seq=-1),
-    "a seq above 2**53": packed("track", seq=2**53 + 1),
+    "a negative frame": packed("track", frame=-1),
+    "a frame above 2**53": packed("track", frame=2**53 + 1),
     "a text for a number": packed("track", score="0.5"),
-    "a missing field": msgpack.packb([VERSION, "track", "", "", {"seq": 1}]),
+    "a missing field": msgpack.packb([VERSION, "track", "", "", {"frame": 1}]),
     "another version": msgpack.packb([VERSION + 1, "track", "", "", {}]),
     "a kind that does not exist": msgpack.packb([VERSION, "orders", "", "", {}]),
     "a number as run": msgpack.packb([VERSION, "end", "", 7, fields_of("end")]),
-    "no envelope": msgpack.packb({"seq": 1}),
+    "no envelope": msgpack.packb({"frame": 1}),
     "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
     "more than a message": encode(EXAMPLES["track"]) + b"\x00",
-    "a map of bytes": b"\x95\x04\xa3end\xa0\xa0\x82\xc4\x03seq\x01\xa6reason\xa1x",
-    "a list of four thousand million": b"\x95\x04\xa3end\xa0\xa0\xdd\xff\xff\xff\xff",
-    "a map of four thousand million": b"\x95\x04\xa3end\xa0\xa0\xdf\xff\xff\xff\xff",
-    "bytes of four gigabytes": b"\x95\x04\xa3end\xa0\xa0\xc6\xff\xff\xff\xff",
-    "a text of four gigabytes": b"\x95\x04\xdb\xff\xff\xff\xff",
+    "a map of bytes": b"\x95\x05\xa3end\xa0\xa0\x82\xc4\x05frame\x01\xa6reason\xa1x",
+    "a list of four thousand million": b"\x95\x05\xa3end\xa0\xa0\xdd\xff\xff\xff\xff",
+    "a map of four thousand million": b"\x95\x05\xa3end\xa0\xa0\xdf\xff\xff\xff\xff",
+    "bytes of four gigabytes": b"\x95\x05\xa3end\xa0\xa0\xc6\xff\xff\xff\xff",
+    "a text of four gigabytes": b"\x95\x05\xdb\xff\xff\xff\xff",
     "a list longer than any message's": msgpack.packb([VERSION, "end", "", "", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * (LONGEST_TEXT + 1)),
-    "an extension type": b"\x95\x04\xa3end\xa0\xa0\xd4\x05\x00",
-    "an extension type without bytes": b"\x95\x04\xa3end\xa0\xa0\xc7\x00\x05",
+    "an extension type": b"\x95\x05\xa3end\xa0\xa0\xd4\x05\x00",
+    "an extension type without bytes": b"\x95\x05\xa3end\xa0\xa0\xc7\x00\x05",
     "a text for bytes": packed("modelfile", file="YSBmaWxl"),
     "a text for the bytes of an array": retrained(labels=plain("<f4", [3], "AAAA" * 4)),
     "bytes for a text": packed("end", reason=b"over"),
     "a map for a list": packed("track", box={"x": 1.0, "y": 2.0, "w": 3.0, "h": 4.0}),
     "a list for a map": packed("health", counters=[1.0]),
-    "a list as a name in a map": b"\x95\x04\xa3end\xa0\xa0\x81\x90\x01",
-    "a text that is not UTF-8": b"\x95\x04\xa3end\xa0\xa0\x81\xa6reason\xa1\xff",
-    "a byte that msgpack does not use": b"\x95\x04\xa3end\xa0\xa0\xc1",
-    "a timestamp": b"\x95\x04\xa3end\xa0\xa0\xd6\xff\x00\x00\x00\x00",
+    "a list as a name in a map": b"\x95\x05\xa3end\xa0\xa0\x81\x90\x01",
+    "a text that is not UTF-8": b"\x95\x05\xa3end\xa0\xa0\x81\xa6reason\xa1\xff",
+    "a byte that msgpack does not use": b"\x95\x05\xa3end\xa0\xa0\xc1",
+    "a timestamp": b"\x95\x05\xa3end\xa0\xa0\xd6\xff\x00\x00\x00\x00",
     "lists in lists, as version": b"\x95" + b"\x91" * 1015 + b"\x90\xa3end\xa0\xa0\x80",
-    "lists in lists, as kind": b"\x95\x04" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80",
-    "lists in lists, as fields": b"\x95\x04\xa3end\xa0\xa0" + b"\x91" * 1015 + b"\x90",
+    "lists in lists, as kind": b"\x95\x05" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80",
+    "lists in lists, as fields": b"\x95\x05\xa3end\xa0\xa0" + b"\x91" * 1015 + b"\x90",
     "lists in lists without end": b"\x91" * 100_000,
 }
 
@@ -284,7 +284,7 @@ def test_a_message_that_violates_its_schema_is_rejected_on_arrival(data):
         features(TrainingRows(array(3, 5, dtype="<f8"), array(3), array(3))),
         features(TrainingRows(array(3, 5), array(4), array(3))),
         dataclasses.replace(EXAMPLES["track"], score=float("nan")),
-        dataclasses.replace(EXAMPLES["track"], seq=-1),
+        dataclasses.replace(EXAMPLES["track"], frame=-1),
         dataclasses.replace(EXAMPLES["track"], object="an na"),
         Position(5, 7, 0, {"an/na": 2}),
         Health("detector", 0.0, trouble="x" * (LONGEST_TEXT + 1)),
@@ -310,7 +310,7 @@ BOMBS = {"lists": b"\x90", "maps": b"\x80", "lists of maps": b"\x91\x81\xa1x\x80
 @pytest.mark.parametrize("place", ["colour", "weights", "version"])
 @pytest.mark.parametrize("bomb", BOMBS.values(), ids=BOMBS)
 def test_many_entries_take_little_memory_whatever_field_they_are_in(bomb, place):
-    data = b"\x95\x04\xa5model\xa0\xa0\x81" + msgpack.packb(place) + many(bomb)
+    data = b"\x95\x05\xa5model\xa0\xa0\x81" + msgpack.packb(place) + many(bomb)
     tracemalloc.start()
     try:
         with pytest.raises(ProtocolError, match="entries"):

@@ -92,7 +92,7 @@ def stranger():
                 socket.subscribe(b"")
             socket.connect(endpoint.address(CHANNELS[name]))
             if kind != zmq.SUB:
-                said = Command("1", "stop") if name == "control" else End(1, "forged")
+                said = Command("1", "stop") if name == "control" else End(0, "forged")
                 with suppress(zmq.Again):  # it may be rejected already
                     socket.send(encode(said), zmq.NOBLOCK)
             return socket
@@ -193,7 +193,7 @@ def test_an_acknowledged_channel_works_with_the_keys_of_the_pipeline(place, unti
         def turn():
             sender.poll(0)
             if (seq := sender.window.sent + 1) <= 50 and not sender.window.full:
-                sender.send(Features(seq, seq, 0.0, {}))
+                sender.send(Features(seq - 1, 0.0, {}))
             if (message := receiver.receive(0.02)) is not None:
                 taken.append(message.seq)
                 receiver.acknowledge(Position(message.seq, message.seq))

@@ -130,11 +130,11 @@ def test_a_late_joiner_receives_the_newest_model_of_each_object_still_tracked(en
 def test_after_the_end_a_late_joiner_receives_only_the_end(endpoint, until):
     with Publisher(SAMPLES, endpoint) as samples:
         samples.send(sample(1, "anna"))
-        samples.send(End(2, "the source has ended"))
+        samples.send(End(1, "the source has ended"))
         with Subscriber(SAMPLES, endpoint) as late:
             heard = []
             until(lambda: heard, lambda: (samples.serve_late_joiners(), heard.extend(late.receive_all())))
-    assert heard == [End(2, "the source has ended")]
+    assert heard == [End(1, "the source has ended")]
 
 
 def sample(version, name, width=5):

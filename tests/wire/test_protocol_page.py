@@ -170,8 +170,8 @@ def test_the_subscriber_of_the_page_receives_every_track(endpoint, until):
         until(lambda: select.select([reader.stdout], [], [], 0.05)[0], lambda: tracks.send(track(1)))
         for seq in range(2, 20):
             for name in ("anna", "ben"):
-                tracks.send(Track(seq, seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1, object=name))
-        tracks.send(End(20, "the source has ended"))
+                tracks.send(Track(seq - 1, 0.0, "present", Box(1.0, 2.0, 3.0, 4.0), 0.5, 1, object=name))
+        tracks.send(End(19, "the source has ended"))
         lines = reader.communicate(timeout=150)[0].splitlines()
     assert reader.returncode == 0
     assert [line for line in lines if "present" in line] == [

@@ -30,7 +30,7 @@ WINDOW = 4
 
 
 def tracks(seq):
-    return Tracks(seq, seq - 1, {"": track(seq)})
+    return Tracks(seq - 1, {"": track(seq)})
 
 
 def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint, until):
@@ -107,7 +107,7 @@ def test_the_last_message_arrives_even_if_its_sender_closes_at_once(endpoint, un
             samples.send(large)
             until(lambda: reader.receive(0.05), samples.serve_late_joiners)
             samples.send(large)
-            samples.send(End(1, "it was the last"))
+            samples.send(End(0, "it was the last"))
             samples.close()
             until(lambda: heard and isinstance(heard[-1], End), lambda: heard.extend(reader.receive_all()))
 
@@ -119,7 +119,7 @@ def test_a_sender_learns_that_its_end_is_stored_though_the_receiver_closes_at_on
     def run():
         with ThreadPoolExecutor(1) as pool, Sender(RESULTS, endpoint, WINDOW) as sender:
             receiver = Receiver(RESULTS, endpoint, Position(), WINDOW)
-            sender.send(End(1, "it was the last"))
+            sender.send(End(0, "it was the last"))
             until(lambda: receiver.receive(0.05), lambda: sender.poll(0))
             receiver.acknowledge(Position(1))
             pool.submit(receiver.close)
@@ -191,7 +191,7 @@ with Sender(ALL_FEATURES, Endpoint.parse(sys.argv[1]), 64) as features:
     features.ask_position(0)
     features.window.resume(0, Position())
     for seq in range(1, 33):
-        features.send(Features(seq, seq - 1, 0.0, {"anna": ObjectFeatures(None, {"appearance": rows})}))
+        features.send(Features(seq - 1, 0.0, {"anna": ObjectFeatures(None, {"appearance": rows})}))
 """
 
 

@@ -27,7 +27,7 @@ def features(seq, width=5):
 #: What may be wrong with a message of features: test_codec.py has all that its schema does not allow.
 WRONG = {
     "msgpack": [b"GET / HTTP/1.1"],
-    "envelope": [msgpack.packb({"seq": 1})],
+    "envelope": [msgpack.packb({"frame": 1})],
     "version": [msgpack.packb([VERSION - 1, "features", "", "", {}])],
     "kind": [encode(Health("trainer", 0.0))],
     "width": [encode(features(2, width=6))],
@@ -69,12 +69,12 @@ def test_acknowledgements_are_sent_only_to_the_sender_of_the_accepted_message(en
                 taken.append(message.seq)
             sender.poll(0)
 
-        sender.send(End(1, "the source has ended"))
+        sender.send(End(0, "the source has ended"))
         until(lambda: taken == [1], turn)
         other.send(b"")
         until(lambda: other.poll(0), turn)
         other.recv()
-        other.send(encode(End(1, "replayed")))
+        other.send(encode(End(0, "replayed")))
         until(lambda: other.poll(0), turn)
         other.recv()
         receiver.acknowledge(Position(1))  # stored only now
@@ -93,7 +93,7 @@ def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(
         Subscriber(CHANNELS[name], endpoint) as reader,
     ):
         other = stranger(zmq.XSUB, name)
-        for junk in (b"GET / HTTP/1.1", b"\x01topic", encode(End(9, "forged"))):
+        for junk in (b"GET / HTTP/1.1", b"\x01topic", encode(End(8, "forged"))):
             other.send(junk)
         other.send(b"\x01" + bytes(10_000))  # above the limit: ZeroMQ ends the connection
         until(
@@ -107,7 +107,7 @@ def test_a_message_above_the_size_limit_closes_its_connection_and_is_counted(end
     before, taken = rejects(), []
     with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
         stranger(zmq.DEALER, "results").send(bytes(CHANNELS["results"].limit + 1))
-        sender.send(End(1, "the source has ended"))
+        sender.send(End(0, "the source has ended"))
 
         def turn():
             sender.poll(0)
