@@ -23,7 +23,10 @@ import multiprocessing.util  # imports from them at its first use
 for name in ("fcntl", "grp", "pwd", "resource", "termios"):
     sys.modules.pop(name, None)
 for module, names in {
-    os: ("fork", "geteuid", "getuid", "memfd_create", "register_at_fork", "sched_getaffinity"),
+    os: (
+        *("O_DIRECTORY", "O_NONBLOCK", "fork", "geteuid", "getuid"),
+        *("memfd_create", "register_at_fork", "sched_getaffinity"),
+    ),
     signal: ("SIGHUP", "SIGSTOP", "pthread_sigmask"),
     socket: ("AF_UNIX",),
 }.items():

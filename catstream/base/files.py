@@ -197,15 +197,16 @@ def locked_folder(folder: Path, kind: type[CatstreamError] = ServiceError, secon
     with contextlib.ExitStack() as stack:
         with writing(folder, kind):
             folder.mkdir(parents=True, exist_ok=True)
-            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
-        if not lock(handle, seconds):
+            handle = None if fcntl is None else stack.enter_context(descriptor(folder, os.O_DIRECTORY))
+        if handle is not None and not lock(handle, seconds):
             raise kind(f"{folder} is being written by {_holder(folder)}: stop it, or pass another path")
         yield
 
 
 def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> None:
     """Raise an error of this kind if another process has locked a file."""
-    with contextlib.suppress(OSError), descriptor(path, os.O_RDONLY | os.O_NONBLOCK) as handle:  # it may be a pipe
+    # A pipe without a writer would block.
+    with contextlib.suppress(OSError), descriptor(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)) as handle:
         if is_locked(handle):
             raise kind(f"{path} is being written by {_holder(path)}: stop it, or pass another path")
 

@@ -169,10 +169,10 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
                 raise
         finally:
             if self._path is not None:
+                self._lock.close()
                 if not self.frames:
                     with contextlib.suppress(OSError):  # the disk may have become read-only
                         self._path.unlink(missing_ok=True)
-                self._lock.close()
 
     @contextlib.contextmanager
     def _reporting_errors(self) -> Iterator[None]:

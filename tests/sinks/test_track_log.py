@@ -311,6 +311,12 @@ def test_a_log_that_another_process_writes_is_refused_with_its_number(tmp_path, 
     open_sink(str(path), Origin()).close()
 
 
+def test_a_pipe_that_nobody_reads_is_an_existing_file(tmp_path):
+    os.mkfifo(tmp_path / "t.ndjson")
+    with pytest.raises(VideoError, match="exists already"):
+        RunFiles(Origin(), None, [str(tmp_path / "t.ndjson")]).check(overwrite=False, earlier=[])
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [
