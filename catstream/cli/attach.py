@@ -29,6 +29,7 @@ from catstream.cli.options import (
     PATH,
     NumberRange,
     combined,
+    with_boxes,
     with_json,
     with_keys,
     with_overwrite,
@@ -383,25 +384,30 @@ def _with_control(command: Callable[..., str]) -> Callable[..., None]:
 
 
 @click.command("set-box", context_settings={"ignore_unknown_options": True})  # -3,40,60,60 is a box
-@click.argument("box", metavar="[NAME=]X,Y,W,H")
+@with_boxes
 @click.option("--keep", is_flag=True, help="Same object: keep what was learned.")
 @_with_control
-def set_box(pipeline: Control, box: str, keep: bool) -> str:
-    """Set the box of an object in a running pipeline.
+def set_box(pipeline: Control, boxes: dict[str, Box], keep: bool) -> str:
+    """Set the box of an object, or of several, in a running pipeline.
 
     X,Y,W,H is the box in pixels in the next frame that is tracked; during a
     pause of a file, in the frame that is held. A new NAME begins an object
     beside the others; an object that has this name already is replaced, and
     everything learned of it is dropped. Without NAME, the only object is meant.
+    Several objects begin in the same frame, or, if a box is invalid, none.
 
     \b
     EXAMPLES
       catstream set-box 120,80,64,48
-      catstream set-box anna=120,80,64,48
+      catstream set-box anna=120,80,64,48 ben=300,90,60,150
       catstream set-box anna=118,83,64,48 --keep
     """
-    name, value = split_name(box)
-    return pipeline.set_box(Box.parse(value), name, keep=keep).reason
+    if len(boxes) > 1 and keep:
+        raise click.UsageError("--keep is for one box: set the boxes one after the other")
+    if len(boxes) > 1:
+        return pipeline.set_boxes(boxes).reason
+    ((name, box),) = boxes.items()
+    return pipeline.set_box(box, name, keep=keep).reason
 
 
 @click.command()

@@ -48,8 +48,8 @@ with_keys = click.option(
 with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
 
 
-def _by_name(flag: str, argument: str, metavar: str, convert: _Converter, help: str) -> Decorator:
-    """An option for objects, which may be repeated; the argument is what `convert` makes of the values by name."""
+def _collect(flag: str, convert: _Converter) -> Callable[..., object]:
+    """A callback for texts [NAME=]VALUE; the argument is what `convert` makes of the values by name."""
 
     def by_name(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> object:
         values: dict[str, str] = {}
@@ -58,11 +58,17 @@ def _by_name(flag: str, argument: str, metavar: str, convert: _Converter, help: 
             if name in values:
                 earlier = f"{name}={values[name]}" if name else values[name]
                 hint = "its own name" if name else f"a name, NAME={value}"
-                raise ObjectError(f"{flag} {earlier} and {flag} {text}: give each object {hint}")
+                raise ObjectError(f"{flag}{earlier} and {flag}{text}: give each object {hint}")
             values[name] = value
         return convert(values)
 
-    return click.option(flag, argument, multiple=True, metavar=metavar, callback=by_name, help=help)
+    return by_name
+
+
+def _by_name(flag: str, argument: str, metavar: str, convert: _Converter, help: str) -> Decorator:
+    """An option for objects, which may be repeated."""
+    callback = _collect(f"{flag} ", convert)
+    return click.option(flag, argument, multiple=True, metavar=metavar, callback=callback, help=help)
 
 
 def with_files(flag: str, argument: str, help: str) -> Decorator:
@@ -71,6 +77,11 @@ def with_files(flag: str, argument: str, help: str) -> Decorator:
 
 
 with_model = with_files("--model", "models", "Model of an object, written by `catstream save`.")
+
+#: Adds boxes as the argument `boxes`, a dict by name.
+with_boxes = click.argument(
+    "boxes", nargs=-1, required=True, metavar="[NAME=]X,Y,W,H...", callback=_collect("", boxes_by_name)
+)
 
 _HELP = "An object in the first frame, in pixels; may be repeated with names."
 _with_box = _by_name("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name, _HELP)

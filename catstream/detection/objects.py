@@ -26,6 +26,7 @@ from catstream.messages.kinds import DetectorState, Features, Model, Track, Trac
 
 _SAME_POSITION = 0.5  # IoU above which two boxes are at the same position
 _INITIAL_OVERLAP = 0.2  # IoU of their initial boxes above which two objects may be at the same position
+_UNTRUSTED_OVERLAP = 0.2  # IoU above which the box of an object that is not trusted may be a part of the other
 
 
 class Detectors:
@@ -151,9 +152,11 @@ def assign(
 ) -> dict[str, Detection]:
     """Resolve conflicts: give a position to one object, to the one whose score would fall most without it.
 
-    An object that loses its position gets the best other window near it; its score is 0 if there is none. Objects whose
-    initial boxes overlapped may be at the same position, and an object that is still sought occupies none. Without a
-    conflict, a detection is unchanged. The windows are `context` times as large as the boxes of the objects.
+    An object that loses its position gets the best other window near it; its score is 0 if there is none. One that is
+    not trusted, because it was last detected elsewhere, also loses a position of which a smaller part is another
+    object's: most likely it is lost, and a part of the other one looks similar. Objects whose initial boxes overlapped
+    may be at the same position, and an object that is still sought occupies none. Without a conflict, a detection is
+    unchanged. The windows are `context` times as large as the boxes of the objects.
     """
     initial = {
         name: (state.first_frame, state.first_window.box(context))
@@ -166,20 +169,27 @@ def assign(
         for name in initial
     }
 
+    limits = {
+        name: _SAME_POSITION if states[name].trusted and not detections[name].redetected else _UNTRUSTED_OVERLAP
+        for name in initial
+    }
+
     def rival_boxes(name: str, positions: Mapping[str, Box]) -> list[Box]:
         return [positions[other] for other in rivals[name] if other in positions]
 
     def in_conflict(name: str, positions: Mapping[str, Box]) -> bool:
-        return any(boxes[name].overlap(box) > _SAME_POSITION for box in rival_boxes(name, positions))
+        return any(boxes[name].overlap(box) > limits[name] for box in rival_boxes(name, positions))
 
     conflicts = [name for name in initial if in_conflict(name, boxes)]
-    alternatives = {name: _best_elsewhere(detections[name], rival_boxes(name, boxes), context) for name in conflicts}
+    alternatives = {
+        name: _best_elsewhere(detections[name], rival_boxes(name, boxes), context, limits[name]) for name in conflicts
+    }
     assigned = {name: box for name, box in boxes.items() if name not in conflicts}
     result = dict(detections)
     for name in sorted(conflicts, key=lambda name: detections[name].score - alternatives[name].score, reverse=True):
         if in_conflict(name, assigned):
             # Neither at an assigned position, nor at one that a later object may be assigned.
-            result[name] = _best_elsewhere(detections[name], rival_boxes(name, boxes | assigned), context)
+            result[name] = _best_elsewhere(detections[name], rival_boxes(name, boxes | assigned), context, limits[name])
         if result[name].score > 0:
             assigned[name] = result[name].window.box(context)
         boxes.pop(name)
@@ -192,13 +202,13 @@ def _are_exclusive(one: tuple[int, Box], other: tuple[int, Box]) -> bool:
     return frame != other_frame or box.overlap(other_box) <= _INITIAL_OVERLAP
 
 
-def _best_elsewhere(detection: Detection, occupied: list[Box], context: float) -> Detection:
+def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, limit: float) -> Detection:
     """The best window near a detection that is at none of the occupied positions."""
     if detection.around is not None:
         scores = detection.around.scores.copy()
         for row, column in np.ndindex(scores.shape):
             box = detection.around.window(row, column).box(context)
-            if any(box.overlap(other) > _SAME_POSITION for other in occupied):
+            if any(box.overlap(other) > limit for other in occupied):
                 scores[row, column] = -np.inf
         row, column = map(int, np.unravel_index(scores.argmax(), scores.shape))
         if scores[row, column] > 0:

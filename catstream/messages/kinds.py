@@ -483,6 +483,8 @@ class Command:
              A pause without it lasts until "resume"
     time     for "set-box" on a live source only: time of the preview in which the box was drawn. If its frame is still
              kept, the object is searched for from there to the next frame that is tracked
+    boxes    for "set-box", in place of `box` and `object`: boxes of several objects by name, which begin in the same
+             frame, or none of them
     """
 
     id: Text
@@ -493,10 +495,12 @@ class Command:
     model: Annotated[bytes, Meta(max_length=LARGEST_GIVEN_MODEL)] | None = None
     seconds: Number | None = None
     time: Number | None = None
+    boxes: ByObject[Box] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, verb in (("box", "set-box"), ("model", "search")):
-            if (getattr(self, name) is not None) != (self.verb == verb):
+        boxes = bool(self.boxes) + (self.box is not None)
+        for name, verb, count in (("box", "set-box", boxes), ("model", "search", self.model is not None)):
+            if count != (self.verb == verb):
                 raise ProtocolError(f"command: expected a {name} with {verb} and with nothing else, got {self.verb!r}")
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from catstream.base.names import check_count
+from catstream.base.text import listed
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, ObjectError
@@ -77,14 +79,33 @@ class Beginnings:
         beginnings: dict[str, Beginning] = {}
         for command in self._commands.take_boxes():
             try:
-                if (name := object_of(command, self._commands.desired)) in beginnings:
+                names = command.boxes.keys() or {object_of(command, self._commands.desired)}
+                if names & beginnings.keys():
                     self._commands.boxes.append(command)
+                    continue
+                if command.boxes:
+                    begun, answered = self._together(command, frame)
+                    beginnings |= begun
                 else:
+                    (name,) = names
                     beginnings[name], answered = self._at_box(name, command, frame)
-                    self._commands.store_and_answer(answered)
+                self._commands.store_and_answer(answered)
             except (BoxError, ObjectError) as error:
                 self._commands.reject(command, str(error))
         return [*beginnings.values()]
+
+    def _together(self, command: Command, frame: Frame) -> tuple[dict[str, Beginning], Answer]:
+        """Begin all objects of a command, or, after an error in one box, none of them."""
+        commands, detectors = self._commands, self._detectors
+        names = commands.desired.objects.keys() | command.boxes.keys()
+        check_count(len(names), self._process.settings.run.max_objects)
+        self._process.watchdog.allow()
+        results = detectors.begin_all(command.boxes, detectors.pyramid(frame.image), frame.time)
+        for name, box in command.boxes.items():
+            commands.desired = commands.desired.with_object(name, DesiredObject(box, detectors.seq + 1))
+        effect = f"{listed(command.boxes)} begin in frame {detectors.seq}"
+        beginnings = {name: Beginning(name, result) for name, result in results.items()}
+        return beginnings, answer(command, detectors, True, effect, frame=detectors.seq)
 
     def _at_box(self, name: str, command: Command, frame: Frame) -> tuple[Beginning, Answer]:
         """Begin an object at the box of a command, or continue it there.

@@ -99,11 +99,14 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert (code, answer.endswith("ambiguous object: this run tracks anna, ben; pass a name")) == (1, True)
     assert steer("forget", "carl")[1].endswith("there is no object 'carl': this run tracks anna, ben")
     assert steer("set-box", "an na=1,2,30,40")[0] == 1
+    assert steer("set-box", "1,2,30,40", "1,2,30,40")[0] == 1
+    assert "dora, emil begin in frame" in steer("set-box", "dora=20,150,70,60", "emil=20,20,60,60")[1]
+    assert [steer("forget", name)[0] for name in ("dora", "emil")] == [0, 0]
     assert steer("forget", "anna")[1].startswith("anna is no longer tracked after frame")
     assert steer("forget")[1].endswith("no object is left, so the run waits for a box")
     assert status()["state"] == "waiting"
     assert steer("stop")[0] == 0
-    assert {track.object for track in run.result(120)} == {"anna", "ben"}
+    assert {track.object for track in run.result(120)} == {"anna", "ben", "dora", "emil"}
 
 
 def test_a_saved_model_finds_the_object_in_another_run(video, follow, succeed, steer, camera, until, tmp_path):

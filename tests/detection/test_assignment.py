@@ -1,5 +1,6 @@
 """Two objects do not claim the same place of a frame, unless they were given there."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -77,6 +78,17 @@ def test_objects_whose_first_boxes_overlap_may_stay_at_one_place():
     assert assign(found, together, CONTEXT) == found
     one_later = {"anna": state(100), "ben": state(110, first_frame=7)}
     assert assign(found, one_later, CONTEXT)["ben"].score == 0
+
+
+@pytest.mark.parametrize(
+    ("trusted", "redetected", "kept"), [(True, False, True), (False, False, False), (True, True, False)]
+)
+def test_an_object_that_is_not_trusted_gets_no_part_of_the_place_of_another(trusted, redetected, kept):
+    found = {"anna": detection(0.7, 100), "ben": replace(detection(0.9, 122), redetected=redetected)}
+    states = APART | {"ben": replace(APART["ben"], trusted=trusted)}
+    result = assign(found, states, CONTEXT)
+    assert result["anna"] is found["anna"]
+    assert (result["ben"].score > 0) is kept
 
 
 def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng):

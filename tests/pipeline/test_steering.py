@@ -85,6 +85,22 @@ def saved(long_video, once):
     return once("saved", save) / "object.safetensors"
 
 
+def test_boxes_of_several_objects_begin_in_the_same_frame_or_none(video):
+    path, boxes = video
+    together = {"anna": boxes[0], "ben": (20, 150, 70, 60)}
+    with steered(path) as (pipeline, steering, _):
+        steering.pause()
+        with pytest.raises(CommandRejectedError, match=r"ben: .*outside"):
+            steering.set_boxes(together | {"ben": (4000, 10, 20, 20)})
+        answer = steering.set_boxes(together)
+        assert (answer.frame, answer.reason) == (0, "anna, ben begin in frame 0")
+        steering.stop()
+        tracks = list(pipeline)
+    assert [(track.object, track.frame, track.box) for track in tracks] == [
+        (name, 0, pytest.approx(box)) for name, box in together.items()
+    ]
+
+
 def test_the_first_frame_waits_for_a_box_and_in_a_pause_a_box_is_for_the_waiting_one(video):
     path, boxes = video
     with steered(path) as (pipeline, steering, _):

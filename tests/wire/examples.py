@@ -39,7 +39,7 @@ def example(kind: type, full: bool = True, d: int = 5) -> Any:
     if kind is Preview:
         values["jpeg"] = b"\xff\xd8\xff"
     if kind is Command:
-        values |= {"verb": "set-box", "model": None} if full else {"verb": "stop"}
+        values |= {"verb": "set-box", "model": None, "boxes": {}} if full else {"verb": "stop", "boxes": {}}
     return kind(**values)
 
 

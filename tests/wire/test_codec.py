@@ -94,7 +94,9 @@ def messages(draw: st.DrawFn, kind: type, width: int | None = None) -> Any:
     if kind is Preview:
         values["jpeg"] = b"\xff\xd8\xff" + values["jpeg"]
     if kind is Command:
-        values["box"] = (values["box"] or BOX) if values["verb"] == "set-box" else None
+        is_box = values["verb"] == "set-box"
+        values["boxes"] = values["boxes"] if is_box else {}
+        values["box"] = (values["box"] or BOX) if is_box and not values["boxes"] else None
         values["model"] = (values["model"] or b"") if values["verb"] == "search" else None
     return kind(**values)
 
@@ -202,6 +204,7 @@ REJECTED = {
     "an unknown verb": packed("command", verb="format"),
     "a box that the verb does not use": packed("command", verb="stop"),
     "set-box without a box": packed("command", box=None),
+    "set-box with a box and several": packed("command", boxes={"anna": [1, 2, 3, 4]}),
     "a dtype that is not allowed": retrained(rows=plain("<f8", [3, 5], bytes(120))),
     "objects": retrained(rows=plain("|O", [3, 5], bytes(120))),
     "another width of its labels": retrained(labels=plain("<f4", [2], bytes(8))),
