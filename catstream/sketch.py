@@ -34,7 +34,7 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
     Parameters
     ----------
     n_components : number of components, at most `size`; None: the least of `size`, d and p
-    size : number of rows of a node of the tree; more of them reduce the error
+    size : number of rows of a node of the tree; more of them reduce the error, and the time of shorter rows
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
     mean_: Float64
     n_samples_seen_: int
 
-    def __init__(self, n_components: int | None = None, size: int = 128) -> None:
+    def __init__(self, n_components: int | None = None, size: int = 256) -> None:
         self.n_components, self.size = n_components, size
 
     def fit(self, X: Any, y: Any = None) -> Self:  # noqa: ARG002  of a Pipeline
