@@ -36,7 +36,7 @@ Progress = Callable[[str, int, int | None], object]
 _BoxesByFrame = Mapping[int, str | Iterable[float] | None]
 KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
 
-_CHECKED = 0.96  #: probability from which a frame is checked
+_CHECKED = 0.97  #: probability from which a frame is checked
 
 
 class NextFrame(NamedTuple):
@@ -391,7 +391,7 @@ def annotate(
     """Track objects between boxes at keyframes of a video, and check the tracks.
 
     Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
-    box is right with a probability of 96 %, see `catstream.annotation.fusion`. Parameters and errors are those of
+    box is right with a probability of 97 %, see `catstream.annotation.fusion`. Parameters and errors are those of
     `Annotation`.
     """
     if not boxes:

@@ -67,7 +67,7 @@ def annotate(
 
     Each stretch between two keyframes is tracked from both of its ends. A frame
     is checked if the two agree so well that its box is right with a probability
-    of 96 %.
+    of 97 %.
 
     \b
     OUTPUT
