@@ -6,7 +6,7 @@ import { Stage } from "./stage.js";
 const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
 const CHECKS = { keyframe: "your box", checked: "checked", unchecked: "may be wrong" };
-const KEYS = { n: "next", Enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
+const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
 
 /** The picture of a frame; a box is saved as soon as it is drawn. */
 class FrameStage extends Stage {
@@ -31,9 +31,10 @@ class AnnotatePage {
       new: () => this.choose(null), done: () => this.done() };
     for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
     $("#slider").oninput = () => this.go(Number($("#slider").value));
-    $("#name").onchange = () => this.rename();
+    $("#name").onchange = () => { this.renaming = this.rename(); };
     $("#naming").onsubmit = (event) => { event.preventDefault(); $("#name").blur(); };
     addEventListener("keydown", (event) => this.key(event));
+    addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // Enter means next again
     new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
     const events = new EventSource("events");
     events.onmessage = ({ data }) => this.receive(JSON.parse(data));
@@ -46,13 +47,13 @@ class AnnotatePage {
     this.silent = Boolean(closed);
     if (!closed) {
       const { work } = this;
-      const before = this.state?.objects ?? [];
+      const before = this.state;
       if (!work.remaining) Object.assign(work, { began: Date.now(), done: 0 });
       work.done += Math.max(0, work.remaining - state.remaining);
       work.remaining = state.remaining;
       this.state = state;
-      if (!before.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
-      this.load();
+      if (!before?.objects.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
+      if (state.revision !== before?.revision) this.load();
     }
     this.show();
   }
@@ -73,7 +74,7 @@ class AnnotatePage {
     let number = 1;
     while (this.get(`object-${number}`)) number += 1;
     $("#name").value = name ?? `object-${number}`;
-    if (name === null && this.state?.objects.length) $("#name").select();
+    if (name === null && this.state?.objects.length) $("#name").select(), $("#name").focus();
     this.showBoxes();
     this.show();
   }
@@ -117,6 +118,13 @@ class AnnotatePage {
     return Object.fromEntries(Object.keys(WAYS).flatMap((name, way) => (proposals[way] ? [[name, proposals[way][0]]] : [])));
   }
 
+  /** What is known of the chosen object in this frame. */
+  get check() {
+    const { box, checked, proposals } = this.boxes[this.chosen] ?? { checked: "unchecked", proposals: [] };
+    if (checked === "unchecked" && !proposals.some(Boolean)) return "not tracked yet";
+    return (box ? "" : "absent, ") + CHECKS[checked];
+  }
+
   showBoxes() {
     if (!this.stage.picture) return;
     const proposed = Object.entries(this.proposals), known = Object.entries(this.boxes).map(([name, { box }]) => [name, box]);
@@ -141,8 +149,9 @@ class AnnotatePage {
 
   /** Save the box of the chosen object in this frame, or of a new one; null if it is absent. */
   async set(box) {
-    const object = this.chosen ?? $("#name").value.trim();
     const { frame } = this;
+    await this.renaming;
+    const object = this.chosen ?? $("#name").value.trim();
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
     if (answer && this.chosen === null) this.choose(object.normalize("NFC"));
     return answer;
@@ -195,7 +204,7 @@ class AnnotatePage {
     if (this.stage.drawing) return this.stage.key(event);
     if (key in steps) this.go(this.frame + steps[key]);
     else if (key === "z") this.undo();
-    else if (key.length === 1 || target.tagName !== "BUTTON") $(`#${KEYS[key.length === 1 ? key.toLowerCase() : key]}`)?.click();
+    else if (key.toLowerCase() in KEYS && (key !== "Enter" || target.tagName !== "BUTTON")) $(`#${KEYS[key.toLowerCase()]}`).click();
     else return;
     event.preventDefault();
   }
@@ -206,7 +215,10 @@ class AnnotatePage {
     add(choose, "i", { className: "swatch" });
     add(choose, "b", { textContent: name || "no name" });
     const line = make("svg", { role: "img", preserveAspectRatio: "none" });
-    line.onclick = (event) => this.jump(Math.floor(this.state.frames * event.offsetX / line.clientWidth), name);
+    line.onclick = ({ clientX }) => {
+      const { left, width } = line.getBoundingClientRect();
+      this.jump(Math.floor(this.state.frames * (clientX - left) / width), name);
+    };
     element.append(line);
     return { element, choose, line, share: add(element, "span", { className: "share number" }) };
   }
@@ -214,11 +226,11 @@ class AnnotatePage {
   fillRow({ element, choose, line, share }, { name, colour, keyframes, unchecked, frames, frame, chosen }) {
     element.style.setProperty("--colour", colour);
     choose.setAttribute("aria-pressed", String(chosen));
-    const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, height: 1 });
-    const mark = (kind, place) => make("line", { class: kind, x1: place + 0.5, x2: place + 0.5, y2: 1 });
-    line.setAttribute("viewBox", `0 0 ${frames} 1`);
+    const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, y: 1, height: 3 });
+    const mark = (kind, place) => make("line", { class: kind, x1: place + 0.5, x2: place + 0.5, y2: 5 });
+    line.setAttribute("viewBox", `0 0 ${frames} 5`);
     line.replaceChildren(bar("right", 0, frames - 1), ...unchecked.map(([first, last]) => bar("wrong", first, last)),
-      ...keyframes.map((place) => mark("", place)), mark("now", frame));
+      mark("now", frame), ...keyframes.map((place) => mark("", place)));
     const wrong = unchecked.reduce((sum, [first, last]) => sum + last - first + 1, 0);
     const percent = Math.floor(100 * (1 - wrong / frames));
     write(share, `${percent}%`);
@@ -226,7 +238,7 @@ class AnnotatePage {
   }
 
   show() {
-    const { state, frame, chosen, boxes, ended, silent, following, proposals } = this;
+    const { state, frame, chosen, ended, silent, following, proposals } = this;
     const objects = state?.objects ?? [], known = this.get(chosen);
     const [kind, words] = this.progress();
     $("#state").dataset.state = kind;
@@ -239,7 +251,7 @@ class AnnotatePage {
     Object.assign($("#slider"), { max: state.frames - 1, value: frame });
     write($("#frame"), `${frame} of ${state.frames}`);
     $("#naming").style.setProperty("--colour", known?.colour ?? "transparent");
-    write($("#check"), boxes[chosen] ? `${chosen || "The object"} in frame ${frame}: ${boxes[chosen].box ? "" : "absent, "}${CHECKS[boxes[chosen].checked]}` : "A new object: draw its box");
+    write($("#check"), known ? `${chosen || "The object"} in frame ${frame}: ${this.check}` : "A new object: draw its box");
     for (const [id, name] of [["first", "1 forwards"], ["second", "2 backwards"]]) {
       write($(`#${id} span`), `Take ${name.slice(2)}${name in proposals && !proposals[name] ? ": absent" : ""}`);
       $(`#${id}`).disabled = !(name in proposals);
