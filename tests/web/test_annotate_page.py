@@ -1,4 +1,4 @@
-"""The page of `catstream annotate` in a real browser: a video is annotated by mouse and keys, and the results are there."""
+"""The page of `catstream annotate` in a real browser: a video is annotated by mouse and keys."""
 
 import csv
 import json

@@ -16,7 +16,9 @@ class FrameStage extends Stage {
 
   release(clicked) {
     super.release(clicked);
-    if (this.box) this.accept().then(() => this.cancel());
+    const { box } = this;
+    this.cancel();
+    if (box) this.actions.follow([box.x, box.y, box.w, box.h]);
   }
 }
 
@@ -24,7 +26,7 @@ class AnnotatePage {
   constructor() {
     Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: false });
     this.work = { began: 0, done: 0, remaining: 0 }; // time of the start of the passes that run, and their frames
-    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box), changed: () => {} });
+    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {} });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
       first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
@@ -64,12 +66,12 @@ class AnnotatePage {
   }
 
   get(name) {
-    return name in WAYS ? { colour: WAYS[name] } : this.state?.objects.find((one) => one.name === name);
+    return Object.hasOwn(WAYS, name) ? { colour: WAYS[name] } : this.state?.objects.find((one) => one.name === name);
   }
 
   /** Choose an object, null for a new one; a proposal is taken. */
   choose(name) {
-    if (name in WAYS) return this.take(name);
+    if (Object.hasOwn(WAYS, name)) return this.take(name);
     this.chosen = name;
     let number = 1;
     while (this.get(`object-${number}`)) number += 1;
@@ -83,6 +85,7 @@ class AnnotatePage {
   go(frame, name = this.chosen) {
     this.stage.cancel();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
+    this.boxes = {}; // those of another frame cannot be taken
     if (name !== this.chosen) this.choose(name);
     this.show();
     this.load();
@@ -120,7 +123,8 @@ class AnnotatePage {
 
   /** What is known of the chosen object in this frame. */
   get check() {
-    const { box, checked, proposals } = this.boxes[this.chosen] ?? { checked: "unchecked", proposals: [] };
+    const { box, checked, proposals } = this.boxes[this.chosen] ?? {};
+    if (!checked) return "";
     if (checked === "unchecked" && !proposals.some(Boolean)) return "not tracked yet";
     return (box ? "" : "absent, ") + CHECKS[checked];
   }
@@ -147,9 +151,9 @@ class AnnotatePage {
     return answer.done ? answer : null;
   }
 
-  /** Save the box of the chosen object in this frame, or of a new one; null if it is absent. */
-  async set(box) {
-    const { frame } = this;
+  /** Save the box of the chosen object, or of a new one, in the frame that is shown; null if it is absent. */
+  async set(box, frame = this.frame) {
+    if (this.stage.picture?.frame !== frame) return null; // another one is shown still
     await this.renaming;
     const object = this.chosen ?? $("#name").value.trim();
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
