@@ -1,6 +1,6 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
 
-import { $, add, Items, make, many, write } from "./dom.js";
+import { $, add, duration, Items, make, many, write } from "./dom.js";
 import { Stage } from "./stage.js";
 
 const JUMP = 25; // frames of a page key
@@ -282,7 +282,7 @@ class AnnotatePage {
     if (!state.decoded) return ["bootstrapping", `decoding: ${many(state.frames, "frame")}`];
     if (!state.remaining) return ["present", "all boxes saved"];
     const seconds = work.done ? Math.ceil(state.remaining * (Date.now() - work.began) / work.done / 1000) : null;
-    return ["bootstrapping", `tracking${seconds === null ? "" : `: ${seconds} s left`}`];
+    return ["bootstrapping", `tracking${seconds === null ? "" : `: ${duration(seconds)} left`}`];
   }
 
   overlay() {
