@@ -128,7 +128,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         What runs and is unchanged is not touched. If the store cannot be used, nothing is started or changed.
         """
         if self._spec is None:
-            raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
+            raise FleetError("missing fleet file: the fleet has no streams yet; pass a file as in docs/how-to/fleet.md")
         spec = self._spec
         if not spec.store:
             if self._address:
@@ -385,7 +385,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         except (RayError, GetTimeoutError) as error:
             self._controller = None
             what = str(error).partition("\n")[0] or type(error).__name__
-        raise FleetError(f"the controller of {self.name} did not do it ({what}): see its log in the folder of Ray")
+        raise FleetError(f"the controller of fleet {self.name} failed ({what}): see its log in Ray's log folder")
 
 
 def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -> Merged:
@@ -395,9 +395,7 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
     streams are `named`, each has to know the object; otherwise the others are skipped.
     """
     if not name and not named:
-        raise FleetError(
-            "objects without a name may be different ones: name the object (--object NAME), or the streams that show it"
-        )
+        raise FleetError("ambiguous unnamed object: pass --object NAME, or the names of the streams that show it")
     store = Store(url)
     models = {stream: _learned(store, stream, name, named=named) for stream in streams}
     learned = {stream: model for stream, model in models.items() if model is not None}
@@ -433,7 +431,7 @@ def _learned(store: Store, stream: str, name: str, *, named: bool) -> SavedModel
     """The saved model of an object in the newest state of a stream in the store; None if there is none."""
     try:
         if (newest := store.stream(stream).newest()) is None:
-            raise FleetError("there is no state of it in the store yet")
+            raise FleetError("no state in the store yet")
         with tempfile.TemporaryDirectory(prefix="catstream-merge-") as folder:
             state.restore(Path(folder), newest.files)
             return state.learned(Path(folder), Job.load(Path(folder)).settings, name)

@@ -385,7 +385,7 @@ class RunFiles:
             if is_file(place):
                 continued = place in earlier and row.follows_log and self._log() is not None
                 if place in earlier and not continued and Path(place).exists():
-                    raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
+                    raise VideoError(f"{place} cannot be continued: pass other destinations to resume (--write DEST)")
                 check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
 
     def position(self, *, skip_damaged: bool = False) -> int | None:

@@ -105,7 +105,7 @@ def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as owner:
         owner.stdout.readline()
-        with pytest.raises(ServiceError, match="stop it, or give another folder"), locked(tmp_path):
+        with pytest.raises(ServiceError, match="stop it, or use another folder"), locked(tmp_path):
             pass
         owner.kill()
     with locked(tmp_path):

@@ -167,7 +167,7 @@ def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_o
     with pytest.raises(VideoError, match=r"t\.csv exists already"):
         run.check(overwrite=False, earlier=run.places[:2])
     Path(run.places[3]).touch()
-    with pytest.raises(VideoError, match=r"t\.mcap cannot be continued: to resume, give other destinations"):
+    with pytest.raises(VideoError, match=r"t\.mcap cannot be continued: pass other destinations to resume"):
         run.check(overwrite=False, earlier=run.places)
 
 
@@ -176,8 +176,8 @@ def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_o
     [
         ("t.xls", r"one of .ndjson, -, .csv, .*where - is"),
         ("t.txt", "for other formats use catstream export"),
-        ("ftp://host/t.csv", "ftp://host/t.csv is no destination of tracks"),
-        ("none/t.csv", "a folder that exists and that you may write to"),
+        ("ftp://host/t.csv", "ftp://host/t.csv is not a destination of tracks"),
+        ("none/t.csv", "an existing folder that you may write to"),
     ],
 )
 def test_destinations_that_cannot_be_written_are_rejected_before_the_run(tmp_path, name, words):
