@@ -128,10 +128,11 @@ def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None
     """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
         if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
-            raise ServiceError(
-                f"{str(folder)!r} already contains a run: continue it (--resume {quote(str(folder))}), or use another "
-                "folder"
-            )
+            if contains_run(folder):
+                hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
+            else:
+                hint = f"contains a run without its {_SMALL[0]}, which cannot be continued: use another folder"
+            raise ServiceError(f"{str(folder)!r} {hint}")
         if job != resumed:
             job.save(folder)
         yield
