@@ -254,7 +254,9 @@ def _tracked(
             progress(frame.number + 1, source.frames)
             yield TrackedFrame([replace(track, source_frame=number) for track in tracker.tracks.values()])
         for frame_number, boxes in begins.items():
-            raise BoxError(f"{listed(boxes)}: frame {frame_number} is not in the video, which has {number + 1} frames")
+            raise BoxError(
+                f"{listed(boxes)}: frame {frame_number} is outside the video: pass a frame from 0 to {number}"
+            )
 
     return head, frames()
 

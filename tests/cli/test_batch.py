@@ -113,7 +113,7 @@ def test_a_table_that_cannot_be_used_is_an_error_of_one_line(fail, tmp_path, row
     [
         ("absent,,,,0", "ben has no box"),
         ("900,0,20,20,0", "ben"),
-        ("10,10,20,20,99", "ben: frame 99 is not in the video, which has 12 frames"),
+        ("10,10,20,20,99", "ben: frame 99 is outside the video: pass a frame from 0 to 11"),
     ],
 )
 def test_a_box_that_cannot_be_tracked_is_the_error_of_its_video(demo, batch, row, message):
