@@ -284,9 +284,7 @@ class _Run:
             settings=tuple(pipeline.settings.changed()),
             boxes=pipeline.boxes,
         )
-        origin = Origin(
-            pipeline.source, part, settings.image_rate, Address(keys=settings.keys), options=results.options, head=head
-        )
+        origin = Origin(head, Address(keys=settings.keys), results.options)
         files = RunFiles(origin, results.output, places)
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
         if folder := self.state or self.resume:

@@ -186,7 +186,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
     with subscribe(address, "tracks") as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(address, wait)
-            origin = Origin(address=address, options=options, head=_head(address))
+            origin = Origin(_head(address), address, options, attached=True)
             check_options(options, places, origin.head.size)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]

@@ -216,7 +216,10 @@ class Fleet(AbstractContextManager["Fleet"]):
         if late and not self.is_owner:  # whose node ends with them
             raise FleetError("\n".join([f"the fleet {self.name} is not down yet, run the command again", *late]))
         unstored: list[str] = late + self._ask("end")
-        self._kill_controller()
+        import ray
+
+        with suppress(ValueError):  # the controller has gone
+            ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
         self._end_ray()
         deadline = time.monotonic() + _LEAVE_SECONDS
         while not self._address and _is_up(self._folder) and time.monotonic() < deadline:
@@ -294,9 +297,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         """Connect to a cluster, or start a node."""
         if not self._address:
             os.environ.update(_VARIABLES | {"RAY_AUTH_TOKEN_PATH": str(self._folder / "token")})
-        os.environ.setdefault(
-            "RAY_NUM_REDIS_GET_RETRIES", "2"
-        )  # of 41 s each if the head dies now; Ray's default is 20
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "2")  # of 41 s each if the head dies now, by default 20
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of Ray, about its own future
             import ray
@@ -354,12 +355,6 @@ class Fleet(AbstractContextManager["Fleet"]):
             .remote(spec.name, spec.store, listen, keys)
         )
         self._ask("ready")
-
-    def _kill_controller(self) -> None:
-        import ray
-
-        with suppress(ValueError):  # it has gone
-            ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
 
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
         """Call a method of the controller, and wait for its answer."""
@@ -447,8 +442,7 @@ def _gcs_address() -> str:
     """HOST:PORT of the head of the cluster that this process uses."""
     import ray
 
-    address: str = ray.get_runtime_context().gcs_address
-    return address
+    return str(ray.get_runtime_context().gcs_address)
 
 
 def _disconnect() -> None:

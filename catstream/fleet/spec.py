@@ -31,7 +31,6 @@ from catstream.video.source import is_live
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
-_CORES = Annotated[float, Meta(gt=0, le=4096)]
 
 #: The type of each key of a fleet, and what its value must be.
 _FLEET: dict[str, tuple[Any, str]] = {
@@ -51,7 +50,7 @@ _STREAM: dict[str, tuple[Any, str]] = {
     "model": (str, "a text"),
     "models": (dict[str, str], 'a table of texts, for example { anna = "anna.safetensors" }'),
     "settings": (dict[str, Any], 'a table, for example { "coreset.size" = 128 }'),
-    "cores": (_CORES, "a number above 0"),
+    "cores": (Annotated[float, Meta(gt=0, le=4096)], "a number above 0"),
     "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
     "follow": (str | list[Annotated[str, Meta(min_length=1)]], 'names of objects, for example ["anna"]'),
 }

@@ -388,9 +388,6 @@ class Claim:
         self._number = 0
         self._fenced: FencedError | None = None
 
-    def __repr__(self) -> str:
-        return f"Claim({self._states.folder!r}, token={self.token})"
-
     def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         """Write a state, and remove those that are no longer needed.
 

@@ -28,9 +28,8 @@ from catstream.client.address import Address
 from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.video.frames import RATE
 from catstream.video.images import IMAGES
-from catstream.video.source import ALL_FRAMES, VIDEOS
+from catstream.video.source import VIDEOS
 
 #: Stands for standard output.
 STDOUT = "-"
@@ -107,24 +106,20 @@ class Head:
 class Origin:
     """The run whose tracks a sink writes.
 
-    source      of its frames if they can be read a second time: None beside a running pipeline
-    part        the frames that are tracked
-    image_rate  frames per second of a folder of images
-    address     of the running pipeline, for a sink that receives other messages, too
-    last        last frame of the file if it is a log that is continued; None for a new file
-    size        number of bytes up to the end of that frame
-    options     of the destinations, beside their addresses
-    head        first line of a log
+    head      of its log
+    address   of the running pipeline, for a sink that receives other messages, too
+    options   of the destinations, beside their addresses
+    attached  whether another program runs the pipeline: its source is not read a second time
+    last      last frame of the file if it is a log that is continued; None for a new file
+    size      number of bytes up to the end of that frame
     """
 
-    source: str | None = None
-    part: slice = field(default_factory=lambda: ALL_FRAMES)
-    image_rate: float = RATE
+    head: Head = field(default_factory=Head)
     address: Address = field(default_factory=Address)
+    options: SinkOptions = field(default_factory=SinkOptions)
+    attached: bool = False
     last: TrackedFrame | None = None
     size: int = 0
-    options: SinkOptions = field(default_factory=SinkOptions)
-    head: Head = field(default_factory=Head)
 
 
 @dataclass(frozen=True, slots=True)
