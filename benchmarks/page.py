@@ -180,12 +180,12 @@ def _accuracy(found: Mapping[str, Record]) -> str:
     scores = ", ".join(f"{tracker} {mean['f_score']:.3f}" for tracker, mean in peers["mean"].items())
     return f"""
         **The defaults were chosen on the first 20 of these sequences**, so the accuracy on a new video is lower. The
-        fifteen of the check list are not used to choose anything. The other trackers are those of OpenCV
+        fifteen of the check list are not used to choose anything. The other trackers are from OpenCV
         {peers["machine"]["opencv"]}. F-score over the {leaves} sequences in which the object disappears, in the runs
-        beside them: {scores}.
+        with other trackers: {scores}.
 
         **Absence is not always noticed**: over four initial boxes of each sequence,
-        {_noticed(found["accuracy-jitter"])} In one run, chance decides: see panda."""
+        {_noticed(found["accuracy-jitter"])} A single run depends on chance: see panda."""
 
 
 def _noticed(record: Record) -> str:
@@ -200,8 +200,8 @@ def _noticed(record: Record) -> str:
 
 def _absence(found: Mapping[str, Record]) -> str:
     return filled(f"""
-        - It does not always notice that an object is gone. In the rendered video of `catstream demo` it does in each
-        of 108 frames; in four runs of each real video, {_noticed(found["accuracy-jitter"])}""")
+        - It does not always report that the object is absent. In the rendered video of `catstream demo` it does in
+        each of 108 frames; in four runs of each real video, {_noticed(found["accuracy-jitter"])}""")
 
 
 def _paper(found: Mapping[str, Record]) -> str:
@@ -219,17 +219,17 @@ def _paper(found: Mapping[str, Record]) -> str:
     rows = (row for row in found["accuracy"]["sequences"] if row["tracker"] == "catstream")
     panda = next(row for row in rows if row["name"] == "TLD_10_panda")
     return f"""
-        `cat25` and `cat10` are the tracker of the paper, implemented from its text. The columns and rows with the name
-        of the paper are its printed figures, on other videos. Most of these sequences are among those on which the
-        defaults were chosen. Chance decides on panda: the success of one pass is {panda["success"]:.3f}. [A
-        plot](images/long_videos.png) shows time and memory over a long video.
+        `cat25` and `cat10` are the tracker of the paper, implemented from its text. The columns and rows "paper" are
+        its printed figures, on other videos. The defaults were chosen on most of these sequences. Panda depends on
+        chance: the success of one pass is {panda["success"]:.3f}. [A plot](images/long_videos.png) shows time and
+        memory over a long video.
 
-        **Two claims of the paper are not confirmed.** The first is that a model learned from a sample of all nodes of
-        the tree is better than one learned from its root: success {trained("our settings", "paper: success")} in the
-        paper. With our settings it is better ({trained("our settings")}), with the paper's own settings it is not
+        **Two claims of the paper are not confirmed.** The first is that training on a sample of all nodes of the tree
+        is better than training on its root: success {trained("our settings", "paper: success")} in the paper. With our
+        settings it is better ({trained("our settings")}), with the paper's own settings it is not
         ({trained("paper's way")}). The second is that a coreset is better than a random sample of the same size:
         {span("sampling", "coreset, paper, n = 512")} against {span("sampling", "random, paper, n = 512")} in the
-        paper, by the share of frames learned from. With the paper's settings it is better
+        paper, by the share of training frames. With the paper's settings it is better
         ({span("sampling", "coreset")} against {span("sampling", "random")}), with ours it is not
         ({span("sampling-ours", "coreset")} against {span("sampling-ours", "random")}). All are single runs:
         `benchmarks/details.md` has the tables."""
@@ -250,12 +250,12 @@ def _figures(found: Mapping[str, Record]) -> str:
     csrt, threaded = rates["csrt, one core"][1], rates["csrt, all cores"][1]
     return filled(f"""
         On {len(found["accuracy"]["sequences"])} public sequences, the area under the success plot (AUC) is
-        **{boxes:.3f}** on average over four initial boxes that differ by at most 2 %. With the true first box it is
-        {ours:.3f}, and that of OpenCV's CSRT is {theirs:.3f}. The defaults were chosen on 20 of the sequences;
+        **{boxes:.3f}** on average over four initial boxes that differ by at most 2 %, and {ours:.3f} from the true
+        initial box (OpenCV's CSRT: {theirs:.3f}). The defaults were chosen on 20 of the sequences;
         [Results](docs/results.md) lists the others separately.
 
         On {speed["machine"]["cores"]} cores, `catstream track` processes **{rest:.0f} frames/s** ({start:.0f} in the
-        first 150 frames), the three processes and the decoding included; `catstream.Tracker` in one process
+        first 150 frames), including the decoding; `catstream.Tracker` in one process
         {one_rest:.0f} ({one_start:.0f}). CSRT processes {csrt:.0f} frames/s on one core and {threaded:.0f} on
         {speed["machine"]["cores"]} (`{speed["command"]}`).""")
 
@@ -285,13 +285,13 @@ _ROBUSTNESS = """
     How much the accuracy depends on the start and on the initial box. Written by `make results` from the records in
     `benchmarks/results`."""
 _STARTS = """
-    OPE is one run of each sequence; TRE starts it from several frames; jitter changes the first box by at most 2 %,
+    OPE is one run of each sequence; TRE starts it from several frames; jitter changes the initial box by at most 2 %,
     and SRE, of which the first 120 frames are tracked, by 10 to 20 %. Each sequence counts once, with the mean over its
     runs; ± is the standard error over the sequences. F is that of the sequences in which the object is absent in some
     frames. A sequence flips if its success differs by more than 0.25 between the jittered boxes. A run is lost if fewer
     than half of the frames in its last quarter have an overlap above 0.5. The check sequences are not used to choose
     anything. The table of attributes has the runs of OPE; [Evaluate on your own
-    video](../docs/how-to/evaluate.md#6-see-what-is-difficult) defines them."""
+    video](../docs/how-to/evaluate.md#5-compare) defines them."""
 _FLEET = """
     Six streams on three nodes of one machine with two cores, and a real S3 server as the store. First, three are live,
     and three are short films, as fast as the cores allow, whose trees are compared, bit for bit, with those without
@@ -315,7 +315,7 @@ _LOAD = """
     Faults (kill -9, SIGSTOP, a full disk) are measured in seconds until recovery. The last table is of runs
     that were killed with all their processes, and resumed."""
 _SEQUENCES = """
-    One run from the first box of each sequence. * is the check list; the defaults were chosen on the first 20."""
+    One run from the initial box of each sequence. * is the check list; the defaults were chosen on the first 20."""
 _PAPER_DETAILS = """
     These experiments use the first 20 sequences, or the five TLD videos among them. "The paper's way" is the tracker of
     the paper, implemented from its text; the rows with the name of the paper are its printed figures, on other videos.

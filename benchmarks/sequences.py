@@ -59,11 +59,11 @@ def sequences(options: argparse.Namespace, prefix: str = "") -> list[Sequence]:
         return [rendered(_QUICK_FRAMES, (320, 240))]
     if not options.data.is_dir():
         raise VideoError(
-            f"there are no sequences at {options.data}: give a folder of sequences with --data, or use --quick"
+            f"there are no sequences at {options.data}: pass a folder of sequences with --data, or use --quick"
         )
     found = [sequence for sequence in find_sequences(options.data) if sequence.name.startswith(prefix)]
     if not found:
-        raise VideoError(f"there is no sequence {prefix}* in {options.data}: give another --data")
+        raise VideoError(f"there is no sequence {prefix}* in {options.data}: pass another --data")
     return found
 
 

@@ -135,7 +135,7 @@ def read_videos(table: Path) -> list[Video]:
 def check_results(videos: Iterable[Video], output: Path) -> None:
     """Raise VideoError if a file of the results of a video exists."""
     for video in videos:
-        _files(video, output, Head(), overwrite=False)
+        _files(video, output, Head(source=str(video.path)), overwrite=False)
 
 
 def track_video(video: Video, output: Path, settings: Settings, progress: Progress) -> Summary:
@@ -215,7 +215,7 @@ def write_summaries(path: Path, summaries: Iterable[Summary]) -> None:
 
 def _files(video: Video, output: Path, head: Head, *, overwrite: bool) -> RunFiles:
     """The files of a video; VideoError if they exist, unless `overwrite`, or cannot be written."""
-    files = RunFiles(Origin(str(video.path), head=head), output, places_of(video.name, Results(output=output)))
+    files = RunFiles(Origin(head), output, places_of(video.name, Results(output=output)))
     files.check(overwrite=overwrite, earlier=[])
     return files
 
@@ -254,7 +254,9 @@ def _tracked(
             progress(frame.number + 1, source.frames)
             yield TrackedFrame([replace(track, source_frame=number) for track in tracker.tracks.values()])
         for frame_number, boxes in begins.items():
-            raise BoxError(f"{listed(boxes)}: frame {frame_number} is not in the video, which has {number + 1} frames")
+            raise BoxError(
+                f"{listed(boxes)}: frame {frame_number} is outside the video: pass a frame from 0 to {number}"
+            )
 
     return head, frames()
 

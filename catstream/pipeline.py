@@ -352,8 +352,8 @@ def _check_exclusive(state: object, resume: object, box: object, model: object) 
         raise SettingsError("state and resume are mutually exclusive (new run / existing run)")
     if resume is not None and not (box is None and model is None):
         raise SettingsError(
-            "a resumed run continues with the objects that it had: omit box and model, and add others with "
-            "catstream set-box or catstream search once it runs"
+            "a resumed run keeps its objects: omit box and model, and add others with catstream set-box or "
+            "catstream search once it runs"
         )
 
 

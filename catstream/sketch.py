@@ -74,8 +74,8 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
 
     def merge(self, other: CoresetPCA) -> Self:
         """Add the rows of another estimator of the same size, with the bound of one into which all were inserted."""
-        for each in (self, other):
-            check_is_fitted(each)
+        for estimator in (self, other):
+            check_is_fitted(estimator)
         tree, p, q = self.tree_.merged(other.tree_), self.n_samples_seen_, other.n_samples_seen_
         shift = other.mean_ - self.mean_
         tree.insert(np.sqrt(p * q / (p + q)) * shift[None])

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import ExitStack, closing, contextmanager, redirect_stderr, redirect_stdout, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from unittest import mock
@@ -330,7 +330,7 @@ def managing():
 
     @contextmanager
     def manage(status, address="", keys=""):
-        with RegistryServer(address, keys, status) as server, _turning(server.turn):
+        with closing(RegistryServer(address, keys, status)) as server, _turning(server.turn):
             yield server.endpoint
 
     return manage

@@ -192,7 +192,7 @@ def test_slow_libraries_are_imported_by_the_functions_that_use_them():
 
 @pytest.mark.parametrize("name", ["compressor", "trainer"])
 def test_a_process_without_a_camera_starts_without_compiled_kernels(name):
-    unused = SLOW | {"asyncio", "cv2", "filterpy", "numba", "sklearn"}
+    unused = SLOW | {"asyncio", "cv2", "numba", "sklearn"}
     check = f"import sys, catstream.processes.{name}; sys.exit({unused!r} & sys.modules.keys() or 0)"
     found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr) == (0, "")

@@ -68,6 +68,11 @@ def test_sdist_and_wheel_are_built_without_a_warning_with_the_page_of_the_view(t
     assert not [name for name in files if name.startswith(("services", "tests"))]
 
 
+def test_every_package_is_installed():
+    packages = {".".join(file.relative_to(ROOT).parent.parts) for file in (ROOT / "catstream").rglob("__init__.py")}
+    assert packages == {*PROJECT["tool"]["setuptools"]["packages"]}
+
+
 def test_an_editable_install_is_found_beside_the_caches_that_an_uninstalled_one_left(tmp_path):
     for name in ("pyproject.toml", "README.md", "LICENSE", "catstream"):
         (tmp_path / name).symlink_to(ROOT / name)

@@ -36,7 +36,7 @@ Progress = Callable[[str, int, int | None], object]
 _BoxesByFrame = Mapping[int, str | Iterable[float] | None]
 KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
 
-_CHECKED = 0.96  #: probability from which a frame is checked
+_CHECKED = 0.97  #: probability from which a frame is checked
 
 
 class NextFrame(NamedTuple):
@@ -167,7 +167,7 @@ class Annotation:
     def rename(self, object: str, name: str) -> None:
         """Rename an object, and keep its passes. ObjectError if the name is not valid, or that of another object."""
         if check_name(name) in self.keyframes:
-            raise ObjectError(f"there is an object {name} already: give another name")
+            raise ObjectError(f"there is an object {name} already: use another name")
         self.keyframes = {name if other == object else other: drawn for other, drawn in self.keyframes.items()}
         passes = self._passes.items()
         self._passes = {task._replace(object=name) if task.object == object else task: one for task, one in passes}
@@ -305,8 +305,7 @@ class Annotation:
                 with errors_about(name):
                     if self._video is None and not 0 <= frame < len(self.frames):
                         raise BoxError(
-                            f"frame {frame} is not in the video, which has {len(self.frames)} frames, numbered from 0: "
-                            f"give a frame from 0 to {len(self.frames) - 1}"
+                            f"frame {frame} is outside the video: pass a frame from 0 to {len(self.frames) - 1}"
                         )
                     if box is not None:
                         box.validated(*self.frames.size)
@@ -391,7 +390,7 @@ def annotate(
     """Track objects between boxes at keyframes of a video, and check the tracks.
 
     Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
-    box is right with a probability of 96 %, see `catstream.annotation.fusion`. Parameters and errors are those of
+    box is right with a probability of 97 %, see `catstream.annotation.fusion`. Parameters and errors are those of
     `Annotation`.
     """
     if not boxes:

@@ -63,7 +63,7 @@ def open_frames(
         If the source is live or cannot be read.
     """
     if is_live(source):
-        raise VideoError(f"{without_password(str(source))} is live, and has no frame to return to: record it to a file")
+        raise VideoError(f"cannot annotate a live source ({without_password(str(source))}): record it to a file first")
     video = open_source(source, part=part, settings=settings.run)
     return video, DecodedFrames(folder / "frames", video.size, [], video.rate, video.name)
 
@@ -92,6 +92,6 @@ def decode(video: Source, frames: DecodedFrames, progress: Callable[[int, int | 
 def _check_space(folder: Path, required: int) -> None:
     if required > (free := shutil.disk_usage(folder).free):
         raise VideoError(
-            f"the decoded frames need {required / 1e9:.1f} GB in {str(folder.parent)!r}, which has {free / 1e9:.1f} GB "
-            "free: set TMPDIR to a larger disk, or cut the video into parts"
+            f"not enough space for the decoded frames in {str(folder.parent)!r} ({required / 1e9:.1f} GB required, "
+            f"{free / 1e9:.1f} GB free): set TMPDIR to a larger disk, or split the video"
         )

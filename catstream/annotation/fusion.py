@@ -3,7 +3,8 @@
 Each pass votes with a weight: it falls linearly from 1 at its own keyframe to 0 at the other one, and is four times as
 high if the pass arrives at the box of the other keyframe, which is evidence that it did not lose the object before. The
 box with the highest weighted sum of IoU wins, and is averaged with those that overlap it. The probability is a logistic
-regression.
+regression of two features: the share of votes for the winner, and its lowest IoU with the passes of the other direction
+in the frames around. Where only one direction was tracked, the second one is 0.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from catstream.base.arrays import Bool, Float64
 _ARRIVAL_WEIGHT = 4.0
 _SAME = 0.5  #: IoU of two boxes that count as the same
 
-#: Weights of the logistic regression: bias, then those of the features in `fuse`. They were fitted on sixteen sequences
-#: with one to eight boxes, each sequence with the same weight; the last one was lowered, so that frames with passes in
-#: only one direction are never checked.
-_LOGISTIC = np.array([-6.3, 5.75, 2.1, 5.2, -2.5])
+#: Weights of the logistic regression: bias, then those of the features in `fuse`. They were fitted on 29 sequences with
+#: one to four boxes, each sequence with the same weight.
+_LOGISTIC = np.array([-4.4, 6.3, 3.8])
+_AROUND = 5  #: frames before and after a frame, whose agreement counts, too
 
 
 def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) -> tuple[Float64, Float64, Float64]:
@@ -49,15 +50,9 @@ def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) ->
     best, frames = votes.argmax(axis=0), np.arange(count)
     agreement = shared[best, :, frames].T  # of the winner with each pass, (passes, frames)
     merged = _averaged(boxes, np.where(agreement > _SAME, weights, 0.0), best)
-    opposite = forward[:, None] != forward[best]
-    features = np.column_stack(
-        [
-            votes.max(axis=0) / weights.sum(axis=0),
-            np.where(opposite, agreement, 0.0).max(axis=0),
-            scores.clip(0, 1).min(axis=0),
-            np.full(count, forward.all() or not forward.any()),
-        ]
-    )
+    opposite = np.where(forward[:, None] != forward[best], agreement, 0.0).max(axis=0)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(opposite, _AROUND, "edge"), 2 * _AROUND + 1).min(axis=1)
+    features = np.column_stack([votes.max(axis=0) / weights.sum(axis=0), around])
     probabilities = 1 / (1 + np.exp(-_LOGISTIC[0] - features @ _LOGISTIC[1:]))
     return merged, probabilities, scores[best, frames]
 

@@ -36,7 +36,7 @@ class Session:
 
     Attributes
     ----------
-    revision : number of changes of what follows
+    revision : number of changes of the keyframes and of what follows
     decoded : whether the frames of the video are decoded
     tracks : the newest tracks of the objects, by name
     next_frames : frames to look at next, but those in stretches that are tracked at present
@@ -130,6 +130,7 @@ class Session:
 
     def _wake(self) -> None:
         with self.lock:
+            self.revision += 1
             self._wakes = True
             self.lock.notify()
 
@@ -183,9 +184,14 @@ class Session:
         return (task.object, task.start) != self._newest and (task.object, task.stop) != self._newest, task.frames
 
     def _is_tracked(self, following: NextFrame) -> bool:
-        """Whether passes are missing that may check the frame; none can at an end of the video without a box."""
+        """Whether a missing pass may check the frame soon: none can at an end of the video without a box."""
         frame, ends = following.frame, (0, len(self.annotation.frames) - 1)
-        around = (task for task in self._missing if task.object == following.object)
+        soon = (task for task in self._missing if task.object == following.object and not _is_refinement(task))
         return frame not in ends and any(
-            min(each.start, each.stop) <= frame <= max(each.start, each.stop) for each in around
+            min(task.start, task.stop) <= frame <= max(task.start, task.stop) for task in soon
         )
+
+
+def _is_refinement(task: Task) -> bool:
+    """Whether it is a long second pass, in which a person need not wait to add a box."""
+    return task.use_memory and task.frames > _LONG

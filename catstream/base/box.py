@@ -129,7 +129,7 @@ class Box(_Rectangle):
             If a number is not finite, or the box has no area.
         """
         if not all(math.isfinite(value) for value in self):
-            raise BoxError(f"a box needs four finite numbers, got {self}: give x,y,w,h in pixels")
+            raise BoxError(f"a box needs four finite numbers, got {self}: pass x,y,w,h in pixels")
         if self.w < 2 or self.h < 2:
             raise BoxError(f"a box needs a width and a height of at least 2 pixels, got {self.w:g} x {self.h:g}")
         return self
@@ -147,14 +147,14 @@ class Box(_Rectangle):
         # With its centre inside the frame, such a box covers the whole frame: it does not select an object.
         if self.w > 2 * width or self.h > 2 * height:
             raise BoxError(
-                f"a box may be twice as wide and high as the frame of {width} x {height} pixels, got "
-                f"{self.w:g} x {self.h:g}: draw it tight around the object"
+                f"the box of {self.w:g} x {self.h:g} pixels is over twice as large as the frame of {width} x {height}: "
+                "draw it tightly around the object"
             )
         x, y = self.centre
         if not (0 <= x < width and 0 <= y < height):
             raise BoxError(
-                f"the box {self} has its centre at ({x:g}, {y:g}), outside the frame of "
-                f"{width} x {height} pixels: give x,y,w,h with x from the left and y from the top"
+                f"the box {self} is centred outside the frame of {width} x {height} pixels: pass x,y,w,h with x from "
+                "the left and y from the top"
             )
         return self
 

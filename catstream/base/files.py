@@ -91,7 +91,7 @@ def writing(path: str | os.PathLike[str], kind: type[CatstreamError] = ServiceEr
     except BrokenPipeError:  # the reader of standard output has ended, as `head` does: not an error of catstream
         raise
     except OSError as error:
-        raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): give another place") from None
+        raise kind(f"cannot write {os.fspath(path)!r} ({error.strerror}): use another folder") from None
 
 
 def check_file(
@@ -102,7 +102,7 @@ def check_file(
     The folder `made` is made before the file, if it does not exist.
     """
     if path.exists() and not overwrite:
-        raise kind(f"{path} exists already: replace it with --overwrite, or give another name")
+        raise kind(f"{path} exists already: replace it with --overwrite, or use another name")
     folder = path.parent.absolute()
     if made is not None and folder == made.absolute():
         folder = next(parent for parent in (folder, *folder.parents) if parent.exists())
@@ -112,7 +112,7 @@ def check_file(
     except OSError:
         is_writable = False
     if not is_writable:
-        raise kind(f"cannot write {path}: give a file in a folder that exists and that you may write to")
+        raise kind(f"cannot write {path}: pass a file in an existing folder that you may write to")
 
 
 @contextlib.contextmanager

@@ -107,6 +107,6 @@ def check_count(count: int, most: int) -> None:
     """Raise ObjectError if there are more objects than allowed."""
     if count > most:
         raise ObjectError(
-            f"{count} objects are more than {most}: follow fewer, or raise the limit "
+            f"too many objects ({count}, limit {most}): track fewer, or raise the limit "
             f"(--set run.max_objects={count}, up to 64)"
         )

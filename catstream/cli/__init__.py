@@ -118,7 +118,7 @@ def main() -> None:
     except PermissionError as error:
         if error.filename is None:  # it is about no file
             raise
-        complain(f"cannot use {error.filename!r} ({error.strerror}): change its permissions, or give another path")
+        complain(f"cannot use {error.filename!r} ({error.strerror}): change its permissions, or use another path")
         sys.exit(1)
     except OSError as error:
         if error.errno != errno.ENOSPC:

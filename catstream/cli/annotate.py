@@ -67,7 +67,7 @@ def annotate(
 
     Each stretch between two keyframes is tracked from both of its ends. A frame
     is checked if the two agree so well that its box is right with a probability
-    of 96 %.
+    of 97 %.
 
     \b
     OUTPUT
@@ -204,8 +204,7 @@ class _ResultFiles:
         frames = self._annotation.frames
         changed = tuple(self._annotation.settings.changed())
         head = Head(source=self._video, size=frames.size, rate=frames.rate, frames=len(frames), settings=changed)
-        origin = Origin(self._video, image_rate=frames.rate, head=head)
-        return RunFiles(origin, self.folder, places_of(frames.name, Results(output=self.folder)))
+        return RunFiles(Origin(head), self.folder, places_of(frames.name, Results(output=self.folder)))
 
 
 def _report(annotation: Annotation) -> None:

@@ -114,7 +114,7 @@ with_wait = click.option(
     default=30.0,
     show_default=True,
     metavar="SECONDS",
-    help="Longest wait for the pipeline at --endpoint.",
+    help="Seconds to wait for the pipeline at --endpoint.",
 )
 
 
@@ -219,12 +219,12 @@ def status(address: Address, as_json: bool, wait: float) -> None:
     """Show the state of a running pipeline.
 
     The state is running, waiting (for a box), paused, or lost (the source). The
-    exit code is 0 if all three processes sent a health report, in each of these
-    states, else 1, so that it can be the health check of a container.
+    exit status is 0 if all three processes sent a health report, else 1, so that
+    the command can be the health check of a container.
 
-    "learning" are the messages that the compressor has not received, or not
-    stored; "rejected" those that do not conform to the protocol; "reports" the
-    age of the last health report of each process.
+    "learning" is the backlog: messages that the compressor has not received or
+    not stored; "rejected" counts invalid messages; "reports" is the age of the
+    last health report of each process.
 
     \b
     EXAMPLES
@@ -385,16 +385,15 @@ def _with_control(command: Callable[..., str]) -> Callable[..., None]:
 
 @click.command("set-box", context_settings={"ignore_unknown_options": True})  # -3,40,60,60 is a box
 @with_boxes
-@click.option("--keep", is_flag=True, help="Same object: keep what was learned.")
+@click.option("--keep", is_flag=True, help="Correct the same object: keep its model.")
 @_with_control
 def set_box(pipeline: Control, boxes: dict[str, Box], keep: bool) -> str:
     """Set the box of an object, or of several, in a running pipeline.
 
-    X,Y,W,H is the box in pixels in the next frame that is tracked; during a
-    pause of a file, in the frame that is held. A new NAME begins an object
-    beside the others; an object that has this name already is replaced, and
-    everything learned of it is dropped. Without NAME, the only object is meant.
-    Several objects begin in the same frame, or, if a box is invalid, none.
+    X,Y,W,H is the box in pixels in the next frame; while a file is paused, in
+    the frame at which it is held. A new NAME adds an object; an existing one is
+    replaced, and its model is dropped. NAME may be omitted if there is only one
+    object. Several objects begin in the same frame, or, if a box is invalid, none.
 
     \b
     EXAMPLES
@@ -416,9 +415,9 @@ def set_box(pipeline: Control, boxes: dict[str, Box], keep: bool) -> str:
 def search(pipeline: Control, file: str) -> str:
     """Search for the object of a saved model in a running pipeline.
 
-    The object is absent until it is found in the whole frame, and learning
-    continues from FILE, which `catstream save` wrote. An object that has the
-    NAME already is replaced. Without NAME, the only object is meant.
+    The object is absent until it is found in the whole frame; training continues
+    from FILE, written by `catstream save`. An existing object NAME is replaced.
+    NAME may be omitted if there is only one object.
 
     \b
     EXAMPLES
@@ -435,8 +434,8 @@ def search(pipeline: Control, file: str) -> str:
 def forget(pipeline: Control, name: str) -> str:
     """Stop tracking an object in a running pipeline.
 
-    Everything learned of it is dropped. Without NAME, the only object is meant.
-    If no object is left, the run waits for `catstream set-box`.
+    Its model and coreset trees are dropped. NAME may be omitted if there is only
+    one object. Without any object, the run waits for `catstream set-box`.
 
     \b
     EXAMPLES
@@ -479,11 +478,11 @@ def resume(pipeline: Control) -> str:
 @with_overwrite
 @_with_pipeline
 def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: bool) -> None:
-    """Save everything that a pipeline has learned of an object to FILE.
+    """Save the model and the coreset trees of an object to FILE.
 
-    `catstream track SOURCE --model FILE` finds the object and continues to
-    learn. With --state, the newest checkpoint in that folder is saved, and no
-    pipeline has to run.
+    `catstream track SOURCE --model FILE` finds the object and continues its
+    training. With --state, the newest checkpoint in that folder is saved, without
+    a running pipeline.
 
     \b
     EXAMPLES

@@ -75,7 +75,7 @@ def allow_(folder: Path, name: str, role: Role, output: Path | None, public: str
       catstream keys allow keys desk --role control --public 'Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID'
     """
     if (output is None) == (public is None):
-        raise click.UsageError("give --output, a folder for the new keys of the client, or --public, the key it has")
+        raise click.UsageError("pass --output DIR for a new key pair, or --public KEY for the key pair of the client")
     allow(folder, name, role, output, public)
     click.echo(f"{name} may connect as {role}" + (f" with the keys in {output}: transfer them to it" if output else ""))
 

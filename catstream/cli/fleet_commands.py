@@ -145,8 +145,8 @@ def _has_started(stream: StreamStatus) -> bool:
 def status(address: Address, as_json: bool) -> None:
     """Show all streams and nodes of a fleet.
 
-    The exit code is 1 if something is wrong with a stream: each line below the
-    table says what, for example that its source cannot be opened.
+    The exit status is 1 if a stream has a problem, which is printed below the
+    table, for example that its source cannot be opened.
 
     \b
     EXAMPLES
@@ -208,22 +208,22 @@ def add(
 
 @fleet.command()
 @click.argument("names", nargs=-1, required=True)
-@click.option("--forget", is_flag=True, help="Remove what they have learned, too.")
+@click.option("--forget", is_flag=True, help="Also remove their models.")
 @with_fleet
 def remove(running: Fleet, names: tuple[str, ...], forget: bool) -> None:
-    """Remove streams; what they have learned stays in the store."""
+    """Remove streams; their models stay in the store."""
     for line in running.remove(*names, forget=forget):
         click.echo(line)
 
 
-@fleet.command(short_help="Move all streams from a node.")
+@fleet.command(short_help="Move all streams away from a node.")
 @click.argument("node")
-@click.option("--undo", is_flag=True, help="Let the node take streams again.")
+@click.option("--undo", is_flag=True, help="Allow streams on the node again.")
 @with_fleet
 def drain(running: Fleet, node: str, undo: bool) -> None:
-    """Move all streams from a NODE and place none there, before it is switched off.
+    """Move all streams away from a NODE, and schedule none there.
 
-    Streams wait if the other nodes have no room for them.
+    Streams wait if the other nodes have no free cores for them.
     """
     click.echo(running.drain(node, undo=undo))
 
@@ -267,10 +267,10 @@ def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path
 @fleet.command()
 @with_fleet
 def down(running: Fleet) -> None:
-    """Stop all streams after their state was stored, and end the fleet.
+    """Store the state of all streams, stop them, and end the fleet.
 
     On this machine, Ray ends with the fleet. On a cluster, Ray stays.
-    `catstream fleet up` continues from the last states. The exit code is 1 if
+    `catstream fleet up` continues from the last states. The exit status is 1 if
     the last state of a stream could not be stored.
     """
     _down(running)

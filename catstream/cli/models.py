@@ -30,7 +30,7 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
     try:
         low, high = map(float, text.split(","))
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not two numbers: for example 0.5,2") from None
+        raise click.BadParameter(f"expected two numbers such as 0.5,2, got {text!r}") from None
     return low, high
 
 
@@ -48,12 +48,17 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
     "--every", type=NumberRange(0, 3600), default=0.2, show_default=True, help="Seconds of a video between two frames."
 )
 @click.option(
-    "--sizes", default="0.4,2.5", show_default=True, callback=_sizes, metavar="LOW,HIGH", help="Sizes to search."
+    "--sizes",
+    default="0.4,2.5",
+    show_default=True,
+    callback=_sizes,
+    metavar="LOW,HIGH",
+    help="Range of sizes, relative to the trained size.",
 )
 @click.option(
-    "--network", type=PATH, metavar="FILE", help="The file features.network that the models were learned with."
+    "--network", type=PATH, metavar="FILE", help="Network (features.network) that the models were trained with."
 )
-@click.option("--fps", type=float, default=25.0, show_default=True, help="Images of a folder per second.")
+@click.option("--fps", type=float, default=25.0, show_default=True, help="Frames per second of a folder of images.")
 @with_skip_damaged
 def find(
     paths: tuple[Path, ...],
@@ -176,15 +181,14 @@ def _print(results: list[FileResult], report: Path) -> None:
 @click.argument("files", nargs=-1, required=True, type=PATH, metavar="FILE...")
 @click.option("-o", "--output", required=True, type=PATH, metavar="FILE", help="File to write.")
 @with_overwrite
-@click.option("--force", is_flag=True, help="Merge models although their objects look different.")
+@click.option("--force", is_flag=True, help="Merge models even if their objects look different.")
 def merge(files: tuple[Path, ...], output: Path, overwrite: bool, force: bool) -> None:
     """Merge saved models of one object, for example from two cameras.
 
-    The coreset trees of all files are merged, and a model is trained from them.
-    Its scores are those of one tree that has seen all the videos, within the
-    bound of the coreset. The files must be of the same object and settings, and
-    no two of them may contain the same frames. Models that look like those of
-    different objects are rejected; in case of doubt there is a warning.
+    The coreset trees are merged, and a model is trained from them. Its scores are
+    those of one tree of all the videos, within the error bound of the coreset.
+    The files must have the same object and settings, and no frames in common.
+    Models of dissimilar objects are rejected, or merged with a warning.
 
     \b
     EXAMPLES

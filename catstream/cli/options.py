@@ -58,7 +58,7 @@ def _collect(flag: str, convert: _Converter) -> Callable[..., object]:
             if name in values:
                 earlier = f"{name}={values[name]}" if name else values[name]
                 hint = "its own name" if name else f"a name, NAME={value}"
-                raise ObjectError(f"{flag}{earlier} and {flag}{text}: give each object {hint}")
+                raise ObjectError(f"duplicate object ({flag}{earlier}, {flag}{text}): give each object {hint}")
             values[name] = value
         return convert(values)
 
@@ -119,7 +119,7 @@ with_part = combined(
     "part",
     lambda start, end, stride: slice(start, end, stride),
     click.option("--start", type=click.IntRange(0), metavar="N", help="First frame, for a file or folder."),
-    click.option("--end", type=click.IntRange(0), metavar="N", help="Frame before which to stop."),
+    click.option("--end", type=click.IntRange(0), metavar="N", help="Stop before this frame."),
     click.option("--stride", type=click.IntRange(1), metavar="N", help="Track only every N-th frame."),
 )
 
@@ -129,7 +129,7 @@ with_overrides = combined(
     lambda file, preset, pairs: Settings.collect(preset=preset, file=file, overrides=pairs),
     click.option("--settings", "file", type=PATH, help="TOML file of settings."),
     click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings."),
-    click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="One setting; may be repeated."),
+    click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="Set one setting; repeatable."),
 )
 
 #: Adds the same options, as the argument `settings`: all settings, the others by default.
@@ -147,5 +147,5 @@ with_reading = combined(
     _reading,
     click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default."),
     with_skip_damaged,
-    click.option("--resize", is_flag=True, help="Scale images of another size to that of the first one."),
+    click.option("--resize", is_flag=True, help="Scale frames of another size to the first size."),
 )

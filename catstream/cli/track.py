@@ -52,8 +52,8 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @click.command()
 @click.argument("source", required=False)
 @click.option("--output", type=PATH, help="Folder for the results.")
-@click.option("--video/--no-video", default=None, help="Write OUTPUT/NAME.mp4 too, with boxes drawn in.")
-@click.option("--write", multiple=True, metavar="DEST", help="Also write the tracks to DEST; may be repeated.")
+@click.option("--video/--no-video", default=None, help="Also write the annotated video OUTPUT/NAME.mp4.")
+@click.option("--write", multiple=True, metavar="DEST", help="Also write the tracks to DEST; repeatable.")
 @click.option("--no-write", is_flag=True, help="With --resume: drop the destinations of --write.")
 @with_sink_options
 @with_overwrite
@@ -69,8 +69,8 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
 @click.option("--paused", is_flag=True, help="Start paused, until `catstream resume`.")
-@click.option("--state", type=PATH, help="Folder for checkpoints, to resume the run from.")
-@click.option("--resume", type=FOLDER, help="Resume the run of such a folder.")
+@click.option("--state", type=PATH, help="Write checkpoints to this folder.")
+@click.option("--resume", type=FOLDER, help="Resume the run of a --state folder.")
 @click.option("--continue", "continues", is_flag=True, help="Resume the run in --state if there is one, or start it.")
 @with_object
 @with_part
@@ -80,30 +80,26 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 def track(**options: Any) -> None:
     """Track one or several objects in a video.
 
-    An object is specified by its box in the first frame, or by a saved model.
-    Without one, tracking starts after `catstream set-box`, or after a box is
-    drawn on the web page.
-
-    Several objects have names: --box NAME=X,Y,W,H or --model NAME=FILE for each
-    of them. More can be added, and others forgotten, during the run:
-    `catstream set-box NAME=X,Y,W,H` and `catstream forget NAME`.
+    Pass the box of an object in the first frame, or a saved model; otherwise
+    tracking starts after `catstream set-box`, or when a box is drawn on the web
+    page. Name several objects: --box NAME=X,Y,W,H or --model NAME=FILE for each.
+    `catstream set-box` and `catstream forget` add and remove objects during the
+    run.
 
     SOURCE is a video file, a folder of images, a pattern like
-    images/%05d.png, a camera (0 or /dev/video0), or a stream (rtsp://... or
-    http://... for MJPEG). Cameras and streams are live: only the newest frame
-    is tracked, the frames before it are skipped and counted, and a lost source
-    is opened again until it is available. demo:1 is a live source without a
-    camera: see `catstream demo`.
+    images/%05d.png, a camera (0 or /dev/video0), a stream (rtsp://... or
+    http://... for MJPEG), or demo:1, a rendered live source. Live sources are
+    tracked in real time: older frames are skipped and counted, and a lost source
+    is reconnected.
 
-    The detector, the compressor and the trainer run as separate processes.
-    Ctrl-C, SIGTERM and the loss of the terminal end them; the results so far
-    are kept.
+    Ctrl-C, SIGTERM and the loss of the terminal end the run; the results so far
+    are complete.
 
     With --state, a checkpoint is written every two seconds. After a power failure,
-    a crash or Ctrl-C, --resume continues the run with the objects that it had,
-    and with the same source, settings and results unless options change them.
-    --state with --continue resumes the run if there is one in the folder, and
-    starts it otherwise: the same line for a service at each of its starts.
+    a crash or Ctrl-C, --resume continues the run with the same objects, and with
+    the same source, settings and results unless options change them. For a
+    service, --state with --continue resumes the run in the folder if there is
+    one, and starts it otherwise.
 
     \b
     Writes
@@ -112,17 +108,17 @@ def track(**options: Any) -> None:
                            score, model version, object, processing time
       OUTPUT/NAME.mp4      with --video
 
-    NAME is the name of the source, so that several sources can share a folder;
-    a/walk.mp4 and b/walk.mp4 need a folder each. `catstream export` makes files
-    of annotation tools and benchmarks, and others, from these.
+    NAME is the name of the source: a/walk.mp4 and b/walk.mp4 need a folder each.
+    `catstream export` converts these files to the formats of annotation tools
+    and benchmarks.
 
-    --write DEST, may be repeated; the suffix selects the format
+    --write DEST, repeatable; the suffix selects the format
 
     {table}
 
-    Existing files are not replaced without --overwrite. A destination on the
-    network that is away or slow does not slow the run down: what it misses is
-    counted. --zone and the options after it are for mqtt:// and http://.
+    Existing files are not replaced without --overwrite. The run does not wait for
+    destinations on the network: losses are counted. --zone and the options after
+    it are for mqtt:// and http://.
 
     \b
     EXAMPLES
@@ -288,9 +284,7 @@ class _Run:
             settings=tuple(pipeline.settings.changed()),
             boxes=pipeline.boxes,
         )
-        origin = Origin(
-            pipeline.source, part, settings.image_rate, Address(keys=settings.keys), options=results.options, head=head
-        )
+        origin = Origin(head, Address(keys=settings.keys), results.options)
         files = RunFiles(origin, results.output, places)
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
         if folder := self.state or self.resume:
@@ -315,7 +309,7 @@ class _Run:
             with ExitStack() as closed_last, pipeline:
                 files.make_folder()
                 if self.continues and self.resume is not None:
-                    console.print(f"the run in {self.resume} continues with the objects that it had")
+                    console.print(f"the resumed run in {self.resume} keeps its objects")
                 if self.view is not None:
                     self._serve(pipeline, self.view, closed_last, console)
                 with progress.line(console) as line:
@@ -391,7 +385,7 @@ def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
     ]
     doubts += [
         f"{name and name + ': '}a box of {w:g}x{h:g} in a frame of {width}x{height}: "
-        f"if {x:g},{y:g},{w:g},{h:g} are two corners, give {x:g},{y:g},{w - x:g},{h - y:g}"
+        f"if {x:g},{y:g},{w:g},{h:g} are two corners, pass {x:g},{y:g},{w - x:g},{h - y:g}"
         for name, (x, y, w, h) in boxes.items()
         if 0 <= x < w <= width
         and 0 <= y < h <= height

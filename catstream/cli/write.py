@@ -74,7 +74,7 @@ with_sink_options = combined(
         zone, margin, when[0], when[1], rate, picture, secret and secret.absolute()
     ),
     click.option(
-        "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A zone, by its corners in pixels."
+        "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A polygon in pixels; repeatable."
     ),
     click.option(
         "--zone-margin",
@@ -82,24 +82,24 @@ with_sink_options = combined(
         type=NumberRange(0, 10000),
         default=10,
         metavar="PIXELS",
-        help="An object has left a zone if it is farther outside than this; 10 by default.",
+        help="Hysteresis: an object leaves a zone only farther outside than this; default: 10.",
     ),
     click.option(
         "--when",
         default=",".join(KINDS),
         metavar="EVENT,...",
         callback=_when,
-        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, by default 2.",
+        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, default: 2.",
     ),
     click.option(
         "--rate",
         type=NumberRange(0, 1000, min_open=True),
         default=1,
         metavar="N",
-        help="To mqtt://: states of each object per second; 1 by default.",
+        help="States of each object per second, for mqtt://; default: 1.",
     ),
     click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
-    click.option("--secret-file", "secret", type=PATH, help="File of a key, with which events to http:// are signed."),
+    click.option("--secret-file", "secret", type=PATH, help="File with the key that signs events, for http://."),
 )
 
 
@@ -158,15 +158,14 @@ def _head(address: Address) -> Head:
 def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address: Address, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
-    Each track is written when it arrives, and stays written however the command
-    ends. The pipeline does not wait; missed tracks are counted. For complete
-    files use `catstream track --output` or `--write`. If another run starts at
-    the same endpoint, because the first one was killed, the command ends.
+    Each track is written when it arrives. The pipeline does not wait; missed
+    tracks are counted. For complete files use `catstream track --output` or
+    `--write`. If another run starts at the same endpoint, the command ends.
 
     {table}
 
-    A video has the small pictures that the pipeline sends to its page, with
-    their tracks. For CVAT, COCO, MOT and others: `catstream export`.
+    A video contains the small pictures of the web page. For CVAT, COCO, MOT and
+    others: `catstream export`.
 
     \b
     EXAMPLES
@@ -187,7 +186,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
     with subscribe(address, "tracks") as tracks:
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(address, wait)
-            origin = Origin(address=address, options=options, head=_head(address))
+            origin = Origin(_head(address), address, options, attached=True)
             check_options(options, places, origin.head.size)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]

@@ -119,8 +119,7 @@ def _local(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
     if fleet not in registries:
         name, others = f"{fleet!r} " if fleet else "", f", only {names}" if names else ""
         raise ServiceError(
-            f"no fleet {name}of yours is running{others}: start it (catstream fleet up), wait until it has started, or "
-            "pass HOST:PORT of a registry"
+            f"no fleet {name}of yours is running{others}: start it (catstream fleet up), or pass the registry HOST:PORT"
         )
     return fleet, registries[fleet] if keys is None else replace(registries[fleet], keys=keys)
 
@@ -129,7 +128,7 @@ def _status(answer: Listing) -> FleetStatus:
     try:
         return msgspec.json.decode(answer.fleet, type=FleetStatus)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise ServiceError(f"the registry has sent no state of a fleet ({error}): run the same catstream") from None
+        raise ServiceError(f"invalid answer of the registry ({error}): use the same version of catstream") from None
 
 
 def described(status: StreamStatus) -> str:

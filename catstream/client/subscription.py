@@ -231,7 +231,7 @@ class Subscription(Generic[Message]):
         check_not_forked(self._generation)  # first: another thread of the original may have held the lock
         with self._turn:
             if self._closed:
-                raise ServiceError("the subscription was closed, perhaps by another thread or task: make another one")
+                raise ServiceError("the subscription is closed (perhaps by another thread or task): create a new one")
             if (message := self._receive()) is not None:
                 self._has_run = True
                 return message

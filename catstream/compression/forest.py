@@ -76,8 +76,8 @@ class Forest:
             return []
         if features.seq != self.seq + 1:
             raise ProtocolError(
-                f"features {features.seq} came after {self.seq}: {features.seq - self.seq - 1} are missing, "
-                "send from the one after the last acknowledged"
+                f"features {features.seq} follow {self.seq}, {features.seq - self.seq - 1} are missing: "
+                "retransmit all after the last acknowledged one"
             )
         compressors: dict[str, Compressor] = {}
         for name, part in features.objects.items():

@@ -212,5 +212,6 @@ def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, l
                 scores[row, column] = -np.inf
         row, column = map(int, np.unravel_index(scores.argmax(), scores.shape))
         if scores[row, column] > 0:
-            return Detection(float(scores[row, column]), detection.around.window(row, column), detection.around)
+            # Elsewhere in the frame, it is redetected there too: its object is not trusted.
+            return replace(detection, score=float(scores[row, column]), window=detection.around.window(row, column))
     return replace(detection, score=0.0, redetected=False)

@@ -86,7 +86,7 @@ class Sequence:
                 if not missing:
                     return
         raise VideoError(
-            f"{str(self.path)!r} has {len(self.boxes)} boxes, but {counted(missing, 'frame')} too few: "
+            f"{str(self.path)!r} has fewer frames than boxes ({len(self.boxes) - missing} of {len(self.boxes)}): "
             "each line of the ground truth needs a frame"
         )
 

@@ -130,7 +130,7 @@ def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[Keyfra
     usable = [frame for frame in range(len(truth)) if _is_usable(truth[frame], size)]
     first = next((frame for frame in usable if _box(truth[frame]) is not None), None)
     if first is None:
-        raise VideoError("tracking can start with no box of the ground truth: use another sequence")
+        raise VideoError("tracking cannot start at any box of the ground truth: use another sequence")
     part = slice(sequence.begin, sequence.begin + len(sequence))
     drawn = {first: _box(truth[first])}
     with Annotation(sequence.path, drawn, settings, part=part, jobs=1) as annotation:

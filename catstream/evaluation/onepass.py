@@ -158,4 +158,4 @@ def _validate_names(sequences: list[Sequence], trackers: list[str], peer_models:
     names = [sequence.name for sequence in sequences]
     for name in names:
         if names.count(name) > 1:
-            raise VideoError(f"two sequences are named {name!r}, and so would be their results: rename a folder")
+            raise VideoError(f"duplicate sequence name {name!r}: rename one of the folders")

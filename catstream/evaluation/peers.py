@@ -93,12 +93,11 @@ def _parameters(name: str, models: Path | None) -> Any:
     files = MODELS[name]
     if models is None:
         needed = " and ".join(files.values())
-        raise SettingsError(f"the tracker {name!r} needs {needed}: give the folder with --peer-models")
+        raise SettingsError(f"the tracker {name!r} needs {needed}: pass their folder with --peer-models")
     missing = [file for file in files.values() if not (models / file).is_file()]
     if missing:
         raise SettingsError(
-            f"the tracker {name!r} needs {' and '.join(files.values())}, but {str(models)!r} has no "
-            f"{' and no '.join(missing)}: put it there"
+            f"missing model file of the tracker {name!r} in {str(models)!r}: add {' and '.join(missing)}"
         )
     parameters = getattr(cv2, f"{PEERS[name]}_Params")()
     for parameter, file in files.items():

@@ -83,7 +83,7 @@ def prepare_folder(output: Path, settings: Settings) -> None:
             if changed:
                 raise SettingsError(
                     f"the runs in {str(output)!r} were made with other settings or versions ({', '.join(changed)}): "
-                    "give another --output, or remove that folder"
+                    "pass another --output, or remove that folder"
                 )
         else:
             file.parent.mkdir(parents=True, exist_ok=True)

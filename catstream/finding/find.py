@@ -254,7 +254,7 @@ class Search:
     def __post_init__(self) -> None:
         low, high = self.sizes
         if not 0 < low <= high < 100:
-            raise SettingsError(f"expected two positive sizes, the smaller one first, got {low:g},{high:g}: give 0.5,2")
+            raise SettingsError(f"expected the smallest and the largest size, got {low:g},{high:g}: for example 0.5,2")
         descriptor = descriptor_of(Settings(features={"network": self.network}))
         for name, saved in self.models.items():
             saved.check_network(digest_of(descriptor), f"the model of {name!r}", "this search has")
@@ -347,10 +347,10 @@ def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[s
         saved = model if isinstance(model, SavedModel) else SavedModel.load(model)
         name = saved.object or (f"object-{number}" if isinstance(model, SavedModel) else Path(model).stem)
         if name in named:
-            raise SettingsError(f"two models are named {name!r}: rename the file of one, or save it under another name")
+            raise SettingsError(f"duplicate model name {name!r}: rename the file of one, or save it under another name")
         named[name] = saved
     if not named:
-        raise SettingsError("a search needs at least one model: `catstream save` and `track --save-model` write one")
+        raise SettingsError("missing model: pass a saved model (`catstream save`, `catstream track --save-model`)")
     return named
 
 

@@ -146,7 +146,7 @@ class Stream:
         claim = self._store.stream(self._spec.name).claim(f"{self._status.node} process {os.getpid()}")
         self._store_trouble = ""
         shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
-        self._has_tracked, self._files = False, set()
+        self._has_tracked, self._files, ended = False, set(), False
         facts: Metadata = claim.state.facts if claim.state is not None else {}
         if claim.state is not None and facts["ended"]:
             if facts["digest"] == self._spec.digest:
@@ -171,16 +171,13 @@ class Stream:
             storing.start()
             stack.callback(storing.join)
             stack.callback(over.set)
-            ended = self._take_all(pipeline)
+            for tracks in pipeline.by_frame(_TRACKS_SECONDS):
+                self._take(pipeline, tracks)
+                if self._stop.is_set():
+                    break
+            else:
+                ended = True
         self._write_last(claim, ended=ended)
-
-    def _take_all(self, pipeline: Pipeline) -> bool:
-        """Take the tracks until the source ends, or the stream is to stop; returns whether the source has ended."""
-        for tracks in pipeline.by_frame(_TRACKS_SECONDS):
-            self._take(pipeline, tracks)
-            if self._stop.is_set():
-                return False
-        return True
 
     def _write_last(self, claim: Claim, *, ended: bool) -> None:
         """Store the last state. A stream has ended once that is done, so it is tried again until it is."""

@@ -284,7 +284,7 @@ class Controller:
         if is_superseded:
             actor.happened = "superseded"
         elif actor.status.state == "ended":
-            actor.happened, actor.ended = "ended", actor.digest
+            actor.happened, actor.ended = "ended", actor.order.partition("/")[0]
 
     def _step(self, name: str, actor: Actor) -> None:
         """Do what the table says for what has happened to a stream."""

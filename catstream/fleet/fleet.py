@@ -128,7 +128,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         What runs and is unchanged is not touched. If the store cannot be used, nothing is started or changed.
         """
         if self._spec is None:
-            raise FleetError("there are no streams: give a file, see docs/how-to/fleet.md")
+            raise FleetError("missing fleet file: the fleet has no streams yet; pass a file as in docs/how-to/fleet.md")
         spec = self._spec
         if not spec.store:
             if self._address:
@@ -216,7 +216,10 @@ class Fleet(AbstractContextManager["Fleet"]):
         if late and not self.is_owner:  # whose node ends with them
             raise FleetError("\n".join([f"the fleet {self.name} is not down yet, run the command again", *late]))
         unstored: list[str] = late + self._ask("end")
-        self._kill_controller()
+        import ray
+
+        with suppress(ValueError):  # the controller has gone
+            ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
         self._end_ray()
         deadline = time.monotonic() + _LEAVE_SECONDS
         while not self._address and _is_up(self._folder) and time.monotonic() < deadline:
@@ -294,9 +297,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         """Connect to a cluster, or start a node."""
         if not self._address:
             os.environ.update(_VARIABLES | {"RAY_AUTH_TOKEN_PATH": str(self._folder / "token")})
-        os.environ.setdefault(
-            "RAY_NUM_REDIS_GET_RETRIES", "2"
-        )  # of 41 s each if the head dies now; Ray's default is 20
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "2")  # of 41 s each if the head dies now, by default 20
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of Ray, about its own future
             import ray
@@ -355,12 +356,6 @@ class Fleet(AbstractContextManager["Fleet"]):
         )
         self._ask("ready")
 
-    def _kill_controller(self) -> None:
-        import ray
-
-        with suppress(ValueError):  # it has gone
-            ray.kill(ray.get_actor(actor_name(self.name, "controller"), namespace=NAMESPACE))
-
     def _ask(self, method: str, *arguments: object, **options: object) -> Any:
         """Call a method of the controller, and wait for its answer."""
         self._connect()
@@ -385,7 +380,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         except (RayError, GetTimeoutError) as error:
             self._controller = None
             what = str(error).partition("\n")[0] or type(error).__name__
-        raise FleetError(f"the controller of {self.name} did not do it ({what}): see its log in the folder of Ray")
+        raise FleetError(f"the controller of fleet {self.name} failed ({what}): see its log in Ray's log folder")
 
 
 def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -> Merged:
@@ -395,9 +390,7 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
     streams are `named`, each has to know the object; otherwise the others are skipped.
     """
     if not name and not named:
-        raise FleetError(
-            "objects without a name may be different ones: name the object (--object NAME), or the streams that show it"
-        )
+        raise FleetError("ambiguous unnamed object: pass --object NAME, or the names of the streams that show it")
     store = Store(url)
     models = {stream: _learned(store, stream, name, named=named) for stream in streams}
     learned = {stream: model for stream, model in models.items() if model is not None}
@@ -433,7 +426,7 @@ def _learned(store: Store, stream: str, name: str, *, named: bool) -> SavedModel
     """The saved model of an object in the newest state of a stream in the store; None if there is none."""
     try:
         if (newest := store.stream(stream).newest()) is None:
-            raise FleetError("there is no state of it in the store yet")
+            raise FleetError("no state in the store yet")
         with tempfile.TemporaryDirectory(prefix="catstream-merge-") as folder:
             state.restore(Path(folder), newest.files)
             return state.learned(Path(folder), Job.load(Path(folder)).settings, name)
@@ -449,8 +442,7 @@ def _gcs_address() -> str:
     """HOST:PORT of the head of the cluster that this process uses."""
     import ray
 
-    address: str = ray.get_runtime_context().gcs_address
-    return address
+    return str(ray.get_runtime_context().gcs_address)
 
 
 def _disconnect() -> None:

@@ -110,11 +110,6 @@ class Actor:
     handle: Any = None
     call: Any = None
 
-    @property
-    def digest(self) -> str:
-        """The digest of the stream that it was started for."""
-        return self.order.partition("/")[0]
-
 
 def selector(spec: StreamSpec, nodes: Collection[Node]) -> dict[str, str]:
     """The labels of the nodes on which a stream may run, as Ray's `label_selector` takes them."""

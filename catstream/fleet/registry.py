@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import replace
 
 import msgspec
@@ -14,7 +14,7 @@ from catstream.wire.commands import Responder
 from catstream.wire.discovery import private_folder, reserve_endpoint
 
 
-class RegistryServer(AbstractContextManager["RegistryServer"]):
+class RegistryServer:
     """Answers the questions of clients about the streams and nodes of a fleet.
 
     It listens at tcp://HOST:PORT with the keys of a folder, or in a folder of Unix sockets; if that is empty, in a new
@@ -27,7 +27,7 @@ class RegistryServer(AbstractContextManager["RegistryServer"]):
             folder = stack.enter_context(private_folder())
             self.endpoint = stack.enter_context(reserve_endpoint(listen, folder, keys, fleet=status().name))
             self._responder = stack.enter_context(Responder[Question, Listing](REGISTRY, self.endpoint))
-            self._stack = stack.pop_all()
+            self.close = stack.pop_all().close
 
     def turn(self, seconds: float = 0.0) -> int:
         """Answer all questions that have arrived within some seconds, and return their number."""
@@ -40,9 +40,3 @@ class RegistryServer(AbstractContextManager["RegistryServer"]):
                 answer = replace(status, streams=streams, nodes={})
             self._responder.answer(Listing(question.id, msgspec.json.encode(answer)))
         return len(questions)
-
-    def close(self) -> None:
-        self._stack.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

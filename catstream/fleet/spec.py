@@ -31,7 +31,6 @@ from catstream.video.source import is_live
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
-_CORES = Annotated[float, Meta(gt=0, le=4096)]
 
 #: The type of each key of a fleet, and what its value must be.
 _FLEET: dict[str, tuple[Any, str]] = {
@@ -51,7 +50,7 @@ _STREAM: dict[str, tuple[Any, str]] = {
     "model": (str, "a text"),
     "models": (dict[str, str], 'a table of texts, for example { anna = "anna.safetensors" }'),
     "settings": (dict[str, Any], 'a table, for example { "coreset.size" = 128 }'),
-    "cores": (_CORES, "a number above 0"),
+    "cores": (Annotated[float, Meta(gt=0, le=4096)], "a number above 0"),
     "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
     "follow": (str | list[Annotated[str, Meta(min_length=1)]], 'names of objects, for example ["anna"]'),
 }
@@ -90,8 +89,7 @@ class StreamSpec:
         with _errors_in(f"the stream {self.name}"):
             if not self.source.strip():
                 raise FleetError(
-                    "it has no source: give a text as `catstream track` takes it, for example "
-                    'source = "rtsp://camera/1"'
+                    'missing source: add one as for `catstream track`, for example source = "rtsp://camera/1"'
                 )
             for name, box in self.boxes.items():
                 with _errors_in(f"the box of {listed([name])}"):
@@ -113,7 +111,7 @@ class StreamSpec:
             values: dict[str, Any] = {"source": ""} | _checked(table, _STREAM)
             for one, several in (("box", "boxes"), ("model", "models")):
                 if one in values and several in values:
-                    raise FleetError(f"it has both {one} and {several}: write all objects in {several}")
+                    raise FleetError(f"{one} and {several} are mutually exclusive: write all objects in {several}")
                 values.setdefault(several, {UNNAMED: values.pop(one)} if one in values else {})
             source, follow = values["source"], values.get("follow", ())
             if source.strip() and not is_live(source) and "://" not in source:
@@ -173,7 +171,7 @@ class FleetSpec:
             values, folder = {"name": path.stem} | _checked(tables, _FLEET), path.parent.absolute()
             if not values.get("streams"):
                 raise FleetError(
-                    'it has no streams: add a table for each, for example [streams.cam-1] with source = "demo:1"'
+                    'missing streams: add a table for each, for example [streams.cam-1] with source = "demo:1"'
                 )
             if (store := values.get("store")) and "://" not in store:
                 values["store"] = str(folder / store)
@@ -186,15 +184,15 @@ class FleetSpec:
         """Raise FleetError if this cannot take the place of an earlier spec of the fleet: its states stay in use."""
         if self.store != earlier.store:
             raise FleetError(
-                f"the fleet {self.name} keeps its state in {earlier.store!r}, and the file says {self.store!r}: end it "
-                "first (catstream fleet down), and copy the state"
+                f"the store of fleet {self.name} cannot change while it runs (now {earlier.store!r}, file "
+                f"{self.store!r}): end the fleet first (catstream fleet down), and copy the states"
             )
         for name in self.streams.keys() & earlier.streams.keys():
             before, after = (Settings.from_values(spec.streams[name].settings) for spec in (earlier, self))
             if changed := changed_setting(before, after):
                 raise FleetError(
-                    f"nothing was changed: {name} was started with {changed}: keep the setting, or first remove the "
-                    f"stream with what it has learned (catstream fleet remove {name} --forget)"
+                    f"stream {name} was started with {changed}, nothing was changed: keep the setting, or first remove "
+                    f"the stream with its models (catstream fleet remove {name} --forget)"
                 )
 
     def check_stream(self, name: str) -> None:

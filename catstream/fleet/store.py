@@ -214,8 +214,8 @@ def _parse(url: str) -> tuple[str, Path | None]:
         return str(Path(url).resolve()), Path(url).resolve()
     if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
         raise FleetError(
-            "the URL of the store contains a user, a password or a query: give credentials in the environment or in "
-            "~/.aws/credentials, and s3://bucket/prefix only"
+            "the URL of the store contains a user, a password or a query: pass s3://bucket/prefix, and credentials "
+            "in the environment or in ~/.aws/credentials"
         )
     if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
         return _parse(parts.path)
@@ -372,7 +372,7 @@ class StateStore:
             return None
 
     def _busy(self, what: str) -> StoreError:
-        return StoreError(f"{self.folder} could not be {what}: other processes change it all the time; try again later")
+        return StoreError(f"{self.folder} could not be {what} (other processes keep changing it): try again later")
 
 
 class Claim:
@@ -387,9 +387,6 @@ class Claim:
         self._states, self._holder = states, holder
         self._number = 0
         self._fenced: FencedError | None = None
-
-    def __repr__(self) -> str:
-        return f"Claim({self._states.folder!r}, token={self.token})"
 
     def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         """Write a state, and remove those that are no longer needed.

@@ -125,8 +125,7 @@ class Job:
     def __post_init__(self) -> None:
         if both := self.boxes.keys() & self.models.keys():
             raise SettingsError(
-                f"{listed(sorted(both))}: a box gives the position of an object, and a model searches for it: "
-                "give one of them"
+                f"box and model of {listed(sorted(both))} are mutually exclusive (start at a position / search for it)"
             )
         check_count(len(self.boxes) + len(self.models), self.settings.run.max_objects)
 
@@ -216,13 +215,13 @@ class Job:
         """Raise SettingsError if another job cannot continue this one, whose state is in `folder`."""
         if other._frames() != self._frames():
             raise SettingsError(
-                f"the run in {str(folder)!r} has {self._frames()}, and this one has {other._frames()}: "
+                f"the run in {str(folder)!r} has {self._frames()}, not {other._frames()}: "
                 "continue with the same frames, or start a new run in another folder"
             )
         if changed := changed_setting(self.settings, other.settings):
             raise SettingsError(
-                f"the run in {str(folder)!r} was started with {changed}: continue without settings (they are stored "
-                "too), or start a new run in another folder"
+                f"the run in {str(folder)!r} was started with {changed}: omit the settings, which are stored, or start "
+                "a new run in another folder"
             )
 
     def _frames(self) -> str:

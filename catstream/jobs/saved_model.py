@@ -97,8 +97,10 @@ class SavedModel:
     def check_network(self, network: str, one: str = "the saved model", other: str = "this run has") -> None:
         """Raise SettingsError unless it was learned with the network of this digest; empty is none."""
         if (own := self.model.network) != network:
-            ours, theirs = (f"the network of digest {one}" if one else "no network" for one in (own, network))
-            raise SettingsError(f"{one} was learned with {ours}, {other} {theirs}: give the same file features.network")
+            ours, theirs = (f"the network of digest {digest}" if digest else "no network" for digest in (own, network))
+            raise SettingsError(
+                f"{one} was trained with {ours}, {other} {theirs}: use the same file for features.network"
+            )
 
     @one_thread()
     def similarity(self) -> Similarity:
@@ -149,11 +151,13 @@ class SavedModel:
         if not Path(path).exists():
             raise MissingFileError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
         if not Path(path).is_file():
-            raise ServiceError(f"{str(path)!r} is not a file: give one that `catstream save` wrote")
+            raise ServiceError(f"{str(path)!r} is not a file: pass a saved model (`catstream save`)")
         try:
             data = Path(path).read_bytes()
         except OSError as error:
-            raise ServiceError(f"cannot read {str(path)!r} ({error.strerror}): give another file") from None
+            raise ServiceError(
+                f"cannot read {str(path)!r} ({error.strerror}): check its permissions, or pass another file"
+            ) from None
         return cls.from_bytes(data, str(path))
 
     @classmethod
@@ -171,7 +175,7 @@ class SavedModel:
         if width != row_length() and not network:
             raise ProtocolError(
                 f"{name} has {width} features of a window, this catstream has {row_length()}: "
-                "learn the object again with this catstream"
+                "track the object again with this version"
             )
         return learned
 
@@ -179,7 +183,7 @@ class SavedModel:
     def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
         trees = unpack_trees(arrays, metadata["trees"])
         if missing := [name for name in TREES if name not in trees]:
-            raise ValueError(f"it has no tree {missing[0]!r}: learn the object again with this catstream")
+            raise ValueError(f"it has no tree {missing[0]!r}: track the object again with this version")
         return cls(
             check_name(metadata["object"]),
             {name: trees[name] for name in TREES},
@@ -216,17 +220,17 @@ def check_files(files: Mapping[str, Path], settings: Settings, network: str) -> 
 
 def check_sizes(sizes: Mapping[str, int]) -> None:
     """Raise SettingsError if the saved models of objects, by name, have too many bytes to begin in one frame."""
-    advice = "track fewer at once, or learn them again with a smaller coreset.size"
+    advice = "track fewer at once, or train them again with a smaller coreset.size"
     for name, size in sizes.items():
         if size > LARGEST_GIVEN_MODEL:
             raise SettingsError(
-                f"the saved model of {listed([name])} has {size >> 20} MiB, at most {LARGEST_GIVEN_MODEL >> 20} are "
-                f"possible: {advice}"
+                f"the saved model of {listed([name])} is too large ({size >> 20} MiB, limit "
+                f"{LARGEST_GIVEN_MODEL >> 20}): {advice}"
             )
     if (together := sum(sizes.values())) > LARGEST_GIVEN_MODELS:
         raise SettingsError(
-            f"the saved models of {listed(sizes)} have {together >> 20} MiB together, at most "
-            f"{LARGEST_GIVEN_MODELS >> 20} can begin in one frame: {advice}"
+            f"the saved models of {listed(sizes)} are too large for one frame ({together >> 20} MiB together, limit "
+            f"{LARGEST_GIVEN_MODELS >> 20}): {advice}"
         )
 
 
@@ -273,7 +277,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     if wrong := [part for part in parts if not isinstance(part, SavedModel)]:
         raise SettingsError(f"a merge takes saved models, got {wrong[0]!r}: read a file with catstream.SavedModel.load")
     if len(parts) < 2:
-        raise SettingsError(f"{len(parts)} saved model given: a merge needs two or more")
+        raise SettingsError(f"too few saved models ({len(parts)}): a merge needs two or more")
     first, origins = parts[0], set(parts[0].origins)
     named = next((part for part in parts if part.object), first)
     for part in parts[1:]:
@@ -301,15 +305,15 @@ def _check_merge(one: SavedModel, other: SavedModel, origins: set[str]) -> None:
     """Raise SettingsError if a saved model cannot be merged; `origins` are those of all before it."""
     if one.object and other.object and one.object != other.object:
         raise SettingsError(
-            f"one saved model is of {one.object!r}, another of {other.object!r}: "
-            "only models of the same object can be merged"
+            f"the saved models are of different objects ({one.object!r}, {other.object!r}): "
+            "merge models of the same object"
         )
-    _check_same(one.settings, other.settings, "one saved model was learned", "another")
+    _check_same(one.settings, other.settings, "one saved model was trained", "another")
     one.check_network(other.model.network, "one saved model", "another with")
     if origins & set(other.origins):
         raise SettingsError(
-            "two of the saved models have learned from the same frames, which would count twice: "
-            "merge models of different videos"
+            "two of the models were trained on the same frames, which would count twice: "
+            "merge models from different videos"
         )
 
 
@@ -332,11 +336,11 @@ def _check_alike(parts: Sequence[SavedModel]) -> None:
         text = f"saved models {one} and {other} look like different objects (similarity {similarity:.2f}"
         if similarity < _UNLIKE:
             raise SettingsError(
-                f"{text}, at least {_UNLIKE} is needed): merge models of the same object, or pass --force "
-                "(force=True in Python) if it is the same one"
+                f"{text}, minimum {_UNLIKE}): merge models of the same object, or pass --force (force=True in Python) "
+                "if it is the same"
             )
         warnings.warn(
-            f"{text}, that of one object is mostly above {_DOUBTFUL}): check that the object is the same",
+            f"{text}, usually above {_DOUBTFUL} for the same object): check that the object is the same",
             stacklevel=4,  # the caller of the decorated `merge`
         )
 

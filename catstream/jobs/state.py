@@ -92,7 +92,7 @@ def files(folder: Path) -> dict[str, bytes]:
             for path in [*(folder / SEARCHED).glob("[0-9a-f]*.safetensors"), *checkpoints[-1:]]:
                 content[f"{path.parent.name}/{path.name}"] = path.read_bytes()
             return content if checkpoints else {}
-    raise ServiceError(f"the state in {str(folder)!r} changes too quickly to be read: try again")
+    raise ServiceError(f"cannot read the state in {str(folder)!r} (it keeps changing): try again")
 
 
 def restore(folder: Path, content: Mapping[str, bytes]) -> None:
@@ -119,7 +119,7 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
         if not lock(handle, seconds):
-            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or give another folder")
+            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or use another folder")
         yield folder
 
 
@@ -128,10 +128,11 @@ def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None
     """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
         if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
-            raise ServiceError(
-                f"{str(folder)!r} already contains a run: continue it (--resume {quote(str(folder))}), or give another "
-                "folder"
-            )
+            if contains_run(folder):
+                hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
+            else:
+                hint = f"contains a run without its {_SMALL[0]}, which cannot be continued: use another folder"
+            raise ServiceError(f"{str(folder)!r} {hint}")
         if job != resumed:
             job.save(folder)
         yield

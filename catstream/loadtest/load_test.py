@@ -69,20 +69,24 @@ class Plan:
     def __post_init__(self) -> None:
         if self.slow_subscribers > self.subscribers:
             raise SettingsError(
-                f"{self.slow_subscribers} of {self.subscribers} subscribers cannot be slow: "
-                "give more, or fewer slow ones"
+                f"more slow subscribers ({self.slow_subscribers}) than subscribers ({self.subscribers}): "
+                "raise --subscribers, or lower --slow-subscribers"
             )
         if self.frames < 1:
             raise SettingsError(
-                f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: give a higher rate or more seconds"
+                f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: raise --rate or --duration"
             )
         if self.source == "h264" and any(side % 2 for side in self.size):
-            raise SettingsError("a frame of H.264 has an even width and an even height: give another size")
+            raise SettingsError(
+                f"H.264 needs an even width and height, got {self.size[0]}x{self.size[1]}: pass another --size"
+            )
         check_count(self.objects, self.settings.run.max_objects)
         if self.settings.run.lockstep:
-            raise SettingsError("the frames of a load test do not wait for models: leave out lockstep")
+            raise SettingsError(
+                "a load test does not support lockstep, because its frames do not wait for models: omit run.lockstep"
+            )
         if self.settings.run.endpoint:
-            raise SettingsError("each stream of a load test has an endpoint of its own: leave out endpoint")
+            raise SettingsError("each stream of a load test has its own endpoint: omit run.endpoint")
 
     def __str__(self) -> str:
         objects = f", {self.objects} objects" if self.objects > 1 else ""
@@ -314,8 +318,8 @@ def _started(
                     raise stream.error
             if monotonic() > deadline:
                 raise ServiceError(
-                    f"{activity} took more than {_START_TIMEOUT_SECONDS:.0f} s: this machine is too slow or too busy, "
-                    "give fewer streams, subscribers or frames a second"
+                    f"{activity} took more than {_START_TIMEOUT_SECONDS:.0f} s: the machine is too slow or too busy; "
+                    "lower --streams, --subscribers or --rate"
                 )
             report(activity, 0.0, "")
             time.sleep(_LOOP_SECONDS)

@@ -72,5 +72,5 @@ def _by_name(texts: list[str]) -> dict[str, str]:
     """Boxes by the names of their objects; ObjectError if two have the same name."""
     boxes = dict(split_name(text) for text in texts)
     if len(boxes) < len(texts):
-        raise ObjectError(f"two boxes of one name (--box {' --box '.join(texts)}): give each object its own name")
+        raise ObjectError(f"duplicate object (--box {' --box '.join(texts)}): give each object its own name")
     return boxes

@@ -76,7 +76,7 @@ class DesiredState:
             return msgspec.json.decode(path.read_bytes(), type=cls)
         except (OSError, msgspec.DecodeError) as error:
             raise ProtocolError(
-                f"the desired state cannot be read from {path} ({error!r}): the run starts with its original boxes, "
+                f"cannot read the desired state in {path} ({error!r}): the run starts with its original boxes; "
                 "repeat later commands"
             ) from None
 

@@ -232,7 +232,7 @@ class Supervisor:
         if self._error is not None:
             raise self._error
         if self._ending.is_set():
-            raise ServiceError("the pipeline was closed, perhaps by another thread: make another one to go on")
+            raise ServiceError("the pipeline is closed (perhaps by another thread): create a new one")
         if self.end is not None and self.end.failed:
             raise VideoError(self.end.reason)
         return None

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from catstream.messages.kinds import End
 from catstream.processes.process import MESSAGE_SECONDS, Process
+from catstream.training.motion_em import prepare
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
 
 _NONE = {"version": 0.0, "trained": 0.0}
+
+prepare()  # once in the start server: a trainer that did it between two models would stop a file for that time
 
 
 def main(process: Process) -> None:

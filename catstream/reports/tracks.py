@@ -147,10 +147,10 @@ class Section:
         self._objects = {name: _Object.of(rows) for name, rows in tracks.items()}
         self._log, self._palette = log, Colours()
         self.colours = {name: self._palette.of(name) for name in tracks}
-        self.duration = max(each.times[-1] for each in self._objects.values()) + 1 / (self._head.rate or 25)
-        self.rows = [each.row(name) for name, each in self._objects.items()]
-        self.lanes = {name: each.lane(self.duration) for name, each in self._objects.items()}
-        self.paths = {name: each.polylines() for name, each in self._objects.items()}
+        self.duration = max(item.times[-1] for item in self._objects.values()) + 1 / (self._head.rate or 25)
+        self.rows = [item.row(name) for name, item in self._objects.items()]
+        self.lanes = {name: item.lane(self.duration) for name, item in self._objects.items()}
+        self.paths = {name: item.polylines() for name, item in self._objects.items()}
         self.size = self._head.size or self._extent()
         self.speeds, self.fastest = self._speeds()
         self.background, self.pictures, self.problem = b"", list[_Picture](), ""
@@ -161,7 +161,7 @@ class Section:
             self.problem = "the log names no video"
             return
         frames = self._frames_to_look_at()
-        middle = int(np.median(np.concatenate([each.frames for each in self._objects.values()])))
+        middle = int(np.median(np.concatenate([item.frames for item in self._objects.values()])))
         logged = {frame.number: frame for frame in self._log if frame.number in frames}
         try:
             part = slice(self._head.start, None, self._head.stride)
@@ -178,16 +178,16 @@ class Section:
 
     def _extent(self) -> tuple[int, int]:
         """Width and height around all boxes."""
-        ends = [np.nanmax(each.boxes[:, :2] + each.boxes[:, 2:], axis=0, initial=1) for each in self._objects.values()]
+        ends = [np.nanmax(item.boxes[:, :2] + item.boxes[:, 2:], axis=0, initial=1) for item in self._objects.values()]
         width, height = np.ceil(np.max(ends, axis=0)).astype(int).tolist()
         return width, height
 
     def _frames_to_look_at(self) -> dict[int, str]:
         """The middle of each of the longest doubtful stretches, and what is doubtful there."""
         runs = [
-            (frames.stop - frames.start, int(each.frames[(frames.start + frames.stop) // 2]), name)
-            for name, each in self._objects.items()
-            for state, frames in each.runs()
+            (frames.stop - frames.start, int(item.frames[(frames.start + frames.stop) // 2]), name)
+            for name, item in self._objects.items()
+            for state, frames in item.runs()
             if state == "doubtful"
         ]
         longest = sorted(runs, reverse=True)[:_PICTURES]
@@ -196,8 +196,8 @@ class Section:
     def _speeds(self) -> tuple[dict[str, list[str]], float]:
         """The polylines of the speed of each object in a plot of 1000 x 460, and the highest speed."""
         edges = np.linspace(0, self.duration, min(_BINS, max(2, int(self.duration * 4))) + 1)
-        speeds = {name: each.speeds(edges) for name, each in self._objects.items()}
-        fastest = max(1.0, *(float(np.nanmax(each, initial=0)) for each in speeds.values()))
+        speeds = {name: item.speeds(edges) for name, item in self._objects.items()}
+        fastest = max(1.0, *(float(np.nanmax(item, initial=0)) for item in speeds.values()))
         xs = 1000 * (edges[1:] + edges[:-1]) / 2 / self.duration
         lines = {}
         for name, values in speeds.items():

@@ -79,7 +79,7 @@ def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None
             for key in ("videos", "images", "tracks", "annotations")
         )
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise VideoError("the existing file is not in COCO format: pass --overwrite, or give another name") from None
+        raise VideoError("the existing file is not in COCO format: pass --overwrite, or use another name") from None
     classes = _numbers(frames, about, existing, first=1)
     images: list[Fields] = []
     tracks: dict[int, Fields] = {}

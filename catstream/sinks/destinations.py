@@ -28,9 +28,8 @@ from catstream.client.address import Address
 from catstream.errors import VideoError, require_extra
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.video.frames import RATE
 from catstream.video.images import IMAGES
-from catstream.video.source import ALL_FRAMES, VIDEOS
+from catstream.video.source import VIDEOS
 
 #: Stands for standard output.
 STDOUT = "-"
@@ -107,24 +106,20 @@ class Head:
 class Origin:
     """The run whose tracks a sink writes.
 
-    source      of its frames if they can be read a second time: None beside a running pipeline
-    part        the frames that are tracked
-    image_rate  frames per second of a folder of images
-    address     of the running pipeline, for a sink that receives other messages, too
-    last        last frame of the file if it is a log that is continued; None for a new file
-    size        number of bytes up to the end of that frame
-    options     of the destinations, beside their addresses
-    head        first line of a log
+    head      of its log
+    address   of the running pipeline, for a sink that receives other messages, too
+    options   of the destinations, beside their addresses
+    attached  whether another program runs the pipeline: its source is not read a second time
+    last      last frame of the file if it is a log that is continued; None for a new file
+    size      number of bytes up to the end of that frame
     """
 
-    source: str | None = None
-    part: slice = field(default_factory=lambda: ALL_FRAMES)
-    image_rate: float = RATE
+    head: Head = field(default_factory=Head)
     address: Address = field(default_factory=Address)
+    options: SinkOptions = field(default_factory=SinkOptions)
+    attached: bool = False
     last: TrackedFrame | None = None
     size: int = 0
-    options: SinkOptions = field(default_factory=SinkOptions)
-    head: Head = field(default_factory=Head)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +249,7 @@ def sink_of(place: str) -> Row:
     row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
     if row is None:
         raise VideoError(
-            f"{redacted(place)} is no destination of tracks: give a file or address with one of {', '.join(SINKS)}, "
+            f"{redacted(place)} is not a destination of tracks: pass a file or address with one of {', '.join(SINKS)}, "
             "where - is standard output; for other formats use catstream export"
         )
     return row
@@ -276,9 +271,9 @@ def is_file(place: str) -> bool:
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:
     """Raise VideoError if a file is of the source, if another process writes it, or as `files.check_file` does."""
     if source and path.exists() and Path(source).exists() and path.samefile(source):
-        raise VideoError(f"{path} is the source, which would be lost: give another name or folder")
+        raise VideoError(f"{path} is the source, which would be lost: use another name or folder")
     if Path(source).is_dir() and path.exists() and path.suffix in VIDEOS | IMAGES and Path(source) in path.parents:
-        raise VideoError(f"{path} is in the folder of the source, and may be its video: give another name or folder")
+        raise VideoError(f"{path} is in the folder of the source, and may be its video: use another name or folder")
     check_unlocked(path, VideoError)
     check_file(path, overwrite=overwrite, made=made, kind=VideoError)
 
@@ -311,12 +306,12 @@ def open_sink(place: str, origin: Origin) -> Sink:
 def check_export(path: Path, row: Row, *, overwrite: bool, append: bool, log: Path) -> None:
     """Raise VideoError if an export would replace or extend something, unless `overwrite` or `append` allow that."""
     if append and not row.appends:
-        raise VideoError(f"{path} can hold one video only: give another name, or pass --overwrite instead of --append")
+        raise VideoError(f"{path} can hold one video only: use another name, or pass --overwrite instead of --append")
     if row.suffix:
         check_result(path, overwrite=overwrite or append, source=str(log))
     elif not (overwrite or append or _is_empty(path)):
         raise VideoError(
-            f"the folder {path} is not empty: add to its data set with --append, replace it with --overwrite, or give "
+            f"the folder {path} is not empty: add to its data set with --append, replace it with --overwrite, or use "
             "another folder"
         )
 

@@ -100,7 +100,7 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, ab
         names[f"{whole}@{min(rows[name, began])}" if whole in names else whole] = (name, began)
     files = [folder / pattern.format(name) for name in names for pattern in LAYOUTS[layout]]
     if about.append and (existing := [file for file in files if file.exists()]):
-        raise VideoError(f"{existing[0]} exists already: replace it with --overwrite, or give another folder")
+        raise VideoError(f"{existing[0]} exists already: replace it with --overwrite, or use another folder")
     for name, key in names.items():
         table = np.full((max(times) + 1, 6), np.nan)
         table[list(rows[key]), :5] = list(rows[key].values())

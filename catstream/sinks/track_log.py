@@ -24,7 +24,6 @@ from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import IO, get_args
 
-from catstream.base.addresses import without_password
 from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
@@ -372,20 +371,18 @@ class RunFiles:
         If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued. All files,
         also the `others` that the run writes, by their purpose, have to be different.
         """
-        source = self.origin.source or ""
+        source = self.origin.head.source
         files = [(f"the destination {place}", Path(place)) for place in self.places if is_file(place)]
         check_distinct([*files, *(others or {}).items()], VideoError)
         for place in self.places:
             row = sink_of(place)
             check_sink(place, self.origin.options)
             if is_file(place) and place.endswith(".mp4") and is_live(source):
-                raise VideoError(
-                    f"a video needs its frames once more, but {without_password(source)} is live: omit the video"
-                )
+                raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
             if is_file(place):
                 continued = place in earlier and row.follows_log and self._log() is not None
                 if place in earlier and not continued and Path(place).exists():
-                    raise VideoError(f"{place} cannot be continued: to resume, give other destinations (--write DEST)")
+                    raise VideoError(f"{place} cannot be continued: pass other destinations to resume (--write DEST)")
                 check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
 
     def position(self, *, skip_damaged: bool = False) -> int | None:

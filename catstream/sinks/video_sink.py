@@ -9,7 +9,7 @@ import numpy as np
 from catstream.client.attach import subscribe
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
-from catstream.sinks.destinations import Origin, Sink, TrackedFrame
+from catstream.sinks.destinations import Head, Origin, Sink, TrackedFrame
 from catstream.video.drawing import Colours, draw, drawn_size, preview_image
 from catstream.video.frames import RATE
 from catstream.video.source import open_source
@@ -20,19 +20,16 @@ _BACKLOG = 256  # frames whose tracks wait for their picture
 
 def open_video(place: str, origin: Origin) -> Sink:
     """Open an MP4 of the frames of a source if they can be read a second time, else of the pipeline's pictures."""
-    return PictureVideo(place, origin) if origin.source is None else SourceVideo(place, origin)
+    return PictureVideo(place, origin) if origin.attached else SourceVideo(place, origin.head)
 
 
 class SourceVideo:
     """An MP4 of the frames that have a track, with their tracks drawn in."""
 
-    last = -1  # when a run is resumed, the video is drawn again from the first frame
-
-    def __init__(self, place: str, origin: Origin) -> None:
+    def __init__(self, place: str, head: Head) -> None:
         # The pipeline skips damaged frames and scales others, or ends at the first: in any case these are its frames.
-        self._frames = open_source(
-            origin.source or "", part=origin.part, image_rate=origin.image_rate, skip_damaged=True, resize=True
-        )
+        part = slice(head.start, None, head.stride)
+        self._frames = open_source(head.source, part=part, image_rate=head.rate or RATE, skip_damaged=True, resize=True)
         self._colours = Colours()
         try:
             aspect = self._frames.pixel_aspect

@@ -156,8 +156,8 @@ def open_video(text: str, hwaccel: str, **options: Any) -> InputContainer:
         if device is None:
             raise
         raise VideoError(
-            f"no device of the kind {hwaccel!r} can decode this video here ({error}): this FFmpeg knows "
-            f"{', '.join(hwdevices_available())}; without run.hwaccel, the processor decodes it"
+            f"run.hwaccel={hwaccel} cannot decode this video ({error}): omit it to decode on the processor, or choose "
+            f"one of {', '.join(hwdevices_available())}"
         ) from None
     return opened
 
@@ -213,11 +213,11 @@ def _validated(image: object) -> np.ndarray:
         raise FrameError(f"{_EXPECTED}, got {kind}: {_CONVERSIONS.get(kind, 'convert it, as np.asarray does')}")
     shape = image.shape
     if not (image.ndim == 2 or (image.ndim == 3 and shape[2] in _CHANNELS)):
-        hint = "give one of this shape"
+        hint = "pass one of this shape"
         if image.ndim == 3 and shape[0] in _CHANNELS:
             hint = "the channels come last, np.moveaxis(frame, 0, -1) puts them there"
         elif image.ndim == 4:
-            hint = "give one image of a batch at a time"
+            hint = "pass one image of a batch at a time"
         raise FrameError(f"{_EXPECTED}, got the shape {shape}: {hint}")
     if not image.size:
         raise FrameError(f"{_EXPECTED}, got the shape {shape}, which has no pixels: check how it was cropped")

@@ -78,11 +78,11 @@ class _FileSource(Source):
         self._frames = reader.frames(numbers, start)
         self._first: Frame | None = next(self._frames, None)
         if self._first is None and numbers[start:].start == 0:
-            raise VideoError(f"no frame of {name} can be decoded, as if it began after its only key frame: {EXPECTED}")
+            raise VideoError(f"no frame of {name} can be decoded (no keyframe): {EXPECTED}")
         if self._first is None:
             raise VideoError(
-                f"{name} has {reader.count() or 'no'} frames, numbered from 0, and none from frame "
-                f"{numbers[start:].start} on: choose an earlier first frame, or another source"
+                f"the first frame, {numbers[start:].start}, is after the end of {name} ({reader.count() or 'no'} "
+                "frames): choose an earlier first frame, or another source"
             )
         height, width = self._first.image.shape[:2]
         super().__init__(name, reader.rate / (part.step or 1), (width, height))
@@ -162,7 +162,7 @@ def open_source(
         return LiveSource(str(text), start, settings, since=since, idle=idle)
     redacted = without_password(str(text))
     if re.match(r"\w+:/[^/]", str(text)) and not Path(text).exists():
-        raise VideoError(f"the address {redacted!r} has one slash after its protocol: write two")
+        raise VideoError(f"invalid address {redacted!r} (one slash after the protocol): write //")
     if str(text) == "-":
         raise VideoError(
             "standard input is not a source, because a restarted process cannot read it again: "
@@ -375,7 +375,7 @@ class _Video:
             if problem and not skip:
                 raise VideoError(
                     f"{str(self.path)!r} is damaged at frame {good} ({problem}): "
-                    "--skip-damaged (run.skip_damaged=true) continues at the next key frame"
+                    "--skip-damaged (run.skip_damaged=true) continues at the next keyframe"
                 )
 
     def _packets(self) -> Iterator[Packet[Any] | str | None]:

@@ -155,7 +155,7 @@ class Guard:
     def __init__(self, app: ASGIApp, token: str | None) -> None:
         if token is not None and len(token) < _MIN_TOKEN_LENGTH:
             raise ServiceError(
-                f"a token of {len(token)} characters can be guessed: give {_MIN_TOKEN_LENGTH} or more, "
+                f"the token is too short ({len(token)} characters): use {_MIN_TOKEN_LENGTH} or more, "
                 "for example VIEW_TOKEN=$(openssl rand -hex 16)"
             )
         self._app = app if token is not None else TrustedHostMiddleware(app, _LOOPBACK, www_redirect=False)

@@ -78,7 +78,7 @@ class Sender(ChannelSocket[Message]):
         if len(data) > self.channel.limit:
             raise ServiceError(
                 f"a message of {self.channel.name} takes {len(data) >> 20} MiB, more than {self.channel.megabytes}: "
-                "follow fewer objects, or give a smaller coreset.size"
+                "track fewer objects, or lower coreset.size"
             )
         self.window.push(message.seq, data)
         self._transmit()

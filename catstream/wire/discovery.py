@@ -83,11 +83,11 @@ def _locked(folder: Path, text: str) -> Iterator[Path]:
             handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
         facts = os.fstat(handle)
         if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
-            raise ServiceError(f"other users may write to {text!r}: give a folder of your own, chmod 700")
+            raise ServiceError(f"other users may write to {text!r}: use a folder of your own, chmod 700")
         if not lock(handle):
             raise ServiceError(
                 f"a pipeline is already running on {text!r}: "
-                "wait for it, or give another folder (--set run.endpoint=FOLDER)"
+                "wait for it, or use another folder (--set run.endpoint=FOLDER)"
             )
         since = generation()
         try:

@@ -72,7 +72,7 @@ class Endpoint:
             raise ServiceError(f"an endpoint is a folder, and {text!r} is a file: pass a folder")
         if is_too_long(folder):
             raise ServiceError(
-                f"the name of the folder {text!r} is too long for a Unix socket: give a shorter one "
+                f"the name of the folder {text!r} is too long for a Unix socket: use a shorter one "
                 "(--set run.endpoint=FOLDER), or set TMPDIR to a shorter folder for temporary files"
             )
         return cls(folder=folder, keys=loaded)
@@ -88,7 +88,7 @@ class Endpoint:
         if keys is None and is_host and (address is None or not address.is_loopback):
             raise ServiceError(
                 f"other machines can reach {text}, and without keys anybody could connect: make keys "
-                "(catstream keys new DIR) and give them to all (--set run.keys=DIR), or give a folder or "
+                "(catstream keys new DIR) and pass them to all (--set run.keys=DIR), or use a folder or "
                 "tcp://127.0.0.1:PORT"
             )
         if not (is_host and 1 <= port <= 65535 - last):

@@ -72,7 +72,7 @@ class Keys:
         if not (self.folder / _SERVER).exists():
             raise ServiceError(
                 f"{self.folder} holds the keys of a client, a pipeline needs those that `catstream keys new` made: "
-                "give that folder"
+                "pass that folder"
             )
         return _key(self.folder / _SERVER, "secret").encode()
 
@@ -89,7 +89,9 @@ class Keys:
 def create(folder: Path) -> None:
     """Make the keys of a pipeline: a pair for its sockets that listen, and one for its processes that connect."""
     if any((folder / name).exists() for name in (_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS)):
-        raise ServiceError(f"{folder} holds keys already, and clients that have them would be locked out: give another")
+        raise ServiceError(
+            f"{folder} holds keys already, and clients that have them would be locked out: use another folder"
+        )
     _write(folder / _SERVER_PUBLIC, public=_pair(folder / _SERVER))
     _write(folder / _CLIENTS / _OWN, role="pipeline", public=_pair(folder / _CLIENT))
 
@@ -209,7 +211,7 @@ def _write(path: Path, **facts: str) -> None:
         try:
             create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
         except FileExistsError:
-            raise ServiceError(f"{path} exists already and is not written over: give another folder") from None
+            raise ServiceError(f"{path} exists already and is not overwritten: use another folder") from None
 
 
 def _text(**facts: str) -> bytes:

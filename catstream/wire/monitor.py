@@ -82,7 +82,7 @@ def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
 
 
 def greeting(address: str) -> bytes | None:
-    """What a listener sends to a client of ZeroMQ with keys, 64 bytes at most; None if it closes the connection.
+    """The first bytes of a listener to a client of ZeroMQ with keys, 64 at most; None if it closes the connection.
 
     It is None, too, if nobody listens. A socket of ZeroMQ sends a greeting of its own, another program something else
     or nothing. libzmq reports a listener with other keys as it does one that closes each connection, such as a tunnel

@@ -137,7 +137,7 @@ def test_the_decoded_frames_are_deleted_with_the_annotation_and_after_an_error(d
 @pytest.mark.parametrize(
     ("boxes", "error", "message"),
     [
-        ({FRAMES: (1, 2, 30, 40)}, BoxError, "frame 24 is not in the video, which has 24 frames"),
+        ({FRAMES: (1, 2, 30, 40)}, BoxError, "frame 24 is outside the video: pass a frame from 0 to 23"),
         ({"anna": {0: (400, 2, 30, 40)}}, BoxError, "anna: the box .* outside the frame"),
         ({"anna": {0: None}}, ObjectError, "anna has no box"),
         ({}, ObjectError, "no object"),
@@ -150,7 +150,7 @@ def test_boxes_that_cannot_be_tracked_are_an_error(demo, boxes, error, message):
 
 
 def test_a_live_source_is_an_error():
-    with pytest.raises(VideoError, match="is live"):
+    with pytest.raises(VideoError, match="a live source"):
         annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
 
 

@@ -65,12 +65,12 @@ def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(s
     [
         (["--size", "640"], "a size is WIDTHxHEIGHT"),
         (["--size", "20x20"], "for example 640x480"),
-        (["--subscribers", 1, "--slow-subscribers", 2], "2 of 1 subscribers cannot be slow"),
+        (["--subscribers", 1, "--slow-subscribers", 2], "more slow subscribers (2) than subscribers (1)"),
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
         (["--rate", 0], "0.5<=x<=1000"),
-        (["--json", "missing/x.json"], "give a file in a folder that exists"),
-        (["--output", "/dev/null/load"], "give another place"),
-        (["--set", "run.lockstep=true"], "leave out lockstep"),
+        (["--json", "missing/x.json"], "pass a file in an existing folder"),
+        (["--output", "/dev/null/load"], "use another folder"),
+        (["--set", "run.lockstep=true"], "omit run.lockstep"),
     ],
 )
 def test_contradictory_options_are_errors_before_the_start(fail, tmp_path, arguments, message):

@@ -129,7 +129,7 @@ def test_a_saved_model_finds_the_object_in_another_run(video, follow, succeed, s
     assert int(found[0]["model_version"]) >= 1
     run = follow(source)
     code, answer = steer("search", f"anna={tmp_path / 'out'}")
-    assert (code, "is not a file: give one that `catstream save` wrote" in answer.replace("\n", " ")) == (1, True)
+    assert (code, "is not a file: pass a saved model" in answer.replace("\n", " ")) == (1, True)
     code, answer = steer("search", f"anna={tmp_path / 'one'}")
     assert (code, answer.startswith("anna is searched for from frame 0 on, by model ")) == (0, True)
     assert [track.state for track in run.result(120)] == [row["state"] for row in found]

@@ -29,7 +29,7 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
         waiting = set(sinks)
         for track in pipeline:
             if waiting := {folder for folder in waiting if not holds(folder) and sinks[folder].poll() is None}:
-                select.select([sinks[folder].stderr for folder in waiting], [], [], 0.3)  # while they start, few pass
+                select.select([sinks[folder].stderr for folder in waiting], [], [], 1)  # while they start, few pass
             if track.frame > 30 and stopped not in waiting and sinks[stopped].poll() is None:
                 sinks[stopped].send_signal(signal.SIGINT)
                 sinks[stopped].wait(150)

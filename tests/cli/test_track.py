@@ -185,8 +185,11 @@ REJECTED = {
     "two objects without a name": (["--box", "1,2,30,40", "--box", "5,6,30,40"], "NAME=5,6,30,40"),
     "a name with a blank": (["--box", "a b=1,2,30,40"], "'a b' is not a name"),
     "a box of an object outside": (["--box", "anna=400,10,20,20"], "anna: the box 400,10,20,20"),
-    "40 objects": ([word for k in range(40) for word in ("--box", f"n{k}=1,2,30,40")], "40 objects are more than 32"),
-    "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "give one of them"),
+    "40 objects": (
+        [word for k in range(40) for word in ("--box", f"n{k}=1,2,30,40")],
+        "(40, limit 32)",
+    ),
+    "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "mutually exclusive"),
     "a model of several objects": (["--box", "a=1,2,30,40", "--box", "b=1,2,30,40", "--save-model", "m"], "NAME=FILE"),
     "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
     "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
@@ -213,7 +216,7 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     source, box = video
     folder = tmp_path / "file" if output == "a file" else Path(output)
     (tmp_path / "file").write_text("mine\n")
-    assert "a folder that exists and that you may write to" in fail("track", source, "--box", box, "--output", folder)
+    assert "an existing folder that you may write to" in fail("track", source, "--box", box, "--output", folder)
     assert (tmp_path / "file").read_text() == "mine\n"
 
 
@@ -245,7 +248,7 @@ def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tm
 
     monkeypatch.setattr(Path, "is_dir", denied)
     code, _, errors = said("evaluate", tmp_path)
-    expected = f"cannot use {str(tmp_path)!r} (Permission denied): change its permissions, or give another path"
+    expected = f"cannot use {str(tmp_path)!r} (Permission denied): change its permissions, or use another path"
     assert (code, errors) == (1, f"catstream: {expected}\n")
 
 

@@ -140,7 +140,7 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "frames 3 to the last": ["track", "--resume", kept, "--start", "3"],
         "contains no run": ["track", "--resume", tmp_path / "none"],
         "--state and --resume are mutually exclusive": ["track", "--resume", kept, "--state", kept],
-        "with the objects that it had": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
+        "keeps its objects": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
         "missing SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
         "missing --state DIR": ["track", source, "--continue"],
         "--no-write has no effect on a new run": ["track", source, "--box", box, "--no-write"],
@@ -209,7 +209,7 @@ def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_i
     before = len(frames(out))
     for says in ("present in", "is complete: to track the source again"):
         _, errors = succeed(*words, cwd=tmp_path)
-        assert "the run in state continues with the objects that it had" in errors
+        assert "the resumed run in state keeps its objects" in errors
         assert says in errors
         assert_goes_on(out / "demo.ndjson", before, whole_run / "out" / "demo.ndjson")
 

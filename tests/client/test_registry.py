@@ -42,7 +42,7 @@ def test_an_answer_that_is_no_state_of_a_fleet_is_an_error(folder, answer):
 
         with Registry(timeout=20) as registry, ThreadPoolExecutor(1) as pool:
             served = pool.submit(serve)
-            with pytest.raises(ServiceError, match="the registry has sent no state of a fleet"):
+            with pytest.raises(ServiceError, match="invalid answer of the registry"):
                 registry.streams()
             served.result()
 

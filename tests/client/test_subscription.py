@@ -55,9 +55,9 @@ def test_a_closed_subscription_ends_its_loops_with_an_error_in_other_threads_too
     with attached(endpoint, tracks) as subscription, ThreadPoolExecutor() as pool:
         loop = pool.submit(list, subscription)
         subscription.close()
-        with pytest.raises(ServiceError, match="the subscription was closed"):
+        with pytest.raises(ServiceError, match="the subscription is closed"):
             loop.result()
-        with pytest.raises(ServiceError, match="the subscription was closed"):
+        with pytest.raises(ServiceError, match="the subscription is closed"):
             next(subscription)
 
 

@@ -123,7 +123,7 @@ def test_an_object_that_begins_again_has_new_trees(settings, messages):
 
 def test_a_missing_message_is_an_error_but_accepted_later_a_stored_one_is_ignored(settings, messages):
     forest, (first, second) = Forest(settings), (next(messages), next(messages))
-    with pytest.raises(ProtocolError, match="features 2 came after 0: 1 are missing"):
+    with pytest.raises(ProtocolError, match="features 2 follow 0, 1 are missing"):
         forest.take(second)
     forest.take(first)
     forest.take(second)

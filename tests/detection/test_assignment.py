@@ -96,7 +96,9 @@ def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng)
     window = Window.around(Box(100, 50, 40, 40), CONTEXT)
     row = ScoreMap.around(frame, window, WINDOW, None).cells.row(0, 0)
     found = local_search(FrameContext(frame, Model(1, 0, row, 0.0), Settings()), window)
+    found = replace(found, redetected=True)
     result = assign({"anna": Detection(1e9, found.window), "ben": found}, APART, CONTEXT)["ben"]
     assert 0 < result.score < found.score
     assert result.window.box(CONTEXT).overlap(found.window.box(CONTEXT)) <= 0.5
     assert result.around is found.around
+    assert result.redetected, "it is elsewhere in the frame, so its object is not trusted"

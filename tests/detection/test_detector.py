@@ -172,7 +172,7 @@ def test_a_detector_that_is_resumed_adopts_no_model_of_the_object_before_either(
 )
 def test_a_box_of_more_than_twice_the_frame_is_rejected_and_tracking_continues(scene, place, box):
     detector = started(scene)
-    with pytest.raises(BoxError, match="twice as wide and high as the frame of 320 x 240 pixels"):
+    with pytest.raises(BoxError, match="over twice as large as the frame of 320 x 240"):
         getattr(detector, place)(scene((60, 50)), Box(*box))
     assert detector.step(scene((60, 50)))[0].state != "absent"
 

@@ -162,7 +162,7 @@ def test_a_moved_first_box_is_found_again_and_a_different_one_is_not(tmp_path, s
     ("count", "trackers", "message"),
     [
         (1, ["catstream", "kfc"], "unknown tracker 'kfc'"),
-        (2, ["catstream"], "two sequences are named 'walk'"),
+        (2, ["catstream"], "duplicate sequence name 'walk'"),
         (1, [], "missing tracker"),
     ],
 )
@@ -178,8 +178,8 @@ def test_a_failing_sequence_is_named_and_the_others_run(tmp_path, sequence, long
     assert [run.name for run in found] == ["walk"]
     assert load(tmp_path, "mil", sequence, FIRST) is not None
     (error,) = errors
-    assert re.match(r"mil on longer: .* 1 frame too few", str(error))
-    with pytest.raises(CatstreamError, match=r"mil on longer: .* too few"):  # without a handler
+    assert re.match(r"mil on longer: .* fewer frames than boxes", str(error))
+    with pytest.raises(CatstreamError, match=r"mil on longer: .* fewer frames"):  # without a handler
         evaluate([longer], ["mil"], SETTINGS)
 
 

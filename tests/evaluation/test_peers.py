@@ -33,7 +33,7 @@ def test_the_model_files_that_a_tracker_lacks_are_named_before_the_first_run(tmp
     with pytest.raises(SettingsError, match=r"needs object_tracking_vittrack_2023sep.onnx: .* --peer-models"):
         evaluate([sequence], ["mil", "vit"], Settings())
     (tmp_path / "nanotrack_backbone_sim.onnx").touch()
-    with pytest.raises(SettingsError, match=r"has no nanotrack_head_sim.onnx: put it there"):
+    with pytest.raises(SettingsError, match=r"missing model file of .*: add nanotrack_head_sim.onnx"):
         evaluate([sequence], ["nano"], Settings(), peer_models=str(tmp_path))
 
 

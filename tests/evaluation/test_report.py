@@ -90,7 +90,7 @@ def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk, 
     code, output, errors = said("evaluate", tmp_path / "all", *options)
     assert re.search(r"walk +mil +12 +0\.\d{3}", output)
     page = (tmp_path / "out" / "report.html").read_text()
-    for message in (r"mil on torn: .* 1 frame too few", r"malformed/groundtruth_rect.txt\S* has one box"):
+    for message in (r"mil on torn: .* fewer frames than boxes", r"malformed/groundtruth_rect.txt\S* has one box"):
         assert re.search(message, errors)
         assert re.search(message, page)
     assert (code, "2 of 3 runs" in errors.splitlines()[-1]) == (1, True)
@@ -100,8 +100,8 @@ def test_failed_runs_are_reported_after_the_table_of_the_others(tmp_path, walk, 
 def test_an_unfit_json_path_is_an_error_before_the_work(tmp_path, walk, fail):
     (tmp_path / "video.mp4").write_bytes(b"a video")
     for place, why in (
-        (tmp_path, "give a file in a folder that exists"),
-        (tmp_path / "a" / "b", "give a file in a folder that exists"),
+        (tmp_path, "pass a file in an existing folder"),
+        (tmp_path / "a" / "b", "pass a file in an existing folder"),
         (tmp_path / "video.mp4", "only a file whose name ends with .json is replaced"),
     ):
         assert why in fail("evaluate", walk, "--tracker", "mil", "--json", place)
@@ -112,7 +112,7 @@ def test_a_report_that_cannot_be_written_is_an_error_of_one_line_after_the_table
     code, output, errors = said("evaluate", walk, "--tracker", "mil", "--output", tmp_path)
     assert re.search(r"walk +mil +12", output)
     place = str(tmp_path / "report.html")
-    assert (code, errors) == (1, f"catstream: cannot write {place!r} (Is a directory): give another place\n")
+    assert (code, errors) == (1, f"catstream: cannot write {place!r} (Is a directory): use another folder\n")
 
 
 def test_neither_command_nor_machine_tell_folders_or_the_host_name():

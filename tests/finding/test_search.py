@@ -145,9 +145,9 @@ def test_an_unreadable_file_is_an_error_after_the_detections_of_the_others(model
 def test_models_without_a_file_or_with_one_name_are_errors(model_files, tmp_path):
     with pytest.raises(ServiceError, match="no saved model"):
         load_models([tmp_path / "none.model"])
-    with pytest.raises(SettingsError, match="named 'dahlia'"):
+    with pytest.raises(SettingsError, match="duplicate model name 'dahlia'"):
         load_models([model_files[0], model_files[0]])
-    with pytest.raises(SettingsError, match="at least one model"):
+    with pytest.raises(SettingsError, match="missing model"):
         load_models([])
     (tmp_path / "cut.model").write_bytes(model_files[0].read_bytes()[:500])
     with pytest.raises(ProtocolError):
@@ -156,7 +156,7 @@ def test_models_without_a_file_or_with_one_name_are_errors(model_files, tmp_path
 
 @pytest.mark.parametrize("sizes", [(2, 1), (0, 1), (1, np.nan), (1, np.inf)])
 def test_sizes_are_two_positive_numbers_in_order(model_files, appearing, sizes):
-    with pytest.raises(SettingsError, match="the smaller one first, got"):
+    with pytest.raises(SettingsError, match="the smallest and the largest size, got"):
         catstream.find(model_files[0], appearing, sizes=sizes)
 
 

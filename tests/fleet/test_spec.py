@@ -109,7 +109,7 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
     [
         ('[streams.cam-7]\nsource="0"\n[streams.cam-7]\nsource="1"', "this is not TOML: Cannot declare ('streams', "),
         ('[streams.cam-7]\nsource=', "this is not TOML: Invalid value (at end of document)"),
-        ("", "it has no streams: add a table for each, for example [streams.cam-1]"),
+        ("", "missing streams: add a table for each, for example [streams.cam-1]"),
         ("[stream.cam-1]\nsource='0'", "there is no key 'stream', did you mean 'streams'?"),
         ("streams = 3", "streams must be tables [streams.NAME], got 3"),
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
@@ -130,8 +130,8 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
 @pytest.mark.parametrize(
     ("line", "error"),
     [
-        ("", "it has no source: give a text as `catstream track` takes it, for example source ="),
-        ("source = ' '", "it has no source"),
+        ("", "missing source: add one as for `catstream track`, for example source ="),
+        ("source = ' '", "missing source"),
         ("source = 7", "source must be a text, got 7"),
         ("sorce = '0'", "there is no key 'sorce', did you mean 'source'? there are source, box"),
         ("source = '0'\nbox = [1, 2, 3]", "a box is four numbers x,y,w,h in pixels, got [1, 2, 3]"),
@@ -139,9 +139,8 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
         ("source = '0'\nboxes = { anna = [1, 2, nan, 4] }", "the box of anna: a box needs four finite numbers"),
         ("source = '0'\nboxes = { 'a b' = [1, 2, 3, 4] }", "'a b' is not a name: expected text of 1 to 64 letters"),
         ("source = '0'\nboxes = [1, 2, 3, 4]", "boxes must be a table, for example { anna = [120, 80, 64, 48] }, got"),
-        ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "it has both box and boxes: write all objects in boxes"),
-        ("source = '0'\nbox = [1, 2, 3, 4]\nmodel = 'a'", "the object without a name: a box gives the position of an "
-         "object, and a model searches for it: give one of them"),
+        ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "box and boxes are mutually exclusive: write all"),
+        ("source = '0'\nbox = [1, 2, 3, 4]\nmodel = 'a'", "box and model of the object without a name are mutually"),
         ("source = '0'\nmodel = 3", "model must be a text, got 3"),
         ("source = '0'\nsettings = { 'coreset.sise' = 1 }", "there is no setting 'coreset.sise', did you mean 'core"),
         ("source = '0'\nsettings = { 'coreset.size' = 0 }", "setting coreset.size cannot be 0: it takes int"),

@@ -15,7 +15,7 @@ from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import ProtocolError, ServiceError
 from catstream.jobs.job import Job, Results, SinkOptions
-from catstream.jobs.state import files, locked, restore
+from catstream.jobs.state import files, locked, locked_for_run, restore
 from catstream.messages import storage
 
 JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240),
@@ -105,7 +105,7 @@ def test_a_folder_is_locked_by_one_process_and_free_once_that_is_killed(tmp_path
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as owner:
         owner.stdout.readline()
-        with pytest.raises(ServiceError, match="stop it, or give another folder"), locked(tmp_path):
+        with pytest.raises(ServiceError, match="stop it, or use another folder"), locked(tmp_path):
             pass
         owner.kill()
     with locked(tmp_path):
@@ -147,3 +147,12 @@ def test_a_resumed_run_keeps_the_options_of_its_destinations_unless_some_are_giv
     assert Results().after(earlier) == earlier
     assert Results(video=False, write=()).after(Results(video=True, write=("-",))) == Results(video=False, write=())
     assert Results(options=SinkOptions(events=("lost",))).after(earlier).options == SinkOptions(events=("lost",))
+
+
+def test_a_state_folder_without_its_job_is_not_said_to_be_resumable(tmp_path):
+    (tmp_path / "trees").mkdir()
+    with (
+        pytest.raises(ServiceError, match=r"without its job\.safetensors, which cannot be continued: use another"),
+        locked_for_run(tmp_path, None, JOB),
+    ):
+        pass

@@ -109,7 +109,7 @@ def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
 def test_a_file_without_one_of_the_trees_is_an_error(learned, tree):
     arrays, metadata = storage.decode(learned.to_bytes(), "one")
     trees = {name: each for name, each in metadata["trees"].items() if name != tree}
-    with pytest.raises(ProtocolError, match=f"it has no tree '{tree}': learn the object again"):
+    with pytest.raises(ProtocolError, match=f"it has no tree '{tree}': track the object again"):
         SavedModel.from_bytes(storage.encode(arrays, {**metadata, "trees": trees}), "one")
 
 
@@ -167,7 +167,7 @@ def test_models_that_do_not_fit_are_not_merged(learned):
     other = Settings(coreset={"size": 16})
     for wrong, why in (
         (learn(stream(2), other), "coreset.size=8, another coreset.size=16"),
-        (learn(stream(2), name="ben"), "of 'anna', another of 'ben'"),
+        (learn(stream(2), name="ben"), r"different objects \('anna', 'ben'\)"),
     ):
         with pytest.raises(SettingsError, match=why):
             merge([learn(stream(1), name="anna"), wrong])
@@ -216,8 +216,11 @@ def test_a_file_without_any_of_its_parts_is_an_error(learned):
     ("mebibytes", "message"),
     [
         ({"anna": 63, "ben": 63, "": 63}, None),
-        ({"anna": 64}, "the saved model of anna has 64 MiB, at most 63 are possible: .*coreset.size"),
-        ({"a": 60, "b": 60, "c": 60, "d": 30}, "a, b, c, d have 210 MiB together, at most 200 can begin in one frame"),
+        ({"anna": 64}, r"the saved model of anna is too large \(64 MiB, limit 63\): .*coreset.size"),
+        (
+            {"a": 60, "b": 60, "c": 60, "d": 30},
+            r"a, b, c, d are too large .*\(210 MiB together, limit 200\)",
+        ),
     ],
 )
 def test_saved_models_that_begin_in_one_frame_fit_into_a_message(mebibytes, message):

@@ -143,7 +143,7 @@ def test_a_loop_ends_with_an_error_if_another_thread_closes_the_pipeline(video, 
         loop = pool.submit(list, waiting)
         until(lambda: waiting.health)
         waiting.close()
-        with pytest.raises(ServiceError, match="the pipeline was closed, perhaps by another thread"):
+        with pytest.raises(ServiceError, match="the pipeline is closed"):
             loop.result()
 
 

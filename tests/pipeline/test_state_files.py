@@ -88,5 +88,5 @@ def test_without_the_last_frame_of_its_program_a_run_continues_after_the_checkpo
 
 
 def test_a_model_that_could_not_be_saved_is_an_error_before_the_run(video, tmp_path):
-    with pytest.raises(ServiceError, match="none/anna: give a file in a folder that exists"):
+    with pytest.raises(ServiceError, match="none/anna: pass a file in an existing folder"):
         Pipeline(video[0], video[1][0], save_model=tmp_path / "none" / "anna")

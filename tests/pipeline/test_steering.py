@@ -195,7 +195,7 @@ def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
 @pytest.mark.parametrize("torn", ["", "{", "null", '{"objects": {"": [1, 2]}}'], ids=repr)
 def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
     (tmp_path / "desired_state.json").write_text(torn)
-    with pytest.raises(ProtocolError, match="the desired state cannot be read"):
+    with pytest.raises(ProtocolError, match="cannot read the desired state"):
         DesiredState.load(tmp_path / "desired_state.json")
 
 
@@ -207,7 +207,7 @@ def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video,
     (tmp_path / "kept" / "desired_state.json").write_text("{")
     with Pipeline(resume=tmp_path / "kept", settings=settings) as pipeline:
         tracks = list(pipeline)
-    assert "the desired state cannot be read" in pipeline.trouble["detector"]
+    assert "cannot read the desired state" in pipeline.trouble["detector"]
     assert pipeline.restarts == 0
     assert 0 < tracks[0].frame <= before.frame + SETTINGS.run.unstored_frames
     assert tracks[0].model_version > 0, "what was learned is whole"

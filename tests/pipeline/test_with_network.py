@@ -103,9 +103,9 @@ def test_a_saved_model_is_searched_for_and_found_with_its_network_only(video, sa
     assert best.box.overlap(video[1][best.frame]) > 0.5
     another(net)
     for network in ("", str(net)):
-        with pytest.raises(SettingsError, match=r"was learned with the network of digest \w+, this run has"):
+        with pytest.raises(SettingsError, match=r"was trained with the network of digest \w+, this run has"):
             Pipeline(video[0], settings={"features.network": network}, model=saved)
-        with pytest.raises(SettingsError, match=r"was learned with the network of digest \w+, this search has"):
+        with pytest.raises(SettingsError, match=r"was trained with the network of digest \w+, this search has"):
             find(saved, video[0], network=network)
 
 
@@ -124,7 +124,7 @@ def test_saved_models_of_one_network_are_merged_and_of_two_are_not(video, expect
     whole = merge([one, learned(settings)])
     assert (whole.model.network, len(whole.model.weights)) == (one.model.network, len(one.model.weights))
     another(net)
-    with pytest.raises(SettingsError, match=r"learned with the network of digest \w+, another with the network of"):
+    with pytest.raises(SettingsError, match=r"trained with the network of digest \w+, another with the network of"):
         merge([one, learned(settings | {"features.network": str(net)})])
     with pytest.raises(SettingsError, match="another with no network"):
         merge([one, learned({})])

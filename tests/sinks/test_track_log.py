@@ -167,7 +167,7 @@ def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_o
     with pytest.raises(VideoError, match=r"t\.csv exists already"):
         run.check(overwrite=False, earlier=run.places[:2])
     Path(run.places[3]).touch()
-    with pytest.raises(VideoError, match=r"t\.mcap cannot be continued: to resume, give other destinations"):
+    with pytest.raises(VideoError, match=r"t\.mcap cannot be continued: pass other destinations to resume"):
         run.check(overwrite=False, earlier=run.places)
 
 
@@ -176,8 +176,8 @@ def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_o
     [
         ("t.xls", r"one of .ndjson, -, .csv, .*where - is"),
         ("t.txt", "for other formats use catstream export"),
-        ("ftp://host/t.csv", "ftp://host/t.csv is no destination of tracks"),
-        ("none/t.csv", "a folder that exists and that you may write to"),
+        ("ftp://host/t.csv", "ftp://host/t.csv is not a destination of tracks"),
+        ("none/t.csv", "an existing folder that you may write to"),
     ],
 )
 def test_destinations_that_cannot_be_written_are_rejected_before_the_run(tmp_path, name, words):
@@ -190,16 +190,16 @@ def test_destinations_that_cannot_be_written_are_rejected_before_the_run(tmp_pat
 def test_the_source_is_not_replaced_and_a_live_one_gives_no_video(tmp_path):
     source, _ = write(tmp_path, 4, (320, 240))
     with pytest.raises(VideoError, match=r"demo\.mp4 is the source, which would be lost"):
-        RunFiles(Origin(str(source)), None, [str(source)]).check(overwrite=True, earlier=[])
-    live = RunFiles(Origin("rtsp://me:secret@127.0.0.1/cam"), None, [str(tmp_path / "t.mp4")])
+        RunFiles(Origin(Head(source=str(source))), None, [str(source)]).check(overwrite=True, earlier=[])
+    live = RunFiles(Origin(Head(source="rtsp://127.0.0.1/cam")), None, [str(tmp_path / "t.mp4")])
     with pytest.raises(VideoError, match=r"but rtsp://127.0.0.1/cam is live"):
         live.check(overwrite=False, earlier=[])
 
 
 def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
     source, _ = demo_video(8)
-    part = slice(1, 8, 2)  # frames 1, 3, 5, 7, counted 0 to 3
-    sink = open_sink(str(tmp_path / "walk.mp4"), Origin(str(source), part))
+    head = Head(source=str(source), start=1, stride=2)  # frames 1, 3, 5, 7, counted 0 to 3
+    sink = open_sink(str(tmp_path / "walk.mp4"), Origin(head))
     for each in TRACKS:
         sink.write(TrackedFrame([each]))
     with pytest.raises(VideoError, match="has no frame 4"):

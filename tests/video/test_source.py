@@ -396,7 +396,7 @@ def test_the_aspect_of_pixels_is_that_of_the_frame_as_it_is_turned(tmp_path):
 
 
 def test_a_start_after_the_end_is_an_error(video):
-    with pytest.raises(VideoError, match="has 5 frames, numbered from 0, and none from frame 5 on"):
+    with pytest.raises(VideoError, match=r"the first frame, 5, is after the end of .* \(5 frames\)"):
         open_source(video("a.avi", frames=5), start=5)
 
 
@@ -410,7 +410,7 @@ def test_a_video_without_a_frame_that_can_be_decoded_is_an_error_that_says_so(vi
 
 
 def test_a_device_that_cannot_decode_a_video_is_an_error_that_names_those_there_are(video):
-    with pytest.raises(VideoError, match=r"no device of the kind 'abacus' can .*this FFmpeg knows .*the processor"):
+    with pytest.raises(VideoError, match=r"run.hwaccel=abacus cannot decode .*omit it .*choose one of"):
         open_source(video("a.mp4", frames=5), hwaccel="abacus")
 
 

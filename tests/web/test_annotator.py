@@ -88,7 +88,7 @@ def test_all_frames_of_an_object_are_checked_between_right_boxes(page, edit, dem
     [
         ({"object": "anna", "frame": 0, "box": [900, 2, 30, 40]}, "outside the frame"),
         ({"object": "anna", "frame": 0, "box": [9, 2, 1, 1]}, "at least 2 pixels"),
-        ({"object": "anna", "frame": 99, "box": [9, 2, 30, 40]}, "frame 99 is not in the video"),
+        ({"object": "anna", "frame": 99, "box": [9, 2, 30, 40]}, "frame 99 is outside the video"),
         ({"object": "no name", "frame": 0, "box": [9, 2, 30, 40]}, "is not a name"),
         ({"object": "anna", "frame": 0}, "anna has no box"),
         ({"object": "anna", "frame": 0, "box": [9, 2, 30]}, "expected edit in JSON"),

@@ -120,7 +120,7 @@ def test_keys_are_not_written_over(keys):
     before = {path: path.read_bytes() for path in keys.parent.glob("**/*") if path.is_file()}
     with pytest.raises(ServiceError, match="holds keys already"):
         create(keys)
-    with pytest.raises(ServiceError, match="not written over"):
+    with pytest.raises(ServiceError, match="not overwritten"):
         allow(keys, "other", "watch", output=keys.parent / "watcher")
     with pytest.raises(ServiceError, match="a client operator already"):
         allow(keys, "operator", "control", output=keys.parent / "other")

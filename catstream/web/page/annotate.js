@@ -1,12 +1,12 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
 
-import { $, add, Items, make, many, write } from "./dom.js";
+import { $, add, duration, Items, make, many, write } from "./dom.js";
 import { Stage } from "./stage.js";
 
 const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
 const CHECKS = { keyframe: "your box", checked: "checked", unchecked: "may be wrong" };
-const KEYS = { n: "next", Enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
+const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
 
 /** The picture of a frame; a box is saved as soon as it is drawn. */
 class FrameStage extends Stage {
@@ -16,7 +16,9 @@ class FrameStage extends Stage {
 
   release(clicked) {
     super.release(clicked);
-    if (this.box) this.accept().then(() => this.cancel());
+    const { box } = this;
+    this.cancel();
+    if (box) this.actions.follow([box.x, box.y, box.w, box.h]);
   }
 }
 
@@ -24,16 +26,17 @@ class AnnotatePage {
   constructor() {
     Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: false });
     this.work = { began: 0, done: 0, remaining: 0 }; // time of the start of the passes that run, and their frames
-    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box), changed: () => {} });
+    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {} });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
       first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
       new: () => this.choose(null), done: () => this.done() };
     for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
     $("#slider").oninput = () => this.go(Number($("#slider").value));
-    $("#name").onchange = () => this.rename();
+    $("#name").onchange = () => { this.renaming = this.rename(); };
     $("#naming").onsubmit = (event) => { event.preventDefault(); $("#name").blur(); };
     addEventListener("keydown", (event) => this.key(event));
+    addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // Enter means next again
     new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
     const events = new EventSource("events");
     events.onmessage = ({ data }) => this.receive(JSON.parse(data));
@@ -46,13 +49,13 @@ class AnnotatePage {
     this.silent = Boolean(closed);
     if (!closed) {
       const { work } = this;
-      const before = this.state?.objects ?? [];
+      const before = this.state;
       if (!work.remaining) Object.assign(work, { began: Date.now(), done: 0 });
       work.done += Math.max(0, work.remaining - state.remaining);
       work.remaining = state.remaining;
       this.state = state;
-      if (!before.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
-      this.load();
+      if (!before?.objects.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
+      if (state.revision !== before?.revision) this.load();
     }
     this.show();
   }
@@ -63,17 +66,17 @@ class AnnotatePage {
   }
 
   get(name) {
-    return name in WAYS ? { colour: WAYS[name] } : this.state?.objects.find((one) => one.name === name);
+    return Object.hasOwn(WAYS, name) ? { colour: WAYS[name] } : this.state?.objects.find((one) => one.name === name);
   }
 
   /** Choose an object, null for a new one; a proposal is taken. */
   choose(name) {
-    if (name in WAYS) return this.take(name);
+    if (Object.hasOwn(WAYS, name)) return this.take(name);
     this.chosen = name;
     let number = 1;
     while (this.get(`object-${number}`)) number += 1;
     $("#name").value = name ?? `object-${number}`;
-    if (name === null && this.state?.objects.length) $("#name").select();
+    if (name === null && this.state?.objects.length) $("#name").select(), $("#name").focus();
     this.showBoxes();
     this.show();
   }
@@ -82,6 +85,7 @@ class AnnotatePage {
   go(frame, name = this.chosen) {
     this.stage.cancel();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
+    this.boxes = {}; // those of another frame cannot be taken
     if (name !== this.chosen) this.choose(name);
     this.show();
     this.load();
@@ -117,6 +121,14 @@ class AnnotatePage {
     return Object.fromEntries(Object.keys(WAYS).flatMap((name, way) => (proposals[way] ? [[name, proposals[way][0]]] : [])));
   }
 
+  /** What is known of the chosen object in this frame. */
+  get check() {
+    const { box, checked, proposals } = this.boxes[this.chosen] ?? {};
+    if (!checked) return "";
+    if (checked === "unchecked" && !proposals.some(Boolean)) return "not tracked yet";
+    return (box ? "" : "absent, ") + CHECKS[checked];
+  }
+
   showBoxes() {
     if (!this.stage.picture) return;
     const proposed = Object.entries(this.proposals), known = Object.entries(this.boxes).map(([name, { box }]) => [name, box]);
@@ -139,10 +151,11 @@ class AnnotatePage {
     return answer.done ? answer : null;
   }
 
-  /** Save the box of the chosen object in this frame, or of a new one; null if it is absent. */
-  async set(box) {
+  /** Save the box of the chosen object, or of a new one, in the frame that is shown; null if it is absent. */
+  async set(box, frame = this.frame) {
+    if (this.stage.picture?.frame !== frame) return null; // another one is shown still
+    await this.renaming;
     const object = this.chosen ?? $("#name").value.trim();
-    const { frame } = this;
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
     if (answer && this.chosen === null) this.choose(object.normalize("NFC"));
     return answer;
@@ -195,7 +208,7 @@ class AnnotatePage {
     if (this.stage.drawing) return this.stage.key(event);
     if (key in steps) this.go(this.frame + steps[key]);
     else if (key === "z") this.undo();
-    else if (key.length === 1 || target.tagName !== "BUTTON") $(`#${KEYS[key.length === 1 ? key.toLowerCase() : key]}`)?.click();
+    else if (key.toLowerCase() in KEYS && (key !== "Enter" || target.tagName !== "BUTTON")) $(`#${KEYS[key.toLowerCase()]}`).click();
     else return;
     event.preventDefault();
   }
@@ -206,7 +219,10 @@ class AnnotatePage {
     add(choose, "i", { className: "swatch" });
     add(choose, "b", { textContent: name || "no name" });
     const line = make("svg", { role: "img", preserveAspectRatio: "none" });
-    line.onclick = (event) => this.jump(Math.floor(this.state.frames * event.offsetX / line.clientWidth), name);
+    line.onclick = ({ clientX }) => {
+      const { left, width } = line.getBoundingClientRect();
+      this.jump(Math.floor(this.state.frames * (clientX - left) / width), name);
+    };
     element.append(line);
     return { element, choose, line, share: add(element, "span", { className: "share number" }) };
   }
@@ -214,11 +230,11 @@ class AnnotatePage {
   fillRow({ element, choose, line, share }, { name, colour, keyframes, unchecked, frames, frame, chosen }) {
     element.style.setProperty("--colour", colour);
     choose.setAttribute("aria-pressed", String(chosen));
-    const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, height: 1 });
-    const mark = (kind, place) => make("line", { class: kind, x1: place + 0.5, x2: place + 0.5, y2: 1 });
-    line.setAttribute("viewBox", `0 0 ${frames} 1`);
+    const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, y: 1, height: 3 });
+    const mark = (kind, place) => make("line", { class: kind, x1: place + 0.5, x2: place + 0.5, y2: 5 });
+    line.setAttribute("viewBox", `0 0 ${frames} 5`);
     line.replaceChildren(bar("right", 0, frames - 1), ...unchecked.map(([first, last]) => bar("wrong", first, last)),
-      ...keyframes.map((place) => mark("", place)), mark("now", frame));
+      mark("now", frame), ...keyframes.map((place) => mark("", place)));
     const wrong = unchecked.reduce((sum, [first, last]) => sum + last - first + 1, 0);
     const percent = Math.floor(100 * (1 - wrong / frames));
     write(share, `${percent}%`);
@@ -226,7 +242,7 @@ class AnnotatePage {
   }
 
   show() {
-    const { state, frame, chosen, boxes, ended, silent, following, proposals } = this;
+    const { state, frame, chosen, ended, silent, following, proposals } = this;
     const objects = state?.objects ?? [], known = this.get(chosen);
     const [kind, words] = this.progress();
     $("#state").dataset.state = kind;
@@ -239,7 +255,7 @@ class AnnotatePage {
     Object.assign($("#slider"), { max: state.frames - 1, value: frame });
     write($("#frame"), `${frame} of ${state.frames}`);
     $("#naming").style.setProperty("--colour", known?.colour ?? "transparent");
-    write($("#check"), boxes[chosen] ? `${chosen || "The object"} in frame ${frame}: ${boxes[chosen].box ? "" : "absent, "}${CHECKS[boxes[chosen].checked]}` : "A new object: draw its box");
+    write($("#check"), known ? `${chosen || "The object"} in frame ${frame}: ${this.check}` : "A new object: draw its box");
     for (const [id, name] of [["first", "1 forwards"], ["second", "2 backwards"]]) {
       write($(`#${id} span`), `Take ${name.slice(2)}${name in proposals && !proposals[name] ? ": absent" : ""}`);
       $(`#${id}`).disabled = !(name in proposals);
@@ -266,7 +282,7 @@ class AnnotatePage {
     if (!state.decoded) return ["bootstrapping", `decoding: ${many(state.frames, "frame")}`];
     if (!state.remaining) return ["present", "all boxes saved"];
     const seconds = work.done ? Math.ceil(state.remaining * (Date.now() - work.began) / work.done / 1000) : null;
-    return ["bootstrapping", `tracking${seconds === null ? "" : `: ${seconds} s left`}`];
+    return ["bootstrapping", `tracking${seconds === null ? "" : `: ${duration(seconds)} left`}`];
   }
 
   overlay() {

@@ -114,7 +114,7 @@ export class BoxForm {
   check() {
     this.name.value = this.name.value.trim().normalize("NFC");
     const taken = this.objects.get(this.name.value);
-    this.name.setCustomValidity(taken?.name ? `There is an object ${taken.name} already: give another name.` : "");
+    this.name.setCustomValidity(taken?.name ? `There is an object ${taken.name} already: use another name.` : "");
     return this.form.reportValidity();
   }
 

@@ -1,0 +1,100 @@
+// What a person does on the page of catstream annotate, by mouse and keys; says what was seen, a line each.
+//   node annotate.mjs URL CHROMIUM PROFILE BOXES WIDTH HEIGHT, with the boxes in the first and the last frame as JSON
+
+import { axe, errorsOf, patience, placeOf, violationsOf, withBrowser } from "./browser.mjs";
+
+const [url, executablePath, profile, boxes, ...size] = process.argv.slice(2);
+const [first, last] = JSON.parse(boxes), [width, height] = size.map(Number);
+
+await withBrowser(executablePath, profile, async (browser) => {
+  const page = await browser.newPage();
+  await page.setViewportSize({ width: 1100, height: 800 });
+  const wrong = errorsOf(page);
+  await page.goto(url);
+  const text = (selector) => page.locator(selector).innerText();
+  const says = (selector, words) => page.waitForFunction(([each, wanted]) => document.querySelector(each).textContent.includes(wanted), [selector, words], patience);
+  const draw = async ([x, y, w, h]) => {
+    const view = await placeOf(page, "#picture");
+    const scale = Math.min(view.width / width, view.height / height);
+    const [left, top] = [view.x + (view.width - width * scale) / 2, view.y + (view.height - height * scale) / 2];
+    await page.mouse.move(left + x * scale, top + y * scale);
+    await page.mouse.down();
+    await page.mouse.move(left + (x + w / 2) * scale, top + (y + h / 2) * scale);
+    await page.mouse.move(left + (x + w) * scale, top + (y + h) * scale);
+    await page.mouse.up();
+  };
+  const name = async (words) => {
+    await page.fill("#name", words);
+    await page.press("#name", "Enter");
+  };
+  const keys = async (...each) => {
+    for (const key of each) await page.keyboard.press(key);
+  };
+
+  await page.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
+  await says("#next", "Draw the first box");
+  await name("no name");
+  await draw(first);
+  await says("#message", "is not a name");
+  console.log("refused", await text("#message"));
+  await name("anna");
+  await draw(first);
+  await says("#check", "anna in frame 0: your box");
+  await says("#next", "Look next at frame 23, anna");
+  await keys("n");
+  await says("#check", "anna in frame 23");
+  await keys("d", "ArrowLeft", "Shift+ArrowUp", "Enter");
+  await says("#check", "anna in frame 23: your box");
+  await keys("u");
+  await page.waitForFunction(() => !document.querySelector("#check").textContent.includes("your box"), null, patience);
+  await draw(last);
+  await says("#next", "All frames are checked");
+  console.log("checked", await text("#timelines"));
+
+  await keys("ArrowLeft");
+  await says("#check", "anna in frame 22: checked");
+  await keys("PageUp");
+  await says("#check", "anna in frame 0: your box");
+  await keys("o");
+  await name("ben");
+  await draw([20, 150, 60, 60]);
+  await says("#check", "ben in frame 0: your box");
+  await says("#next", "Look next at frame 23, ben");
+  await page.click("#next");
+  await keys("a");
+  await says("#check", "ben in frame 23: absent, your box");
+  await draw([220, 170, 60, 60]); // another place: the directions do not agree
+  await says("#check", "ben in frame 23: your box");
+  await page.waitForFunction(() => !document.querySelector("#next").disabled, null, patience);
+  await keys("n");
+  await says("#check", "may be wrong");
+  console.log("proposals", (await page.locator("#stage text").allTextContents()).sort().join());
+  await keys("1");
+  await says("#check", "your box");
+  await keys("b");
+  await says("#check", "ben in frame 23");
+  await name("carl");
+  await says("#timelines", "carl");
+  await keys("Control+z");
+  await says("#check", "may be wrong");
+  await page.locator("#timelines svg").first().click();
+  await says("#check", "anna in frame 12: checked");
+  console.log("objects", (await page.locator("#timelines b").allInnerTexts()).join());
+
+  await page.evaluate(axe);
+  for (const colorScheme of ["light", "dark"]) {
+    await page.emulateMedia({ colorScheme });
+    console.log("violations", colorScheme, JSON.stringify(await violationsOf(page)));
+  }
+  for (const [wide, high] of [[390, 844], [1920, 1080]]) {
+    await page.setViewportSize({ width: wide, height: high });
+    console.log("overflow", await page.evaluate(() => document.documentElement.scrollWidth - innerWidth));
+  }
+  const other = await browser.newPage();
+  await other.goto(url);
+  await other.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
+  await page.click("#done");
+  await says("#overlay", "Done: the results are written");
+  await other.waitForFunction(() => document.querySelector("#overlay").textContent.includes("does not answer"), null, patience);
+  console.log("errors", JSON.stringify(wrong.filter((line) => !/40[04]|ERR_/.test(line))));
+});

@@ -1,0 +1,36 @@
+"""The page of `catstream annotate` in a real browser: a video is annotated by mouse and keys."""
+
+import csv
+import json
+import os
+import subprocess
+
+import pytest
+
+FRAMES, SIZE = 24, (320, 240)
+
+pytestmark = pytest.mark.system
+
+
+def test_a_video_is_annotated_by_mouse_and_keys(script_of_browser, catstream, demo_video, tmp_path):
+    video, truth = demo_video(FRAMES)
+    out = tmp_path / "out"
+    process = catstream("annotate", video, "--output", out, "--listen", "0", env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    link, boxes = process.stdout.readline().strip(), json.dumps([truth[0], truth[-1]])
+    run = subprocess.run(
+        script_of_browser("annotate.mjs", link, boxes, *map(str, SIZE)), capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    lines = run.stdout.splitlines()
+    assert lines[0].startswith("refused 'no name' is not a name: expected")
+    assert "proposals 1 forwards,2 backwards,anna" in lines
+    assert "objects anna,carl" in lines
+    assert [line for line in lines if line.startswith("violations")] == ["violations light []", "violations dark []"]
+    assert [line for line in lines if line.startswith("overflow")] == ["overflow 0", "overflow 0"]
+    assert lines[-1] == "errors []"
+    assert process.wait(60) == 0
+    with (out / "keyframes.csv").open() as file:
+        drawn = {(row["object"], int(row["frame"])): row["x"] for row in csv.DictReader(file)}
+    assert {*drawn} == {("anna", 0), ("anna", FRAMES - 1), ("carl", 0), ("carl", FRAMES - 1)}
+    assert float(drawn["anna", 0]) == pytest.approx(truth[0].x, abs=1)
+    assert len((out / "demo.ndjson").read_text().splitlines()) == 1 + 2 * FRAMES
