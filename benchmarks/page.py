@@ -279,8 +279,8 @@ _DETAILS_HEAD = """
     The tables that [Results](../docs/results.md) leaves out or shortens, also written by `make results` from the
     records in `benchmarks/results`. [Benchmarks](README.md) describes each measurement."""
 _MORE_HEAD = """
-    A fleet under faults, and objects that are detected in other videos, written by `make results` from the records in
-    `benchmarks/results`."""
+    A fleet under faults, objects that are detected in other videos, and PCA of a stream of rows, written by `make
+    results` from the records in `benchmarks/results`."""
 _ROBUSTNESS = """
     How much the accuracy depends on the start and on the initial box. Written by `make results` from the records in
     `benchmarks/results`."""
@@ -307,6 +307,10 @@ _FOUND = """
     rendered object is learned in 76 frames before a plain background, and searched before other backgrounds, turned,
     scaled and in other lights. The machine was busy: only the ratios of times count. See [the
     how-to](../docs/how-to/find.md)."""
+_STREAMS = """
+    Excess is the squared reconstruction error of all rows, divided by that of a PCA of all rows, less 1. The machine
+    was busy, so processor seconds are shown, of BLAS with one thread; MB are added by the fit. In the second table,
+    `limited` sets OPENBLAS_NUM_THREADS=1, and `default` no variable. See [Coreset trees](../docs/coreset-trees.md)."""
 _SPEED = """
     Each tracker has one core, without decoding; only the three processes decode, and use all cores. A frame of a long
     run takes as long as one at its beginning."""
@@ -406,6 +410,7 @@ DETAILS = (
 MORE = (
     Section("A fleet under faults", _FLEET, (Shown("fleet_faults", _THREE), Shown("fleet_faults-free", select(1)))),
     Section("Objects found again", _FOUND, (Shown("instance", _THREE),)),
+    Section("PCA of a stream", _STREAMS, (Shown("sketch", several(select(0), select(1))),)),
 )
 
 ROBUSTNESS = (
