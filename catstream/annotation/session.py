@@ -16,6 +16,9 @@ from catstream.messages.kinds import Track
 #: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
 _LONG = 600
 
+#: Expected errors of a stretch from which a box is asked for while others are tracked.
+_WORTHWHILE = 3.0
+
 
 class _StoppedError(Exception):
     pass
@@ -177,7 +180,9 @@ class Session:
                 self._running[future] = task, count
                 future.add_done_callback(lambda _: self._wake())
         self.tracks = self.annotation.tracks
-        self.next_frames = [each for each in self.annotation.next_frames() if not self._is_tracked(each)]
+        least = _WORTHWHILE if self._missing else 0.0
+        following = (each for each in self.annotation.next_frames() if each.errors >= least)
+        self.next_frames = [each for each in following if not self._is_tracked(each)]
         self.revision += 1
 
     def _priority(self, task: Task) -> tuple[bool, int]:
