@@ -43,6 +43,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await says("#next", "Look next at frame 23, anna");
   await keys("n");
   await says("#check", "anna in frame 23");
+  await page.waitForSelector('#picture[src="frames/23.jpg"]', patience);
   await keys("d", "ArrowLeft", "Shift+ArrowUp", "Enter");
   await says("#check", "anna in frame 23: your box");
   await keys("u");
@@ -61,6 +62,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await says("#check", "ben in frame 0: your box");
   await says("#next", "Look next at frame 23, ben");
   await page.click("#next");
+  await page.waitForSelector('#picture[src="frames/23.jpg"]', patience);
   await keys("a");
   await says("#check", "ben in frame 23: absent, your box");
   await draw([220, 170, 60, 60]); // another place: the directions do not agree

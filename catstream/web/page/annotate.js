@@ -167,6 +167,7 @@ class AnnotatePage {
 
   /** Begin with the box that is there, to change it with the keyboard. */
   async draw() {
+    if (this.stage.picture?.frame !== this.frame) return; // another one is shown still
     await this.stage.begin();
     const { width, height } = this.stage.picture;
     const [x, y, w, h] = this.boxes[this.chosen]?.box ?? [width * 0.4, height * 0.4, width * 0.2, height * 0.2];
