@@ -163,7 +163,7 @@ class Session:
 
     def _schedule(self) -> None:
         """Store the passes that ended, stop those that are not missing any more, and start others."""
-        for future in [each for each in self._running if each.done()]:
+        for future in [future for future in self._running if future.done()]:
             del self._running[future]
             self.annotation.store(future)
         self._missing = self.annotation.missing()
@@ -173,7 +173,7 @@ class Session:
                 del self._running[future]
         running = [task for task, _ in self._running.values()]
         for task in sorted(self._missing, key=self._priority):
-            alike = [each for each in running if (each.frames > _LONG) == (task.frames > _LONG)]
+            alike = [other for other in running if (other.frames > _LONG) == (task.frames > _LONG)]
             if task not in running and len(alike) < self._jobs:
                 running.append(task)
                 future, count = self.annotation.submit(task)
@@ -181,15 +181,15 @@ class Session:
                 future.add_done_callback(lambda _: self._wake())
         self.tracks = self.annotation.tracks
         least = _WORTHWHILE if self._missing else 0.0
-        following = (each for each in self.annotation.next_frames() if each.errors >= least)
-        self.next_frames = [each for each in following if not self._is_tracked(each)]
+        frames = (frame for frame in self.annotation.next_frames() if frame.errors >= least)
+        self.next_frames = [frame for frame in frames if not self._is_tracked(frame)]
         self.revision += 1
 
     def _priority(self, task: Task) -> tuple[bool, int]:
         return (task.object, task.start) != self._newest and (task.object, task.stop) != self._newest, task.frames
 
     def _is_tracked(self, following: NextFrame) -> bool:
-        """Whether a missing pass may check the frame soon: none can at an end of the video without a box."""
+        """Return True if a missing pass may check the frame soon: none can at an end of the video without a box."""
         frame, ends = following.frame, (0, len(self.annotation.frames) - 1)
         soon = (task for task in self._missing if task.object == following.object and not _is_refinement(task))
         return frame not in ends and any(
@@ -198,5 +198,5 @@ class Session:
 
 
 def _is_refinement(task: Task) -> bool:
-    """Whether it is a long second pass, in which a person need not wait to add a box."""
+    """Return True for a long second pass, in which a person need not wait to add a box."""
     return task.use_memory and task.frames > _LONG

@@ -158,8 +158,8 @@ class Control(AbstractContextManager["Control"]):
         boxes: Mapping[str, Box] = MappingProxyType({}),
     ) -> Answer:
         """Send any command, and wait for its answer; the parameters are the fields of a `Command` of the protocol."""
-        for each in (*boxes.values(), *([] if box is None else [box])):
-            each.checked()
+        for one in (*boxes.values(), *([] if box is None else [box])):
+            one.checked()
         for name, number in (("seconds", seconds), ("time", time)):
             if number is not None and not (math.isfinite(number) and number >= 0):
                 raise ServiceError(f"{name} must be a finite number and not negative (got {number})")

@@ -84,8 +84,8 @@ class Beginnings:
                     self._commands.boxes.append(command)
                     continue
                 if command.boxes:
-                    begun, answered = self._together(command, frame)
-                    beginnings |= begun
+                    together, answered = self._together(command, frame)
+                    beginnings |= together
                 else:
                     (name,) = names
                     beginnings[name], answered = self._at_box(name, command, frame)

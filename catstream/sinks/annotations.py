@@ -110,9 +110,9 @@ def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None
 
 
 def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
-    """Write `CVAT for video 1.1`: a key frame for each box, and one that is outside where the object disappears.
+    """Write `CVAT for video 1.1`: a keyframe for each box, and one that is outside where the object disappears.
 
-    CVAT drops the boxes of a file that are no key frames, and interpolates. So those that a person drew in an
+    CVAT drops the boxes of a file that are no keyframes, and interpolates. So those that a person drew in an
     annotation are marked by the attribute `checked`.
 
     CVAT refuses a file with a frame that its video does not have, so a track that reaches the last frame of the source

@@ -290,7 +290,7 @@ class LiveSource(Source):
 class Backlog:
     """Decides which packets of a stream to drop because they arrive faster than they are decoded.
 
-    The latency would grow without limit. From two seconds on, only key frames are decoded until it is small again,
+    The latency would grow without limit. From two seconds on, only keyframes are decoded until it is small again,
     because no other frame refers to what was dropped. The latency is not measured by the camera's clock, which may
     drift: a stream whose decoder mostly waits for packets is on time.
     """
@@ -299,7 +299,7 @@ class Backlog:
         self._is_late = False
         self._min_age = math.inf  # arrival less time stamp of a packet on time
         self._decoded: float | None = None  # when the last packet was decoded
-        self._key = 0.0  # arrival of the last key frame
+        self._key = 0.0  # arrival of the last keyframe
         self._waited = 0.0  # seconds without a packet since then
 
     def drops(self, now: float, time: float | None, *, is_key: bool) -> bool:

@@ -18,7 +18,7 @@ The text is one of these:
 
 Files and images are read to the last frame, and no frame is skipped. If FFmpeg cannot decode a part of a file, the
 frames before it are returned and then `VideoError` is raised; with `run.skip_damaged`, reading continues at the next
-key frame. The other sources are live: see `catstream.video.live`.
+keyframe. The other sources are live: see `catstream.video.live`.
 """
 
 from __future__ import annotations
@@ -341,7 +341,7 @@ class _Video:
                     return
 
     def _decoded(self) -> Iterator[VideoFrame]:
-        """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next key frame."""
+        """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next keyframe."""
         import av
 
         decoder, skip, good = self.stream.codec_context, self.settings.skip_damaged, 0
