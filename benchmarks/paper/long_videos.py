@@ -113,7 +113,8 @@ def growth(journey: Journey) -> tuple[float, ...]:
     began, ended = (sum(float(each[part].mean()) for each in work) for part in (slice(few), slice(-few, None)))
     before = sum(looks[len(looks) // 10].megabytes for looks in journey.looks.values())
     after = sum(looks[-1].megabytes for looks in journey.looks.values())
-    return float(early), float(late), float(late / early), began, ended, ended / began, before, after
+    ratio = ended / began if began else 1.0  # of a few frames, whose time is less than a tick of the clock
+    return float(early), float(late), float(late / early), began, ended, ratio, before, after
 
 
 if __name__ == "__main__":

@@ -31,6 +31,8 @@ await withBrowser(executablePath, profile, async (browser) => {
     for (const key of each) await page.keyboard.press(key);
   };
 
+  const undone = () => page.waitForFunction(() => !document.querySelector("#check").textContent.includes("your box"), null, patience);
+
   await page.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
   await says("#next", "Draw the first box");
   await name("no name");
@@ -47,7 +49,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await keys("d", "ArrowLeft", "Shift+ArrowUp", "Enter");
   await says("#check", "anna in frame 23: your box");
   await keys("u");
-  await page.waitForFunction(() => !document.querySelector("#check").textContent.includes("your box"), null, patience);
+  await undone();
   await draw(last);
   await says("#next", "All frames are checked");
   console.log("checked", await text("#timelines"));
@@ -78,7 +80,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await name("carl");
   await says("#timelines", "carl");
   await keys("Control+z");
-  await says("#check", "may be wrong");
+  await undone();
   await page.locator("#timelines svg").first().click();
   await says("#check", "anna in frame 12: checked");
   console.log("objects", (await page.locator("#timelines b").allInnerTexts()).join());
