@@ -375,7 +375,7 @@ def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
     >>> _doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
     ['anna and ben have the same box: each costs time']
     >>> print(*_doubtful({"": Box(213, 121, 234, 216)}, 352, 288))
-    a box of 234x216 in a frame of 352x288: if 213,121,234,216 are two corners, give 213,121,21,95
+    a box of 234x216 in a frame of 352x288: if 213,121,234,216 are two corners, pass 213,121,21,95
     """
     whole = Box(0, 0, width, height)
     doubts = [

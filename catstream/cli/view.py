@@ -56,7 +56,8 @@ def _token_of_user() -> str:
     token = secrets.token_hex(16)
     try:
         file = state_home() / "view-token"
-        if file.exists() and file.stat().st_uid == os.geteuid() and not file.stat().st_mode & 0o077:
+        is_own = file.exists() and (not hasattr(os, "geteuid") or file.stat().st_uid == os.geteuid())
+        if is_own and not file.stat().st_mode & 0o077:
             return file.read_text(encoding="ascii").strip()
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_atomically(file, f"{token}\n".encode(), mode=0o600)

@@ -35,7 +35,7 @@ def spec(demo_video):
 @pytest.fixture
 def long_spec(demo_video):
     """A stream that runs for seconds after the store fails."""
-    path, truth = demo_video(400)
+    path, truth = demo_video(1000)
     return StreamSpec("cam-7", str(path), {"": Box(*truth[0])}, settings={"run.lockstep": True})
 
 

@@ -175,7 +175,7 @@ def test_a_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, fo
     settings = Settings(run={"endpoint": str(folder) if transport == "ipc" else tcp, "unstored_frames": 16})
     with Pipeline(path, boxes[0], settings) as first:
         with (
-            pytest.raises(ServiceError, match=r"(give|choose) another (endpoint|folder)"),
+            pytest.raises(ServiceError, match=r"(use|choose) another (endpoint|folder)"),
             Pipeline(path, boxes[0], settings),
         ):
             pass

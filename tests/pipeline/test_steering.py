@@ -347,7 +347,7 @@ def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_
         Pipeline(path, model=torn)
     with pytest.raises(ServiceError, match="no saved model"):
         Pipeline(path, model=tmp_path / "none")
-    with pytest.raises(SettingsError, match="one of them"):
+    with pytest.raises(SettingsError, match="box and model of the object without a name are mutually exclusive"):
         Pipeline(path, boxes[0], model=saved)
     with pytest.raises(SettingsError, match=r"learned with coreset.size=\d+, this run has coreset.size=5"):
         Pipeline(path, settings={"coreset.size": 5}, model=saved)

@@ -242,7 +242,7 @@ def test_events_for_a_receiver_that_stays_away_are_counted_at_the_end(monkeypatc
         ("http://host:0/secret", "expected https://"),
         ("http://host/secret hook", "a space is %20"),
         ("http://hóst/secret", "a space is %20"),
-        ("ftp://me:secret@host/one", "is no destination"),
+        ("ftp://me:secret@host/one", "is not a destination"),
     ],
 )
 def test_an_address_that_is_none_is_an_error_before_the_run_that_tells_no_password(place, words):
@@ -287,7 +287,7 @@ def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_
         (["--when", "lost=inf"], "is not in the range 0<=x<=86400"),
         (["--rate", "0"], "is not in the range 0<x<=1000"),
         (["--write", "mqtt://me:secret@host/#"], "has no valid topic"),
-        (["--write", "ftp://me:secret@host/a"], "ftp://host/a is no destination"),
+        (["--write", "ftp://me:secret@host/a"], "ftp://host/a is not a destination"),
     ],
 )
 def test_an_option_that_is_not_valid_is_an_error_of_one_line_before_the_run(demo_video, fail, words, error):

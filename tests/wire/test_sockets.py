@@ -54,7 +54,7 @@ def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint,
 
 def test_a_message_that_is_too_large_to_arrive_is_an_error_that_says_what_to_give(endpoint):
     small = replace(RESULTS, megabytes=0)
-    with Sender(small, endpoint, WINDOW) as sender, pytest.raises(ServiceError, match=r"smaller coreset\.size"):
+    with Sender(small, endpoint, WINDOW) as sender, pytest.raises(ServiceError, match=r"lower coreset\.size"):
         sender.send(tracks(1))
 
 
