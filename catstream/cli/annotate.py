@@ -216,7 +216,9 @@ def _report(annotation: Annotation) -> None:
             f"{name and name + ': '}{count} of {len(checks)} frames checked ({count / len(checks):.0%}), {boxes}"
         )
     following = annotation.next_frame()
-    if following is None:
+    if not annotation.keyframes:
+        click.echo("no box was drawn")
+    elif following is None:
         click.echo("all frames are checked")
     else:
         of = following.object and f" for {following.object}"

@@ -97,7 +97,7 @@ def test_exports_that_add_to_one_data_set_at_once_all_succeed(whole_run, catstre
         for dest in options.values()
         for name in names
     ]
-    assert [(process.wait(60), process.stderr.read()) for process in started] == [(0, "")] * len(started)
+    assert [(process.wait(150), process.stderr.read()) for process in started] == [(0, "")] * len(started)
     coco = json.loads((tmp_path / "all.json").read_text())
     assert len(coco["videos"]) == len(coco["categories"]) == 3
     classes = (tmp_path / "set" / "data.yaml").read_text().split("names:")[1]

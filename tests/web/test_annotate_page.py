@@ -28,7 +28,7 @@ def test_a_video_is_annotated_by_mouse_and_keys(script_of_browser, catstream, de
     assert [line for line in lines if line.startswith("violations")] == ["violations light []", "violations dark []"]
     assert [line for line in lines if line.startswith("overflow")] == ["overflow 0", "overflow 0"]
     assert lines[-1] == "errors []"
-    assert process.wait(60) == 0
+    assert process.wait(150) == 0
     with (out / "keyframes.csv").open() as file:
         drawn = {(row["object"], int(row["frame"])): row["x"] for row in csv.DictReader(file)}
     assert {*drawn} == {("anna", 0), ("anna", FRAMES - 1), ("carl", 0), ("carl", FRAMES - 1)}

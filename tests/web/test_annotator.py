@@ -130,7 +130,7 @@ def serving(catstream, demo, tmp_path):
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         link = process.stdout.readline().strip()
-        with httpx.Client(base_url=link.partition("?")[0], timeout=60, follow_redirects=True) as client:
+        with httpx.Client(base_url=link.partition("?")[0], timeout=150, follow_redirects=True) as client:
             assert client.get(link).status_code == 200
             yield process, client
 
@@ -143,7 +143,7 @@ def test_the_command_continues_where_it_was_interrupted_until_it_is_done(serving
         until(lambda: state(client)["decoded"])
         client.post("/edit", json={"verb": "draw", "object": "anna", "frame": 0, "box": box})
         process.terminate()
-        assert process.wait(60) == 143
+        assert process.wait(150) == 143
     assert (tmp_path / "out" / "keyframes.csv").read_text().splitlines()[1].startswith("0,anna,")
     assert (tmp_path / "out" / "demo.ndjson").exists()
     with serving() as (process, client):
@@ -151,6 +151,14 @@ def test_the_command_continues_where_it_was_interrupted_until_it_is_done(serving
         assert [one["name"] for one in state(client)["objects"]] == ["anna"]
         client.post("/edit", json={"verb": "draw", "object": "anna", "frame": FRAMES - 1})
         assert client.post("/edit", json={"verb": "done"}).json() == {"done": True}
-        assert process.wait(60) == 0
+        assert process.wait(150) == 0
         assert "2 keyframes" in process.stdout.read()
     assert len((tmp_path / "out" / "demo.csv").read_text().splitlines()) == FRAMES + 1
+
+
+def test_an_annotation_that_ends_without_a_box_says_so(serving, until):
+    with serving() as (process, client):
+        until(lambda: state(client)["decoded"])
+        client.post("/edit", json={"verb": "done"})
+        assert process.wait(150) == 0
+        assert process.stdout.read().startswith("no box was drawn\n")
