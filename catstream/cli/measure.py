@@ -392,12 +392,13 @@ def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None
 
         click.echo(first_box(live))
         return
-    import numpy as np
+    with INTERRUPTS.leaving():
+        import numpy as np
 
-    from catstream.cli.track import track
-    from catstream.evaluation.scores import score
-    from catstream.sinks.track_log import Log
-    from catstream.video.rendered import write
+        from catstream.cli.track import track
+        from catstream.evaluation.scores import score
+        from catstream.sinks.track_log import Log
+        from catstream.video.rendered import write
 
     with line_of(messages()) as bar:
         task = bar.add_task("rendering", total=frames)

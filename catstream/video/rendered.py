@@ -16,6 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy import random  # now: numpy would import it at its first use, and lose a Ctrl-C meanwhile
 
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
@@ -124,7 +125,7 @@ class Demo:
 
     def __init__(self, size: tuple[int, int] = SIZE, seed: int = 0) -> None:
         self.size = size
-        self.lake = Lake(_ZOOM, np.random.default_rng(seed))
+        self.lake = Lake(_ZOOM, random.default_rng(seed))
         shape = self.lake.picture.shape[:2]
         pagoda = cv2.fillPoly(np.zeros(shape, np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
         self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)
@@ -224,7 +225,7 @@ class Sprite:
 class Lake:
     """The picture of the lake, enlarged, over which sprites move, and the sensor noise of the camera."""
 
-    def __init__(self, zoom: float, rng: np.random.Generator) -> None:
+    def __init__(self, zoom: float, rng: random.Generator) -> None:
         photograph = load_photograph("china")
         self.picture = cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC).clip(0, 255)
         self._noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)

@@ -17,8 +17,9 @@ from catstream.processes.supervisor import Child
 from catstream.video.source import open_source
 
 
-def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_error(video, tmp_path):
+def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_error(demo_video, tmp_path):
     """The compressor has stored nothing yet, so all frames that the owner has are repeated."""
+    video = demo_video(200)  # not complete when its processes die
     with open_source(video[0]) as source:
         for frame in source:
             cv2.imwrite(str(tmp_path / f"{frame.number:03d}.png"), frame.image)

@@ -251,7 +251,7 @@ def answering(reply):
                     connection, _ = server.accept()
                     connections.append(connection)
                     with connection:
-                        connection.recv(1)
+                        connection.recv(1024)  # all: a reply before a reset would be lost
                         connection.sendall(reply)
 
         threading.Thread(target=serve, daemon=True).start()
