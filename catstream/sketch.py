@@ -61,7 +61,7 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
         self.n_components, self.size = n_components, size
 
     def fit(self, X: Any, y: Any = None) -> Self:  # noqa: ARG002  of a Pipeline
-        """Fit the components to rows, (k, d), without those of earlier calls."""
+        """Fit the components to rows, (k, d); rows of earlier calls are forgotten."""
         self._insert(validate_data(self, X, dtype=_TYPES), begin=True)
         self._decomposition  # noqa: B018  other methods change no attribute
         return self

@@ -57,7 +57,7 @@ class Node:
         return np.diag(np.einsum("ij,ij->i", self.rows, self.rows)) if self.level else products(self.rows)
 
     def products_with(self, newer: Node) -> np.ndarray | None:
-        """The Gram matrix of its rows stacked on those of a newer node, float32 (2n, 2n).
+        """The Gram matrix of its rows stacked on the rows of a newer node, float32 (2n, 2n).
 
         None if rows are shorter than 2n: `catstream.compression.reduce.reduce` does not need it.
         """

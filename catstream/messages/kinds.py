@@ -192,7 +192,7 @@ class Features(_Numbered):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """How far the receiver of an acknowledged channel is, receiver -> sender. The message of frame n has number n + 1.
+    """Acknowledgement of messages, receiver -> sender. The message of frame n has number n + 1.
 
     seq        all messages up to this one are stored, except for the last `in_memory` ones: the sender drops its copies
     processed  all messages up to this one have been processed

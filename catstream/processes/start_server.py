@@ -39,8 +39,11 @@ from catstream.base.threads import limit_process
 from catstream.base.workers import name_process
 from catstream.errors import ServiceError
 
-#: The processes that a server can start, in the order in which a pipeline starts and ends them.
+#: The processes that a server can start, in the order in which a pipeline ends them.
 NAMES = ("detector", "compressor", "trainer")
+
+#: The order in which a pipeline starts them: the imports of the trainer take longest, beside those of the server.
+START_ORDER = ("trainer", "detector", "compressor")
 
 _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
 _EXIT_SECONDS = 1.0  # limit for a server that has closed its sockets to end
@@ -48,8 +51,8 @@ _LONGEST = 1 << 16  # bytes of a request
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
 _MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
-#: What numba imports if it is installed, for kernels that call BLAS or C: a sixth of a second. Ours do not.
-_NOT_CALLED = ("scipy.linalg.cython_blas", "cffi")
+#: Modules that numba imports if they are installed, for kernels that call BLAS or C; they take a sixth of a second.
+_UNUSED = ("scipy.linalg.cython_blas", "cffi")
 
 
 def reset_process() -> None:
@@ -227,14 +230,24 @@ def _forget() -> None:
 after_fork(_forget)
 
 
+def _import(name: str) -> None:
+    """Import the module of a process; after an error, the process imports it again, and reports it."""
+    with suppress(Exception):
+        if name == "detector":
+            with _hidden(*_UNUSED):
+                import_module("catstream.features.kernels")
+        import_module(f"catstream.processes.{name}")
+
+
 @contextmanager
 def _hidden(*modules: str) -> Iterator[None]:
     """Let modules that were not imported yet appear not to be installed."""
-    sys.modules |= dict.fromkeys(modules)  # type: ignore[arg-type]
+    hidden = [module for module in modules if module not in sys.modules]
+    sys.modules |= dict.fromkeys(hidden)  # type: ignore[arg-type]
     try:
         yield
     finally:
-        for module in modules:
+        for module in hidden:
             del sys.modules[module]
 
 
@@ -255,14 +268,11 @@ def main(descriptor: int, program: int) -> None:
     for readable in (requests.fileno(), has_ended, os.pidfd_open(program)):
         poll.register(readable, select.POLLIN)
     running: dict[int, socket.socket] = {}  # the sockets for the answers, by process id
-    with suppress(Exception), _hidden(*_NOT_CALLED):
-        import_module("catstream.features.kernels")
-    to_import = [*NAMES]
+    to_import = [*START_ORDER]
     while True:
         ready = [readable for readable, _ in poll.poll(0 if to_import else None)]
         if not ready:
-            with suppress(Exception):  # the process imports it again, and reports the error
-                import_module(f"catstream.processes.{to_import.pop(0)}")
+            _import(to_import.pop(0))
         elif has_ended in ready:
             os.read(has_ended, 4096)
             while running and (ended := os.waitpid(-1, os.WNOHANG))[0]:
@@ -274,8 +284,7 @@ def main(descriptor: int, program: int) -> None:
                 return
             log, memory, answer_to = descriptors
             request = json.loads(data)
-            with suppress(Exception):  # the process reports it
-                import_module(f"catstream.processes.{request['name']}")
+            _import(request["name"])
             gc.freeze()  # a later collection leaves the memory alone that all processes share
             parent = os.getpid()
             if not (pid := os.fork()):

@@ -11,11 +11,11 @@ from catstream.wire.newest import Publisher, Subscriber
 
 _NONE = {"version": 0.0, "trained": 0.0}
 
-prepare()  # once in the start server: a trainer that did it between two models would stop a file for that time
-
 
 def main(process: Process) -> None:
     """Train a model from each sample that arrives, until the stream ends; the objects take turns."""
+    process.watchdog.allow()
+    prepare()  # in this process, while the start server imports what the others need
     trainer = Trainer(process.settings)
     trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:

@@ -42,7 +42,7 @@ def test_tracks_are_written_to_files_and_stay_there(long_video, catstream, tmp_p
 
 
 def holds(folder):
-    """Whether tracks and a picture have come there."""
+    """Return True once the folder has tracks and a picture."""
     file = folder / FILES[0]
     return file.exists() and file.read_bytes().count(b"\n") > 1 and (folder / "walk.mp4").exists()  # below the head
 
