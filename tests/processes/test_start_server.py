@@ -53,7 +53,8 @@ def start(folder, tmp_path, until):
         log.close()
 
 
-def test_a_hidden_module_appears_not_to_be_installed():
+def test_a_hidden_module_appears_not_to_be_installed(monkeypatch):
+    monkeypatch.delitem(sys.modules, "cffi", raising=False)
     with module._hidden("cffi"), pytest.raises(ImportError):
         import_module("cffi")
     assert import_module("cffi").FFI
