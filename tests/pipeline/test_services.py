@@ -95,12 +95,11 @@ def test_no_process_outlives_its_program(video, number, until, alive):
 def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(video, endless, folder, by_hand, until):
     with Subscriber(TRACKS, Endpoint.parse(str(folder))) as tracks:
         processes = by_hand(endless, box=video[1][0])
-        until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.frame >= 5)
+        until(lambda: isinstance(track := tracks.receive(0.1), Track) and track.model_version)  # all have started
         for process in processes:
             process.send_signal(signal.SIGTERM)
         end = until(lambda: next((m for m in iter(lambda: tracks.receive(0.1), None) if isinstance(m, End)), None))
         assert [process.wait(150) for process in processes] == [0, 0, 0]
-    assert end.totals["sent"] > 5
     assert end.totals["stored"] == end.totals["sent"]
 
 
