@@ -202,15 +202,12 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
         start_server()
 
 
-def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(start, folder):
+def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(start, folder, until):
     job = Job("rtsp://me:secret@10.0.0.7/gate", endpoint=str(folder)).save(folder)
     process, _, _ = start(job)
     shown = psutil.Process(process.pid)
-    deadline = time.monotonic() + 60
-    while shown.name() != "trainer:gate" and time.monotonic() < deadline:
-        time.sleep(0.01)
+    until(lambda: shown.cmdline()[0] == "catstream trainer rtsp://10.0.0.7/gate"[: len(shown.cmdline()[0])])
     assert Path(f"/proc/{process.pid}/comm").read_text() == "trainer:gate\n"
-    assert shown.cmdline()[0] == "catstream trainer rtsp://10.0.0.7/gate"[: len(shown.cmdline()[0])]
     assert "secret" not in Path(f"/proc/{process.pid}/cmdline").read_text()
 
 
