@@ -49,7 +49,7 @@ _SEARCH_LIMITS = ("p99=0.1", "skipped=0")
 @click.option("--jitter", type=click.IntRange(min=1), help="Start from K initial boxes that differ by at most 2 %.")
 @click.option("--keyframes", type=click.IntRange(min=1), help="Annotate with up to N boxes from the ground truth.")
 @click.option("--attributes", type=PATH, help="JSON file with attributes, {sequence: [attribute]}.")
-@click.option("--peer-models", type=PATH, help="Folder with the model files of nano and vit.")
+@click.option("--peer-models", type=PATH, help="Folder with the model files of nano, nano-v3 and vit.")
 @click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Number of worker processes.")
 @click.option("--output", type=PATH, help="Output folder for the results and report.html.")
 @with_json_file
@@ -81,7 +81,8 @@ def evaluate(
       catstream        single-process tracker
       mil              OpenCV's, always available
       csrt, kcf, tld   OpenCV's, with pip install ".[peers]"
-      nano, vit        OpenCV's NanoTrack and VitTrack, with --peer-models FOLDER
+      nano, nano-v3    OpenCV's NanoTrackV2 and V3, with --peer-models FOLDER
+      vit              OpenCV's VitTrack, with --peer-models FOLDER
 
     \b
     METRICS, over the frames with the object

@@ -83,7 +83,7 @@ def evaluate(
     """Run trackers, by their names in `TRACKERS`; return the runs in order of sequence, tracker and start.
 
     starts : the starts of a sequence, `one_pass`, or what `choose_starts` returns
-    peer_models : folder of the model files of `nano` and `vit`
+    peer_models : folder of the model files of `nano`, `nano-v3` and `vit`
     jobs : number of processes, with one thread each
     output : folder for results, or None; runs that are complete there are not repeated
     begin, done : functions that are called with the total number of frames, and with each finished run

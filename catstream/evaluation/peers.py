@@ -27,12 +27,14 @@ PEERS = {
     "mil": "TrackerMIL",
     "tld": "TrackerTLD",
     "nano": "TrackerNano",
+    "nano-v3": "TrackerNano",
     "vit": "TrackerVit",
 }
 
 #: The model files of a tracker, with the names of their authors, by parameter of its class in OpenCV.
 MODELS = {
     "nano": {"backbone": "nanotrack_backbone_sim.onnx", "neckhead": "nanotrack_head_sim.onnx"},
+    "nano-v3": {"backbone": "nanotrack_backbone.onnx", "neckhead": "nanotrack_head.onnx"},
     "vit": {"net": "object_tracking_vittrack_2023sep.onnx"},
 }
 
