@@ -81,8 +81,8 @@ def evaluate(
       catstream        single-process tracker
       mil              OpenCV's, always available
       csrt, kcf, tld   OpenCV's, with pip install ".[peers]"
-      nano, nano-v3    OpenCV's NanoTrackV2 and V3, with --peer-models FOLDER
-      vit              OpenCV's VitTrack, with --peer-models FOLDER
+      nano, vit        OpenCV's NanoTrackV2 and VitTrack, with --peer-models FOLDER
+      nano-v3          NanoTrackV3, with --peer-models FOLDER
 
     \b
     METRICS, over the frames with the object

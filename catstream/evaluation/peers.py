@@ -17,6 +17,7 @@ import numpy as np
 
 from catstream.base.box import Box
 from catstream.errors import BoxError, SettingsError, install_command
+from catstream.evaluation.nanotrack import NanoTrackV3
 
 OPENCV: str = cv2.__version__  #: version of OpenCV
 
@@ -27,7 +28,7 @@ PEERS = {
     "mil": "TrackerMIL",
     "tld": "TrackerTLD",
     "nano": "TrackerNano",
-    "nano-v3": "TrackerNano",
+    "nano-v3": "TrackerNano",  # its parameters; the tracker is NanoTrackV3
     "vit": "TrackerVit",
 }
 
@@ -81,6 +82,8 @@ class Peer:
 
 
 def _constructor(name: str, models: Path | None) -> Callable[[], Any]:
+    if name == "nano-v3":
+        return partial(_with_models, NanoTrackV3, name, _parameters(name, models))
     for home in (cv2, getattr(cv2, "legacy", None)):
         create: Callable[..., Any] | None = getattr(home, f"{PEERS[name]}_create", None)
         if create is not None:

@@ -7,10 +7,14 @@ from pathlib import Path
 from unittest.mock import create_autospec
 
 import cv2
+import numpy as np
 import pytest
 
+from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import BoxError, SettingsError
+from catstream.evaluation import peers
+from catstream.evaluation.nanotrack import NanoTrackV3
 from catstream.evaluation.onepass import evaluate, follow
 from catstream.evaluation.peers import MODELS, PEERS, Peer
 
@@ -20,7 +24,8 @@ def test_a_tracker_gets_its_model_files_and_its_confidence_is_reported(tracker, 
     files = {parameter: str(tmp_path / name) for parameter, name in MODELS[tracker].items()}
     peer, given = create_autospec(getattr(cv2, PEERS[tracker]), instance=True), []
     peer.update.return_value, peer.getTrackingScore.return_value = (True, (1, 2, 30, 40)), 0.625
-    monkeypatch.setattr(cv2, f"{PEERS[tracker]}_create", lambda parameters: given.append(parameters) or peer)
+    home, name = (peers, "NanoTrackV3") if tracker == "nano-v3" else (cv2, f"{PEERS[tracker]}_create")
+    monkeypatch.setattr(home, name, lambda parameters: given.append(parameters) or peer)
     for file in files.values():
         Path(file).touch()
     run = follow(tracker, Settings(), sequence, peer_models=tmp_path)
@@ -66,3 +71,35 @@ def test_a_tracker_missing_in_opencv_is_an_error_with_the_install_command(monkey
     monkeypatch.setitem(PEERS, "csrt", "TrackerThatIsNot")
     with pytest.raises(SettingsError, match=r"catstream\[peers\]"):
         Peer("csrt")
+
+
+class Brightness:
+    """A network for `NanoTrackV3`: the features are the picture, and the object is where it is brightest, 30 x 30."""
+
+    def __init__(self, *_):
+        self.inputs = {}
+
+    def setInput(self, blob, name=""):
+        self.inputs[name] = blob
+
+    def forward(self, outputs=None):
+        if outputs is None:
+            return self.inputs[""]
+        places = 127 + 16 * np.arange(-7, 8)
+        light = cv2.blur(self.inputs["input2"][0].mean(axis=0), (61, 61))[np.ix_(places, places)]
+        return np.stack([0 * light, light / 2 - 120])[None], np.full((1, 4, 15, 15), 30.0)
+
+
+def test_nanotrack_moves_its_box_to_the_place_with_the_highest_score(monkeypatch):
+    monkeypatch.setattr(cv2.dnn, "readNet", Brightness)
+    tracker = NanoTrackV3(cv2.TrackerNano_Params())
+    for step in range(6):
+        frame = np.zeros((240, 320, 3), np.uint8)
+        cv2.rectangle(frame, (100 + 10 * step, 80 + 10 * step), (139 + 10 * step, 119 + 10 * step), (255, 255, 255), -1)
+        box = (100, 80, 40, 40)
+        if step == 0:
+            tracker.init(frame, box)
+        else:
+            _, box = tracker.update(frame)
+        assert Box(*box).overlap(Box(100 + 10 * step, 80 + 10 * step, 40, 40)) > 0.6
+    assert tracker.getTrackingScore() > 0.5
