@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean
 
 from sequences import CHECK, sequences
-from table import command, mean_and_error
+from table import command
 
 from catstream.base.settings import Settings
 from catstream.errors import SettingsError
@@ -27,22 +27,17 @@ MEANS = ("AUC", "success", "precision")
 
 def accuracy_command(about: str | None, starts: int = 1, *, kept: bool = True) -> argparse.ArgumentParser:
     """Return a parser with the options of a benchmark over many sequences and starts."""
-    parser = many_sequences(command(about), kept=kept)
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--starts", type=int, default=starts, help="number of start frames of each sequence (default: %(default)s)"
-    )
-    chosen.add_argument("--jitter", type=int, metavar="K", help="K first boxes within 2 %% instead")
-    return parser
-
-
-def many_sequences(parser: argparse.ArgumentParser, *, kept: bool = True) -> argparse.ArgumentParser:
-    """Add the options that choose sequences and their frames, and, if runs are kept, their folder."""
+    parser = command(about)
     parser.add_argument("--group", choices=("all", "tuning", "check"), default="all", help="only these sequences")
     parser.add_argument("--frames", type=int, help="number of frames of each sequence (default: all)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes (default: %(default)s)")
     if kept:
         parser.add_argument("--output", type=Path, help="folder for the runs; complete runs are not repeated")
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--starts", type=int, default=starts, help="number of start frames of each sequence (default: %(default)s)"
+    )
+    chosen.add_argument("--jitter", type=int, metavar="K", help="K first boxes within 2 %% instead")
     return parser
 
 
@@ -111,13 +106,3 @@ def means(runs: Iterable[EvaluationRun]) -> tuple[float, float, float]:
 def spread(runs: Iterable[EvaluationRun]) -> float:
     """Return the standard deviation of the AUC over the runs of a sequence, averaged over the sequences."""
     return fmean(row.auc_spread for row in rows_of(runs))
-
-
-def difference(runs: list[EvaluationRun], others: list[EvaluationRun]) -> tuple[float, float]:
-    """Return the mean difference of AUC over the sequences, and its standard error.
-
-    Runs over one sequence are alike: they count as one.
-    """
-    pairs = zip(rows_of(runs), rows_of(others), strict=True)
-    mean, error = mean_and_error(row.auc - other.auc for row, other in pairs)
-    return mean or 0.0, error or 0.0

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
 import psutil
-from table import plots
 
 from catstream.base.names import Boxes
 from catstream.base.settings import Settings
@@ -86,20 +84,3 @@ def travel(
                         look = Look(number, process.memory_info().rss / 1e6, seconds)
                         journey.looks.setdefault(name, []).append(look)
     return journey
-
-
-def draw(journeys: dict[str, Journey], file: Path, blocks: int = 80) -> None:
-    """Plot against frames: median time per frame in blocks, processor time of each process per frame, and memory."""
-    with plots(file, (8, 8), rows=3) as (time, work, memory):
-        for label, journey in journeys.items():
-            parts = np.array_split(journey.milliseconds, min(blocks, len(journey.milliseconds)))
-            time.plot(np.cumsum([len(part) for part in parts]), [np.median(part) for part in parts], label=label)
-            for name, looks in journey.looks.items():
-                work.plot(*journey.work(name), label=f"{label} {name}".strip())
-                memory.plot([look.frame for look in looks], [look.megabytes for look in looks])
-        time.set(ylabel="ms a frame (median)", ylim=(0, None))
-        work.set(ylabel="processor time, ms a frame", ylim=(0, None))
-        memory.set(ylabel="resident memory, MB", xlabel="frame", ylim=(0, None))
-        if len(journeys) > 1:
-            time.legend()
-        work.legend(fontsize="small")

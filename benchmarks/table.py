@@ -1,6 +1,6 @@
 """The options and the output of every benchmark: tables on the terminal and in a JSON file.
 
-`--json benchmarks/results/NAME.json` is the record that `docs/results.md` shows; `make results` writes the page.
+`--json benchmarks/results/NAME.json` is a record, of which `make results` writes the tables in the documentation.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean, stdev
@@ -24,7 +23,7 @@ from catstream.reports.provenance import provenance
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA", "data"))
 #: Options with paths of this machine.
-_PLACES = ("--json", "--data", "--output", "--strips", "--attributes", "--peer-models")
+_PLACES = ("--json", "--data", "--output", "--strips", "--attributes", "--models", "--peer-models")
 
 Cell = str | int | float | None
 
@@ -111,21 +110,6 @@ def mean_and_error(values: Iterable[float | None]) -> tuple[float | None, float 
     """Return the mean of the values that are not None, and its standard error, if there are enough."""
     known = [value for value in values if value is not None]
     return fmean(known) if known else None, stdev(known) / len(known) ** 0.5 if len(known) > 1 else None
-
-
-@contextmanager
-def plots(file: Path, size: tuple[float, float], rows: int = 1, columns: int = 1) -> Iterator[Any]:
-    """Yield the axes of some plots, which are saved to a file afterwards."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", sharex=rows > 1)
-    yield axes
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=120)
-    pyplot.close(figure)
 
 
 def text(table: Table) -> str:

@@ -1,8 +1,9 @@
-"""What MkDocs adds to the pages when it builds them: commands, settings, and the list of decisions."""
+"""What MkDocs adds to the pages when it builds them: commands, settings, and the lists of decisions and of all pages."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from inspect import cleandoc
 from pathlib import Path
@@ -13,6 +14,7 @@ import click
 from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
 
+README = Path(__file__).parents[1] / "README.md"
 RECORDS = sorted((Path(__file__).parent / "decisions").glob("0*.md"))
 
 
@@ -25,10 +27,17 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Append the help of every command, all settings, or the list of decisions to their page."""
-    pages = {"command-line.md": commands, "settings.md": settings, "decisions/index.md": decisions}
+    """Append the help of every command, all settings, or a list of decisions or pages to their page."""
+    pages = {"command-line.md": commands, "settings.md": settings, "decisions/index.md": decisions, "index.md": index}
     added = pages.get(page.file.src_uri)
     return f"{markdown}\n{added()}" if added else markdown
+
+
+def index() -> str:
+    """Return the table of the pages from README, with links as they are in the folder of the documentation."""
+    _, heading, section = README.read_text(encoding="utf-8").partition("## Documentation\n")
+    table, _, _ = section.strip().partition("\n\n")
+    return re.sub(r"\]\((docs/)?", lambda link: "](" if link[1] else "](../", f"{heading}\n{table}\n")
 
 
 def decisions() -> str:

@@ -47,7 +47,7 @@ IMPORTERS = {
         "catstream/video",
         "catstream/loadtest/crowd.py",
         "catstream/base/threads.py",
-        "catstream/evaluation/peers.py",
+        *("catstream/evaluation/peers.py", "catstream/evaluation/nanotrack.py"),
         "catstream/reports/provenance.py",  # its version
         "catstream/processes/detector.py",
         "catstream/sinks/events.py",

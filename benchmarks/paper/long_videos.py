@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import shared  # noqa: F401
-from journey import Journey, draw, travel
+from journey import Journey, travel
 from sequences import named, scratch
 from table import Table, benchmark, command
 
@@ -52,7 +52,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
             boxes = np.array(journey.boxes)
             successes.append((label, *(score(boxes[:end], truth[:end]).success for end in ends)))
         path.unlink()
-    draw(journeys, options.plot)
     lengths = [f"{length * frames:.0f}" for length in LENGTHS]
     paper = [(f"paper: {name}", *printed) for name, printed in PAPER.items()]
     yield Table("Success", ("frames", *lengths), successes + paper, "the paper's columns: 10K, 20K, 50K, 75K and 100K")
@@ -127,5 +126,4 @@ if __name__ == "__main__":
         frames=(100_000, "frames of the longest video"),
         videos=(["TLD_06_car", "TLD_10_panda"], "names of sequences"),
         sizes=([64, 500], "n"),
-        plot=(Path("out/long_videos.png"), "plot"),
     )

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 import shared  # noqa: F401
 from sequences import named
-from table import Table, benchmark, command, plots
+from table import Table, benchmark, command
 
 from catstream.base.box import Window
 from catstream.compression.tree import CoresetTree
@@ -43,7 +42,6 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     building = [(count, *(seconds(grown, rows[:count], n) / count * 1e6 for n in SIZES)) for count in counts]
     columns = ("points", *(f"n = {n}, us" for n in SIZES))
     yield Table("Building the tree, a point", columns, building)
-    draw(training, building, options.plot)
 
 
 def points_of(sequence: Sequence, count: int) -> np.ndarray:
@@ -76,28 +74,9 @@ def seconds(work: Callable[..., object], *arguments: object) -> float:
     return min(times)
 
 
-def draw(training: list[tuple[float, ...]], building: list[tuple[float, ...]], file: Path) -> None:
-    """Draw the two plots of the figure side by side."""
-    with plots(file, (10, 4), columns=2) as (left, right):
-        points, everything, *coresets = zip(*training, strict=True)
-        left.semilogy(points, everything, label="all points")
-        for n, times in zip(SIZES[1:3], coresets, strict=True):
-            left.semilogy(points, times, label=f"coreset, n = {n}")
-        points, *times = zip(*building, strict=True)
-        for n, each in zip(SIZES, times, strict=True):
-            right.plot(points, each, label=f"n = {n}")
-        left.set(xlabel="points", ylabel="one training, ms")
-        right.set(xlabel="points", ylabel="building the tree, us a point", ylim=(0, None))
-        for axes in (left, right):
-            axes.set_xscale("log", base=2)
-            axes.xaxis.set_major_formatter("{x:.0f}")
-            axes.legend()
-
-
 if __name__ == "__main__":
     benchmark(
         figures,
         command(__doc__),
         points=(8192, "maximum number of points"),
-        plot=(Path("out/time_complexity.png"), "plot"),
     )
