@@ -1,4 +1,4 @@
-"""What MkDocs adds to the pages when it builds them: commands, settings, and the lists of decisions and of all pages."""
+"""What MkDocs adds to the pages when it builds them: commands, settings, and lists of decisions and of all pages."""
 
 from __future__ import annotations
 

@@ -106,6 +106,12 @@ def test_the_index_of_decisions_lists_every_record():
     assert len(shown) == len([*DOCS.glob("decisions/0*.md")])
 
 
+def test_the_first_page_has_the_table_of_pages_of_the_readme():
+    linked = re.findall(r"\]\((\S+?)\)", built("index.md"))
+    assert len(linked) > 30
+    assert all((DOCS / link).is_file() for link in linked)
+
+
 def test_every_command_and_option_has_help_and_a_name_of_its_own():
     """The page of the command line is made from it when the documentation is built."""
     for words, command in every_command().items():
