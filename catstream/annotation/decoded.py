@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import UInt8
 from catstream.base.files import writing
 from catstream.base.settings import Settings
 from catstream.errors import VideoError
 from catstream.video.frames import Source
-from catstream.video.source import ALL_FRAMES, is_live, open_source
+from catstream.video.source import ALL_FRAMES, open_source
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,12 @@
-"""Addresses without the passwords in them, for messages, logs and health reports."""
+"""Addresses of sources: which are live, and without passwords for messages, logs and health reports."""
 
 from __future__ import annotations
 
 import re
 from itertools import takewhile
+from pathlib import Path
+
+_LIVE = re.compile(r"\d+|/dev/video\d+|demo:.*|(?!(?i:file):)[a-zA-Z][\w+.-]+://.+", re.DOTALL)
 
 #: An address, also with one slash; or a user and a password before a host.
 _ADDRESS = re.compile(r"(?:([a-z][a-z0-9+.-]*):/+|(?=[^/@]*:[^@]*@))(.*)", re.IGNORECASE | re.DOTALL)
@@ -12,6 +15,15 @@ _PLAIN = re.compile(r"(?!.*(pass|pwd|token|secret|auth|key|login|user|usr|cred|s
 
 #: A word of a text that may be an address with a password.
 _SUSPECT = re.compile(r"""[^\s'"()]*:[^\s'"()]*[@=][^\s'"()]*""")
+
+
+def is_live(text: str | Path) -> bool:
+    """Return whether a text names a live source. A number names a camera; a folder named 0 is ./0.
+
+    >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "demo:1", "./0", "walk.mp4")]
+    [True, True, True, True, False, False]
+    """
+    return _LIVE.fullmatch(str(text)) is not None
 
 
 def without_password(source: str) -> str:

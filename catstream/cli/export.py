@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from catstream.base.addresses import is_live
 from catstream.base.files import locked_folder
 from catstream.base.text import counted
 from catstream.cli.options import PATH, with_overwrite
@@ -17,7 +18,7 @@ from catstream.errors import VideoError
 from catstream.sinks import destinations
 from catstream.sinks.destinations import EXPORTS, About, Head
 from catstream.sinks.track_log import Log, logs_of
-from catstream.video.source import VIDEOS, is_live, open_source
+from catstream.video.source import VIDEOS, open_source
 from catstream.video.writer import is_annotated
 
 

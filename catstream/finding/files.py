@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.video.frames import Frame, read_ahead
 from catstream.video.images import IMAGES, ImageReader, first_pages, natural_order, pages_of, visible
-from catstream.video.source import VIDEOS, is_live, open_source
+from catstream.video.source import VIDEOS, open_source
 
 #: A frame that is searched, and the name of its file in a folder of images.
 NamedFrame = tuple[Frame, str]

@@ -19,7 +19,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from hashlib import sha256
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.client.address import Address
 from catstream.client.attach import control
 from catstream.client.control import Control
@@ -38,7 +38,6 @@ from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
-from catstream.video.source import is_live
 from catstream.wire.channels import CHANNELS
 from catstream.wire.discovery import private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.errors import CatstreamError
 from catstream.fleet import lifecycle
 from catstream.fleet.actor import Stream, initial_model
@@ -27,7 +27,6 @@ from catstream.fleet.registry import RegistryServer
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
-from catstream.video.source import is_live
 from catstream.wire.keys import Client, allowed, ensure
 
 #: Namespace of the named actors of all fleets.

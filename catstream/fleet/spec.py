@@ -21,13 +21,13 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from catstream.base.addresses import is_live
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED, boxes_by_name, by_name, check_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
 from catstream.errors import CatstreamError, FleetError
 from catstream.jobs.job import Job, changed_setting
-from catstream.video.source import is_live
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]

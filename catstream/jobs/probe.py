@@ -6,12 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from catstream.base.addresses import is_live
 from catstream.base.names import check_boxes
 from catstream.errors import SettingsError
 from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import check_files
-from catstream.video.source import is_live, open_source
+from catstream.video.source import open_source
 
 
 class SourceInfo(NamedTuple):

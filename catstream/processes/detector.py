@@ -16,7 +16,7 @@ from time import sleep
 
 import cv2
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.detection.objects import Detectors
 from catstream.errors import VideoError
 from catstream.messages.kinds import Features, Model, Track, Tracks, run_state
@@ -28,7 +28,7 @@ from catstream.processes.process import TURN_SECONDS, Process
 from catstream.processes.shared import LONG_SECONDS
 from catstream.video import source as video_source
 from catstream.video.frames import Frame, Source, read_ahead
-from catstream.video.source import is_live, open_source
+from catstream.video.source import open_source
 from catstream.wire.channels import MODELS
 from catstream.wire.newest import Subscriber
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from secrets import token_hex
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.base.workers import die_with, name_process
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.jobs.job import Job
@@ -38,6 +39,10 @@ STOPPED_EARLY = 4
 TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
 MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
 HEALTH_SECONDS = 1.0  #: between two health reports of a process
+
+#: Of the compressor and the trainer of a live source: the next frame does not wait for either of them. A file is
+#: tracked as fast as all three processes allow.
+_LIVE_NICENESS = 10
 
 _log = logging.getLogger(__name__)
 
@@ -103,6 +108,8 @@ def run(
         service = import_module(f"catstream.processes.{name}")
         job = Job.load(job) if isinstance(job, Path) else job
         job = replace(job, resume=job.resume or restarted, paused=job.paused and not restarted)
+        if name != "detector" and is_live(job.source):
+            os.nice(_LIVE_NICENESS)
         source = without_password(job.source)
         name_process(f"{name}:{Path(source).name}" if source else name, f"catstream {name} {source}")
         process = Process(name, job, memory)

@@ -20,6 +20,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
 
+from catstream.base.addresses import is_live
 from catstream.base.cgroup import oom_kills
 from catstream.base.clock import RunningClock
 from catstream.errors import ServiceError, VideoError
@@ -28,7 +29,6 @@ from catstream.messages.kinds import End, Health, Track, Tracks
 from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS
 from catstream.processes.shared import SharedMemory
 from catstream.processes.start_server import NAMES, START_ORDER, StartedProcess, start_server, starting
-from catstream.video.source import is_live
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from catstream.base.addresses import is_live
 from catstream.base.arrays import Float64
 from catstream.base.text import counted
 from catstream.errors import VideoError
@@ -19,7 +20,7 @@ from catstream.sinks.destinations import Head
 from catstream.sinks.track_log import Log
 from catstream.video.drawing import Colours, draw
 from catstream.video.frames import jpeg
-from catstream.video.source import is_live, open_source
+from catstream.video.source import open_source
 
 _PICTURES = 8  #: most frames to look at in a video
 _SIDE = 480  #: of a picture, pixels

@@ -24,6 +24,7 @@ from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import IO, get_args
 
+from catstream.base.addresses import is_live
 from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
@@ -44,7 +45,6 @@ from catstream.sinks.destinations import (
     sink_of,
 )
 from catstream.sinks.remote import Warnings
-from catstream.video.source import is_live
 from catstream.wire.codec import decode_json
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}

@@ -38,7 +38,7 @@ from urllib.parse import unquote, urlsplit
 import cv2
 import numpy as np
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.base.settings import RunSettings
 from catstream.errors import VideoError
 from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
@@ -60,7 +60,6 @@ _VIDEOS = (
 )
 VIDEOS = {f".{suffix}" for suffix in _VIDEOS.split()}
 _FOLDERS = ("img", "imgs", "color", "rgb")
-_LIVE_ADDRESS = re.compile(r"\d+|/dev/video\d+|demo:.*|(?!(?i:file):)[a-zA-Z][\w+.-]+://.+", re.DOTALL)
 
 #: Number of errors of the container without a packet between them after which a file is treated as ended.
 _MAX_FAILURES = 3
@@ -109,15 +108,6 @@ class _FileSource(Source):
     def close(self) -> None:
         self._first = None
         self._frames.close()
-
-
-def is_live(text: str | Path) -> bool:
-    """Return whether a text names a live source. A number names a camera; a folder named 0 is ./0.
-
-    >>> [is_live(text) for text in ("0", "/dev/video2", "rtsp://10.0.0.7/stream", "demo:1", "./0", "walk.mp4")]
-    [True, True, True, True, False, False]
-    """
-    return _LIVE_ADDRESS.fullmatch(str(text)) is not None
 
 
 def open_source(
