@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catstream.base import threads
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
@@ -72,14 +71,6 @@ def test_every_object_is_followed(together):
 def test_an_object_of_several_is_followed_as_alone_bit_for_bit(frames, together):
     for name in STEPS:
         assert of(name, together) == of(name, followed(frames, [name]))
-
-
-def test_the_tracks_do_not_depend_on_the_number_of_cores(frames, together, monkeypatch):
-    for cores in (1, 4):
-        monkeypatch.setattr(threads, "cores", lambda cores=cores: cores)
-        threads._pool.cache_clear()
-        assert followed(frames, STEPS) == together
-    threads._pool.cache_clear()
 
 
 #: In which frame an object begins, and in which it is forgotten, if it is.

@@ -1,4 +1,4 @@
-"""Threads: linear algebra on one of them while catstream computes, and calls for several objects on all cores.
+"""Threads: linear algebra on one of them while catstream computes.
 
 The matrices are small. With more threads, OpenBLAS spends its time on synchronisation (a tenth of the frame rate), and
 the order of its sums changes, so results are not reproducible. The processes of a pipeline set environment variables
@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
-
-from catstream.base.forks import after_fork
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -109,30 +106,6 @@ def one_thread(*, opencv: bool = False) -> Iterator[None]:
             cv2.setNumThreads(threads)
 
 
-def in_parallel(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Return `function(item)` for each item, in threads if this process may use several cores.
-
-    The kernels, OpenCV and linear algebra release the GIL, so threads compute at the same time. The order of the
-    results is that of the items, and each call is independent: the results do not depend on the number of threads. If a
-    call raises an exception, the first of these is raised, in the order of the items.
-
-    >>> in_parallel(abs, [-3, 2, -1])
-    [3, 2, 1]
-    """
-    waiting = list(items)
-    if len(waiting) < 2 or cores() < 2:
-        return [function(item) for item in waiting]
-
-    def limited(item: _Item) -> _Result:
-        with one_thread():
-            return function(item)
-
-    calls = [_pool().submit(limited, item) for item in waiting]
-    for call in calls:
-        call.exception()  # waits
-    return [call.result() for call in calls]
-
-
 def one_at_a_time(function: Callable[[_Item], _Result]) -> Callable[[_Item], _Result]:
     """The same function, of which no two threads are inside at once."""
     lock = threading.Lock()
@@ -148,11 +121,3 @@ def one_at_a_time(function: Callable[[_Item], _Result]) -> Callable[[_Item], _Re
 def cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(cores(), "catstream")
-
-
-after_fork(_pool.cache_clear)  # threads do not survive a fork

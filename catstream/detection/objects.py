@@ -15,7 +15,6 @@ from catstream.base.box import Box
 from catstream.base.names import check_count, check_name, errors_about
 from catstream.base.settings import Settings
 from catstream.base.text import listed
-from catstream.base.threads import in_parallel
 from catstream.detection.detector import Detector, Result
 from catstream.detection.search import Detection
 from catstream.detection.similarity import Similarity
@@ -122,14 +121,11 @@ class Detectors:
         self.seq += 1
         results = dict(results or {})
         detectors = {name: detector for name, detector in self.detectors.items() if name not in results}
-        searches = in_parallel(lambda detector: detector.search(frame, self.seq), detectors.values())
-        detections = dict(zip(detectors, searches, strict=True))
+        detections = {name: detector.search(frame, self.seq) for name, detector in detectors.items()}
         states = {name: detector.state for name, detector in detectors.items() if detector.state is not None}
         detections = assign(detections, states, self.settings.search.context)
-        updates = in_parallel(
-            lambda name: detectors[name].update(detections[name], frame, self.seq, time), list(detectors)
-        )
-        results |= zip(detectors, updates, strict=True)
+        for name, detector in detectors.items():
+            results[name] = detector.update(detections[name], frame, self.seq, time)
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         objects = {name: results[name][1] for name in names}

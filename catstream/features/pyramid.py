@@ -56,8 +56,6 @@ class Region(NamedTuple):
 class Pyramid:
     """A frame at full, half, quarter ... size; the levels are computed at their first use.
 
-    Several threads may cut from it at the same time.
-
     Parameters
     ----------
     image : uint8 (h, w, 3) BGR, or (h, w) grey; patches have the same channels
@@ -86,7 +84,7 @@ class Pyramid:
         level = 0
         while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
             level += 1
-            if level not in self._halves:  # two threads may compute the same level, with the same pixels
+            if level not in self._halves:
                 self._halves[level] = _half(self._halves[level - 1])
         return self._halves[level], 1 << level
 

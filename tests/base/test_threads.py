@@ -1,4 +1,4 @@
-"""Linear algebra on one thread, whatever the program has set or imported: the same bits; and calls in threads."""
+"""Linear algebra on one thread, whatever the program has set or imported: the same bits."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from catstream.base import threads
-from catstream.base.threads import _VARIABLES, in_parallel, one_thread
+from catstream.base.threads import _VARIABLES, one_thread
 
 
 def counts():
@@ -89,39 +89,6 @@ def test_opencv_is_limited_only_if_requested():
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
-
-
-@pytest.fixture(params=[1, 3], ids="{} cores".format)
-def cores(request, monkeypatch):
-    monkeypatch.setattr(threads, "cores", lambda: request.param)
-    threads._pool.cache_clear()
-    yield request.param
-    threads._pool.cache_clear()
-
-
-@pytest.mark.usefixtures("cores")
-def test_results_have_the_order_of_the_items():
-    assert in_parallel(lambda item: item**2, range(50)) == [item**2 for item in range(50)]
-    assert in_parallel(str, []) == []
-
-
-def test_items_are_processed_at_the_same_time_if_there_are_cores(cores):
-    barrier = Barrier(min(cores, 2))
-    if cores > 1:
-        assert len(set(in_parallel(lambda _: barrier.wait(150), range(2)))) == 2
-
-
-def test_the_first_error_is_raised(cores):
-    ended = []
-
-    def call(item):
-        if item in (1, 2):
-            raise ValueError(item)
-        ended.append(item)
-
-    with pytest.raises(ValueError, match="1"):
-        in_parallel(call, range(4))
-    assert set(ended) == ({0, 3} if cores > 1 else {0})
 
 
 #: Prints a digest of two models that a Tracker learns, merged.
