@@ -23,7 +23,7 @@ from catstream.reports.provenance import provenance
 _ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA", "data"))
 #: Options with paths of this machine.
-_PLACES = ("--json", "--data", "--output", "--strips", "--attributes", "--peer-models")
+_PLACES = ("--json", "--data", "--output", "--strips", "--attributes", "--models", "--peer-models")
 
 Cell = str | int | float | None
 
