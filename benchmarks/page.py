@@ -65,32 +65,32 @@ def filled(page: str, records: Records) -> str:
 
 
 def accuracy(records: Records) -> str:
-    trackers, rates = records.trackers(), records.rows("speed", _PEERS)
+    trackers, cost = records.trackers(), records.rows("peers")
     new = set(trackers["catstream"]) - TUNED
     whole = {name: _means(each) for name, each in trackers.items() if len(each) > len(new)}
     means = {name: _means({video: each[video] for video in new}) for name, each in trackers.items()}
-    speeds = {name: rates[f"{name}, one core"]["the rest"] for name in trackers if f"{name}, one core" in rates}
+    times = {name: row["times that of catstream"] for name, row in cost.items()}
     return _block(
         records,
         f"""**Of the trackers that learn from one box, without pretrained weights, it is the most accurate: AUC
         {means["catstream"][0]:.3f} on new sequences, CSRT {means["csrt"][0]:.3f} at
-        {speeds["csrt"] / speeds["catstream"]:.2f} times the frame rate.** NanoTrack, a network that is trained on many
-        videos, has {means["nano"][0]:.3f} in version 2 and {means["nano-v3"][0]:.3f} in version 3.""",
-        ("tracker", "learned from", f"AUC, {len(new)} new", "success", "AUC, all", "success", "frames/s on one core"),
+        {times["csrt"]:.1f} times the processor time.** NanoTrackV3, a network trained on many videos, has
+        {means["nano-v3"][0]:.3f} at {times["nano-v3"]:.1f} times the time.""",
+        ("tracker", "learned from", f"AUC, {len(new)} new", "success", "AUC, all", "success", "processor time"),
         [
             (
                 _NAMES.get(name, name),
                 "videos" if name.startswith("nano") else "one box",
                 *means[name],
                 *whole.get(name, (None, None)),
-                speeds.get(name),
+                times[name],
             )
             for name in sorted(trackers, key=lambda name: -means[name][0])
         ],
         "accuracy",
         "accuracy-networks",
         "accuracy-peers",
-        "speed",
+        "peers",
     )
 
 
