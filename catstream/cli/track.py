@@ -18,7 +18,6 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.table import Column
 from rich.text import Text
 
-from catstream.base.addresses import without_password
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted, listed
@@ -41,7 +40,7 @@ from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import SINKS, STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.destinations import SINKS, STDOUT, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
@@ -273,18 +272,7 @@ class _Run:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
         check_options(self.options, places, pipeline.size)
-        part, stride = pipeline.part, pipeline.part.step or 1
-        head = Head(
-            source=without_password(pipeline.source),
-            size=pipeline.size,
-            rate=pipeline.rate * stride,
-            frames=pipeline.frames,
-            start=part.start or 0,
-            stride=stride,
-            settings=tuple(pipeline.settings.changed()),
-            boxes=pipeline.boxes,
-        )
-        origin = Origin(head, Address(keys=settings.keys), results.options)
+        origin = Origin(pipeline.head, Address(keys=settings.keys), results.options)
         files = RunFiles(origin, results.output, places)
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
         if folder := self.state or self.resume:

@@ -20,11 +20,13 @@ from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
-from catstream.errors import SilenceError
+from catstream.errors import SettingsError, SilenceError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks import destinations
+from catstream.sinks import options as sink_options
 from catstream.sinks.destinations import SINKS, Head, Origin, Row, TrackedFrame
 from catstream.sinks.events import KINDS, check_zones
+from catstream.sinks.options import parse_when
 
 Command = Callable[..., Any]
 
@@ -61,10 +63,10 @@ def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dic
 
 def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, ...], float]:
     """The kinds of events, and the seconds of `lost`."""
-    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
-    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
-        raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
-    return tuple(kinds), NumberRange(0, 86400).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
+    try:
+        return parse_when(text)
+    except SettingsError as error:
+        raise click.BadParameter(str(error)) from None
 
 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
@@ -116,22 +118,11 @@ _FLAGS = {
 
 
 def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, int] | None = None) -> None:
-    """Raise UsageError if an option has no effect; with the `size` of a frame, SettingsError for zones outside."""
-    default, used = SinkOptions(), {name for place in places for name in destinations.sink_of(place).options}
-    for name, flag in _FLAGS.items():
-        if getattr(options, name) != getattr(default, name) and name not in used:
-            users = " or ".join(scheme for scheme, row in SINKS.items() if name in row.options)
-            raise click.UsageError(f"{flag} has no effect on these destinations: add one with {users}, or omit it")
-    of_zones = [kind for kind in ("entered", "left") if kind in options.events]
-    if of_zones and options.events != default.events and not options.zones:
-        raise click.UsageError(f"--when {','.join(of_zones)} has no effect without a zone: add --zone")
-    if options.margin != default.margin and not options.zones:
-        raise click.UsageError("--zone-margin has no effect without a zone: add --zone")
-    if options.zones and not of_zones and "rate" not in used:  # states, which it is for, have zones, too
-        raise click.UsageError("--zone has no effect: add entered or left to --when")
-    check_zones(options.zones, size)
-    if size is not None and options.margin > max(size):
-        raise click.UsageError(f"--zone-margin {options.margin:g} is larger than the frame: no object can leave a zone")
+    """Raise UsageError if an option has no effect; with the `size` of a frame, also if a zone is outside."""
+    try:
+        sink_options.check_options(options, places, size, _FLAGS)
+    except SettingsError as error:
+        raise click.UsageError(str(error)) from None
 
 
 def _head(address: Address) -> Head:

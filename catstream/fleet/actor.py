@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from hashlib import sha256
+from pathlib import Path
 
 from catstream.base.addresses import is_live, without_password
 from catstream.client.address import Address
@@ -38,6 +39,9 @@ from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
+from catstream.sinks.destinations import Origin, TrackedFrame
+from catstream.sinks.options import check_options
+from catstream.sinks.track_log import RunFiles, is_log
 from catstream.wire.channels import CHANNELS
 from catstream.wire.discovery import private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
@@ -155,7 +159,11 @@ class Stream:
                 return
             claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
-            pipeline = stack.enter_context(self._open_pipeline(claim, stack))
+            pipeline = self._open_pipeline(claim, stack)
+            write, resume = None, claim.state is not None
+            files = self._destinations(pipeline, resume=resume)
+            closed_last = stack.enter_context(ExitStack())  # after the processes
+            stack.enter_context(pipeline)
             with self._lock:
                 self._failure = ""
                 self._began_at, self._stored_at = time.time(), float(facts.get("time", 0.0))
@@ -172,6 +180,9 @@ class Stream:
             stack.callback(over.set)
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
                 self._take(pipeline, tracks)
+                if tracks and files.places:
+                    write = write or closed_last.enter_context(files.continued(pipeline.endpoint, resume=resume))
+                    write(TrackedFrame([*tracks.values()]))
                 if self._stop.is_set():
                     break
             else:
@@ -197,6 +208,16 @@ class Stream:
             return Pipeline(self._spec.source, self._spec.boxes or None, settings, state=state)
         restore(state, claim.state.files)
         return Pipeline(self._spec.source, settings=settings, resume=state)
+
+    def _destinations(self, pipeline: Pipeline, *, resume: bool) -> RunFiles:
+        """The destinations of the tracks; the frames continue those of a log on this node."""
+        options = self._spec.options
+        check_options(options, self._spec.write, pipeline.size)
+        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
+        files = RunFiles(origin, None, list(self._spec.write))
+        if resume and any(path.exists() for path in map(Path, files.places) if is_log(path)):
+            pipeline.first_frame = files.position()
+        return files
 
     def _sockets(self, stack: ExitStack) -> dict[str, object]:
         """The settings of the sockets: those of a private folder, or ports of this node with keys made here."""

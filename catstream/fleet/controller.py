@@ -294,7 +294,7 @@ class Controller:
         if happened is None or (step := lifecycle.TABLE.get((before, happened))) is None:
             return
         after, action = step
-        _log.info("%s: %s, %s: %s %s", name, before, lifecycle.EVENTS[happened], after, action)
+        _log.info("%s: %s, %s: %s %s", name, before, happened, after, action)
         match action:
             case "start" if spec is not None:
                 self._start(spec, actor, now)

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Protocol, Self, cast
 
 import msgspec
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.base.box import Box
 from catstream.base.files import check_file, check_unlocked, remove_parts, writing
 from catstream.client.address import Address
@@ -278,9 +278,14 @@ def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | 
     check_file(path, overwrite=overwrite, made=made, kind=VideoError)
 
 
-def check_sink(place: str, options: SinkOptions) -> None:
-    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid."""
+def check_sink(place: str, options: SinkOptions, source: str = "") -> None:
+    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid.
+
+    Also if it is the video of a live `source`.
+    """
     home = sink_of(place).load()
+    if is_file(place) and place.endswith(".mp4") and is_live(source):
+        raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
     if hasattr(home, "check"):
         home.check(place, options)
 
