@@ -345,7 +345,8 @@ class Controller:
             leaves = self._phase == "up" and lifecycle.event(self._desired(name), actor, self._nodes, now) == "unwanted"
             return replace(last, node=node, state="moving" if leaves else last.state, trouble=trouble)
         age = None if last.stored_seconds is None else last.stored_seconds + now - actor.answered
-        last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age, trouble="")
+        last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age)
+        last = replace(last, trouble="", present={})
         if actor.ended == spec.digest:
             return replace(last, state="ended")
         if self._phase == "down":

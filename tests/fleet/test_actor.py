@@ -11,12 +11,14 @@ from catstream.base.box import Box
 from catstream.client.attach import control
 from catstream.errors import StoreError
 from catstream.fleet import actor as module
-from catstream.fleet.actor import PORTS, Stream, free_ports
+from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
 from catstream.jobs.job import SinkOptions
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
+from catstream.wire import discovery
+from catstream.wire.discovery import PORTS, free_ports
 
 FRAMES = 60
 LIVE = "demo:1"
@@ -208,9 +210,11 @@ def test_a_stream_that_has_lost_its_source_says_so(store, camera, demo_video, un
     gate = camera(lambda _: image)
     with started(StreamSpec("gate", gate.url, {"": boxes[0]}), store) as stream:
         until(lambda: stream.report()[0].state == "running")
+        assert stream.report()[0].present.keys() == {""}
         gate.leave()
         lost = until(lambda: (found := stream.report()[0]).state == "lost" and found)
     assert lost.trouble.startswith("its source has been lost for ")
+    assert lost.present == {}, "where the object is, is not known"
 
 
 def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):
@@ -226,7 +230,7 @@ def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store,
 
 
 def test_no_two_streams_of_a_node_listen_on_the_same_ports(monkeypatch):
-    monkeypatch.setattr(module, "PORTS", PORTS[-8:])
+    monkeypatch.setattr(discovery, "PORTS", PORTS[-8:])
     with ExitStack() as stack:
         assert sorted(free_ports("127.0.0.1", stack) for _ in range(8)) == list(PORTS[-8:])
 
