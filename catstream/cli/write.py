@@ -72,8 +72,11 @@ def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
 with_sink_options = combined(
     "options",
-    lambda zone, margin, when, rate, picture, secret: SinkOptions(
-        zone, margin, when[0], when[1], rate, picture, secret and secret.absolute()
+    lambda zone, margin, when, rate, picture, secret, folder, megabytes: SinkOptions(
+        *(zone, margin, when[0], when[1], rate, picture),
+        secret and secret.absolute(),
+        folder and folder.absolute(),
+        megabytes,
     ),
     click.option(
         "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A polygon in pixels; repeatable."
@@ -102,6 +105,15 @@ with_sink_options = combined(
     ),
     click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
     click.option("--secret-file", "secret", type=PATH, help="File with the key that signs events, for http://."),
+    click.option("--events-folder", "folder", type=PATH, metavar="DIR", help="Write a picture of each event to DIR."),
+    click.option(
+        "--events-megabytes",
+        "megabytes",
+        type=NumberRange(0, min_open=True),
+        default=1000,
+        metavar="N",
+        help="Size of DIR, above which the oldest pictures are removed; default: 1000.",
+    ),
 )
 
 
@@ -114,6 +126,8 @@ _FLAGS = {
     "rate": "--rate",
     "picture": "--picture",
     "key": "--secret-file",
+    "folder": "--events-folder",
+    "folder_megabytes": "--events-megabytes",
 }
 
 
@@ -140,7 +154,7 @@ def _head(address: Address) -> Head:
 
 
 @click.command()
-@click.argument("places", nargs=-1, required=True, metavar="DEST...")
+@click.argument("places", nargs=-1, metavar="DEST...")
 @with_overwrite
 @with_sink_options
 @with_address
@@ -166,6 +180,8 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
+    if not (places := (*places, *options.places)):
+        raise click.UsageError("missing DEST: pass a file or an address, or --events-folder")
     check_options(options, places)
     for place in places:
         destinations.check_sink(place, options)

@@ -196,7 +196,7 @@ class Row:
 
 
 #: Options of the sinks that send events.
-_EVENTS = ("zones", "margin", "events", "lost_seconds", "picture")
+_EVENTS = ("zones", "margin", "events", "lost_seconds")
 
 #: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
 SINKS = {
@@ -216,11 +216,16 @@ SINKS = {
         "mqtt_sink.MqttSink",
         "HOST/TOPIC: events and states of objects, for a broker",
         extra="mqtt",
-        options=(*_EVENTS, "rate"),
+        options=(*_EVENTS, "picture", "rate"),
     ),
-    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt", options=(*_EVENTS, "rate")),
-    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "key")),
-    "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "key")),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt", options=(*_EVENTS, "picture", "rate")),
+    "folder://": Row(
+        "events_folder.EventsFolder",
+        "DIR: a picture of each event, as with --events-folder",
+        options=(*_EVENTS, "folder", "folder_megabytes"),
+    ),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "picture", "key")),
+    "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "picture", "key")),
 }
 
 #: Name of a format -> the export.

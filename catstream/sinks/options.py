@@ -29,6 +29,8 @@ KEYS: dict[str, tuple[Any, str]] = {
     "rate": (Annotated[float, Meta(gt=0, le=1000)], "a number above 0 and at most 1000"),
     "picture": (bool, "true or false"),
     "secret_file": (str, "a text"),
+    "events_folder": (str, 'a text, for example "events/{stream}"'),
+    "events_megabytes": (Annotated[float, Meta(gt=0)], "a number above 0"),
 }
 
 #: Field of `SinkOptions` -> the key that sets it.
@@ -40,6 +42,8 @@ _KEY_OF = {
     "rate": "rate",
     "picture": "picture",
     "key": "secret_file",
+    "folder": "events_folder",
+    "folder_megabytes": "events_megabytes",
 }
 
 
@@ -55,11 +59,11 @@ def destinations(
     if "when" in values:
         with _errors_of("when"):
             fields["events"], fields["lost_seconds"] = parse_when(values["when"])
-    if "key" in fields:
-        fields["key"] = folder / fields["key"]
+    for field in {"key", "folder"} & fields.keys():
+        fields[field] = folder / fields[field].replace("{stream}", stream)
     options = SinkOptions(**fields)
     named = dict.fromkeys(place.replace("{stream}", stream) for place in values.get("write", ()))
-    places = [str(folder / place) if is_file(place) else place for place in named]
+    places = [*(str(folder / place) if is_file(place) else place for place in named), *options.places]
     with _errors_of("write"):
         for place in places:
             if place == STDOUT:

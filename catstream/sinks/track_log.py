@@ -346,7 +346,7 @@ def places_of(name: str, results: Results) -> list[str]:
     """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
     kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
     own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
-    return [*dict.fromkeys([*own, *(results.write or ())])]
+    return [*dict.fromkeys([*own, *(results.write or ()), *results.options.places])]
 
 
 @dataclass(frozen=True, slots=True)
