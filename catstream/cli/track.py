@@ -32,7 +32,7 @@ from catstream.cli.options import (
     with_part,
     with_reading,
 )
-from catstream.cli.view import PORT, HostPort, HostPortType, with_token
+from catstream.cli.view import HostPort, with_token, with_view
 from catstream.cli.write import check_options, with_sink_options, with_table
 from catstream.client.address import Address
 from catstream.errors import require_extra
@@ -57,14 +57,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @with_sink_options
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
-@click.option(
-    "--view",
-    type=HostPortType(),
-    is_flag=False,
-    flag_value=str(PORT),
-    metavar="[[HOST:]PORT]",
-    help="Serve a web page of the run.",
-)
+@with_view
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
 @click.option("--paused", is_flag=True, help="Start paused, until `catstream resume`.")
@@ -313,7 +306,7 @@ class _Run:
         from catstream.web.server import Server
 
         feed = PipelineFeed(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
-        server = Server(Site(feed), host=view.host, port=view.port, token=self.token)
+        server = Server(Site(feed), host=view.host, port=view.port, token=self.token, attempts=view.attempts)
         stack.enter_context(server.in_background())
         stack.callback(feed.wait_for_end)
         for url in server.urls:

@@ -252,6 +252,8 @@ def test_the_streams_of_the_example_begin_with_the_boxes_that_they_name():
         assert list(stream.boxes.values()) == [first_box(stream.source)]
 
 
-def test_the_file_in_the_docs_is_read(load):
+def test_the_files_in_the_docs_are_read(load):
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
-    assert load(page.partition("```toml\n")[2].partition("```")[0]).streams["cam-7"].follow == ("anna",)
+    six, whole = (part.partition("```")[0] for part in page.split("```toml\n")[1:])
+    assert load(six).streams["gate"].options.zones.keys() == {"door"}
+    assert load(whole).streams["cam-7"].follow == ("anna",)
