@@ -30,6 +30,7 @@ from catstream.jobs.state import last_seq, last_time, locked_for_run, saved
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
+from catstream.sinks.destinations import Head
 from catstream.video.source import ALL_FRAMES, source_text
 from catstream.wire.discovery import private_folder, reserve_endpoint
 
@@ -263,6 +264,21 @@ class Pipeline:
             raise ServiceError("the pipeline was not started yet: use it in a `with`, or iterate it")
         check_not_forked(self._generation)
         return self._supervisor
+
+    @property
+    def head(self) -> Head:
+        """The head of the log of the run."""
+        stride = self.part.step or 1
+        return Head(
+            source=without_password(self.source),
+            size=self.size,
+            rate=self.rate * stride,
+            frames=self.frames,
+            start=self.part.start or 0,
+            stride=stride,
+            settings=tuple(self.settings.changed()),
+            boxes=self.boxes,
+        )
 
     @property
     def endpoint(self) -> str:

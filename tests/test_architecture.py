@@ -77,7 +77,12 @@ IMPORTERS = {
         *("catstream/base/box.py", "catstream/messages"),
         *("catstream/processes/decisions.py", "catstream/compression/forest.py"),
         *("catstream/jobs/job.py", "catstream/evaluation/datasets.py"),
-        *("catstream/finding/results.py", "catstream/cli/attach.py", "catstream/sinks/destinations.py"),
+        *(
+            "catstream/finding/results.py",
+            "catstream/cli/attach.py",
+            "catstream/sinks/destinations.py",
+            "catstream/sinks/options.py",
+        ),
         "catstream/batch.py",
     ],
     "threadpoolctl": ["catstream/base/threads.py", "catstream/reports/provenance.py"],

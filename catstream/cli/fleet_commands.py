@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,9 +23,9 @@ from catstream.base.names import UNNAMED, split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
 from catstream.cli.options import PATH, with_json, with_overwrite
-from catstream.cli.view import fleet_view
+from catstream.cli.view import HostPort, fleet_view, with_token, with_view
 from catstream.client.address import Address
-from catstream.errors import FleetError
+from catstream.errors import FleetError, require_extra
 from catstream.messages.kinds import FleetStatus, StreamStatus
 
 if TYPE_CHECKING:
@@ -78,8 +78,10 @@ def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
 
 @fleet.command(short_help="Start the streams of a file, or apply its changes.")
 @click.argument("file", type=PATH)
+@with_view
+@with_token("view-")
 @with_fleet
-def up(running: Fleet) -> None:
+def up(running: Fleet, view: HostPort | None, token: str | None) -> None:
     """Start the streams of FILE, or apply its changes to a fleet that runs.
 
     On a cluster of Ray (--address), or if the fleet runs already, the command
@@ -90,17 +92,35 @@ def up(running: Fleet) -> None:
 
     \b
     EXAMPLES
-      catstream fleet up examples/fleet.toml
+      catstream fleet up examples/fleet.toml --view
       catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
+    if view is not None:
+        require_extra("view")
     with Console(stderr=True).status("starting the fleet"):
         lines = running.up()
     for line in lines:
         click.echo(line)
-    with suppress(KeyboardInterrupt):
+    with ExitStack() as stack, suppress(KeyboardInterrupt):
+        if view is not None:
+            _serve(running, view, token, stack)
         _watch(screen(), running)
     if running.is_owner and running.is_running:
         _down(running)
+
+
+def _serve(fleet: Fleet, view: HostPort, token: str | None, stack: ExitStack) -> None:
+    """Serve the page of a fleet that ends with this command until the stack is left."""
+    from catstream.web.app import fleet_site
+    from catstream.web.server import Server
+
+    if not fleet.is_owner:
+        raise click.UsageError("--view needs a fleet that ends with this command: use catstream fleet view")
+    site = fleet_site(Address(fleet=fleet.name))
+    server = Server(site, host=view.host, port=view.port, token=token, attempts=view.attempts)
+    stack.enter_context(server.in_background())
+    for url in server.urls:
+        click.echo(f"page: {url}")
 
 
 def _down(fleet: Fleet) -> None:
@@ -284,11 +304,13 @@ def _tables(status: FleetStatus) -> list[RenderableType]:
 
 def _streams(status: FleetStatus) -> Table:
     """A row for each stream, those with trouble first."""
-    numbers = ("frame", "skipped", "model")
+    numbers = ("frame", "skipped", "model", "present")
     rows = table("stream", "node", "state", *numbers, right=numbers)
     for stream in sorted(status.streams.values(), key=lambda stream: (not stream.trouble, stream.name)):
         figures = (stream.frame, stream.skipped, max(stream.models.values(), default=0))
-        rows.add_row(stream.name, stream.node or "-", stream.state, *(str(figure or "-") for figure in figures))
+        present = f"{sum(stream.present.values())} of {len(stream.present)}" if stream.present else "-"
+        texts = (*(str(figure or "-") for figure in figures), present)
+        rows.add_row(stream.name, stream.node or "-", stream.state, *texts)
     return rows
 
 

@@ -18,7 +18,6 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.table import Column
 from rich.text import Text
 
-from catstream.base.addresses import without_password
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.text import counted, listed
@@ -33,7 +32,7 @@ from catstream.cli.options import (
     with_part,
     with_reading,
 )
-from catstream.cli.view import PORT, HostPort, HostPortType, with_token
+from catstream.cli.view import HostPort, with_token, with_view
 from catstream.cli.write import check_options, with_sink_options, with_table
 from catstream.client.address import Address
 from catstream.errors import require_extra
@@ -41,7 +40,7 @@ from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import SINKS, STDOUT, Head, Origin, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.destinations import SINKS, STDOUT, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
@@ -58,14 +57,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @with_sink_options
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
-@click.option(
-    "--view",
-    type=HostPortType(),
-    is_flag=False,
-    flag_value=str(PORT),
-    metavar="[[HOST:]PORT]",
-    help="Serve a web page of the run.",
-)
+@with_view
 @with_token("view-")
 @click.option("--lockstep", is_flag=True, help="Wait for each model: the run is reproducible bit for bit.")
 @click.option("--paused", is_flag=True, help="Start paused, until `catstream resume`.")
@@ -273,18 +265,7 @@ class _Run:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
         check_options(self.options, places, pipeline.size)
-        part, stride = pipeline.part, pipeline.part.step or 1
-        head = Head(
-            source=without_password(pipeline.source),
-            size=pipeline.size,
-            rate=pipeline.rate * stride,
-            frames=pipeline.frames,
-            start=part.start or 0,
-            stride=stride,
-            settings=tuple(pipeline.settings.changed()),
-            boxes=pipeline.boxes,
-        )
-        origin = Origin(head, Address(keys=settings.keys), results.options)
+        origin = Origin(pipeline.head, Address(keys=settings.keys), results.options)
         files = RunFiles(origin, results.output, places)
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
         if folder := self.state or self.resume:
@@ -325,7 +306,7 @@ class _Run:
         from catstream.web.server import Server
 
         feed = PipelineFeed(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
-        server = Server(Site(feed), host=view.host, port=view.port, token=self.token)
+        server = Server(Site(feed), host=view.host, port=view.port, token=self.token, attempts=view.attempts)
         stack.enter_context(server.in_background())
         stack.callback(feed.wait_for_end)
         for url in server.urls:

@@ -21,30 +21,34 @@ if TYPE_CHECKING:
 PORT = 8000
 
 _LARGEST_PORT = 65535
+_ATTEMPTS = 100  # ports of PORT+
 
 
 class HostPort(NamedTuple):
-    """The address on which the web server listens."""
+    """The address on which the web server listens, on the next ports if it is in use and there are `attempts`."""
 
     host: str
     port: int
+    attempts: int = 1
 
 
 class HostPortType(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2 only
-    """Parameter type [HOST:]PORT; the default host is 127.0.0.1.
+    """Parameter type [HOST:]PORT; the default host is 127.0.0.1. PORT+ is that port or the next free one.
 
-    >>> [tuple(HostPortType().convert(text, None, None)) for text in ("8080", "0.0.0.0:8000", "[::]:0")]
-    [('127.0.0.1', 8080), ('0.0.0.0', 8000), ('::', 0)]
+    >>> [tuple(HostPortType().convert(text, None, None)) for text in ("8080", "[::]:0", "0.0.0.0:8000+")]
+    [('127.0.0.1', 8080, 1), ('::', 0, 1), ('0.0.0.0', 8000, 100)]
     """
 
     name = "[HOST:]PORT"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> HostPort:
-        host, _, port = str(value).rpartition(":")
+        text = str(value).removesuffix("+")
+        attempts = 1 if text == str(value) else _ATTEMPTS
+        host, _, port = text.rpartition(":")
         is_port = port.isascii() and port.isdigit() and int(port) <= _LARGEST_PORT
         if not is_port or host.startswith("[") != host.endswith("]"):
             self.fail(f"expected [HOST:]PORT, for example 8000 or 0.0.0.0:8000, got {value!r}", param, ctx)
-        return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
+        return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port), attempts)
 
 
 #: In the place of a token: everybody on this machine may use the page.
@@ -82,6 +86,16 @@ def with_token(prefix: str = "") -> Decorator:
         ),
     )
 
+
+#: Adds `--view`, which serves a page during a command.
+with_view = click.option(
+    "--view",
+    type=HostPortType(),
+    is_flag=False,
+    flag_value=f"{PORT}+",
+    metavar="[[HOST:]PORT]",
+    help=f"Serve a web page; default: port {PORT}, or the next free one.",
+)
 
 #: Adds `--listen`.
 with_listen = click.option(

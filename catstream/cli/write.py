@@ -20,11 +20,13 @@ from catstream.cli.common import INTERRUPTS
 from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
-from catstream.errors import SilenceError
+from catstream.errors import SettingsError, SilenceError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks import destinations
+from catstream.sinks import options as sink_options
 from catstream.sinks.destinations import SINKS, Head, Origin, Row, TrackedFrame
 from catstream.sinks.events import KINDS, check_zones
+from catstream.sinks.options import parse_when
 
 Command = Callable[..., Any]
 
@@ -61,17 +63,20 @@ def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dic
 
 def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, ...], float]:
     """The kinds of events, and the seconds of `lost`."""
-    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
-    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
-        raise click.BadParameter(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
-    return tuple(kinds), NumberRange(0, 86400).convert(kinds.get("lost") or SinkOptions().lost_seconds, None, None)
+    try:
+        return parse_when(text)
+    except SettingsError as error:
+        raise click.BadParameter(str(error)) from None
 
 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
 with_sink_options = combined(
     "options",
-    lambda zone, margin, when, rate, picture, secret: SinkOptions(
-        zone, margin, when[0], when[1], rate, picture, secret and secret.absolute()
+    lambda zone, margin, when, rate, picture, secret, folder, megabytes: SinkOptions(
+        *(zone, margin, when[0], when[1], rate, picture),
+        secret and secret.absolute(),
+        folder and folder.absolute(),
+        megabytes,
     ),
     click.option(
         "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A polygon in pixels; repeatable."
@@ -100,6 +105,15 @@ with_sink_options = combined(
     ),
     click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
     click.option("--secret-file", "secret", type=PATH, help="File with the key that signs events, for http://."),
+    click.option("--events-folder", "folder", type=PATH, metavar="DIR", help="Write a picture of each event to DIR."),
+    click.option(
+        "--events-megabytes",
+        "megabytes",
+        type=NumberRange(0, min_open=True),
+        default=1000,
+        metavar="N",
+        help="Size of DIR, above which the oldest pictures are removed; default: 1000.",
+    ),
 )
 
 
@@ -112,26 +126,17 @@ _FLAGS = {
     "rate": "--rate",
     "picture": "--picture",
     "key": "--secret-file",
+    "folder": "--events-folder",
+    "folder_megabytes": "--events-megabytes",
 }
 
 
 def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, int] | None = None) -> None:
-    """Raise UsageError if an option has no effect; with the `size` of a frame, SettingsError for zones outside."""
-    default, used = SinkOptions(), {name for place in places for name in destinations.sink_of(place).options}
-    for name, flag in _FLAGS.items():
-        if getattr(options, name) != getattr(default, name) and name not in used:
-            users = " or ".join(scheme for scheme, row in SINKS.items() if name in row.options)
-            raise click.UsageError(f"{flag} has no effect on these destinations: add one with {users}, or omit it")
-    of_zones = [kind for kind in ("entered", "left") if kind in options.events]
-    if of_zones and options.events != default.events and not options.zones:
-        raise click.UsageError(f"--when {','.join(of_zones)} has no effect without a zone: add --zone")
-    if options.margin != default.margin and not options.zones:
-        raise click.UsageError("--zone-margin has no effect without a zone: add --zone")
-    if options.zones and not of_zones and "rate" not in used:  # states, which it is for, have zones, too
-        raise click.UsageError("--zone has no effect: add entered or left to --when")
-    check_zones(options.zones, size)
-    if size is not None and options.margin > max(size):
-        raise click.UsageError(f"--zone-margin {options.margin:g} is larger than the frame: no object can leave a zone")
+    """Raise UsageError if an option has no effect; with the `size` of a frame, also if a zone is outside."""
+    try:
+        sink_options.check_options(options, places, size, _FLAGS)
+    except SettingsError as error:
+        raise click.UsageError(str(error)) from None
 
 
 def _head(address: Address) -> Head:
@@ -149,7 +154,7 @@ def _head(address: Address) -> Head:
 
 
 @click.command()
-@click.argument("places", nargs=-1, required=True, metavar="DEST...")
+@click.argument("places", nargs=-1, metavar="DEST...")
 @with_overwrite
 @with_sink_options
 @with_address
@@ -175,6 +180,8 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook --when lost=10,entered --secret-file key
     """
+    if not (places := (*places, *options.places)):
+        raise click.UsageError("missing DEST: pass a file or an address, or --events-folder")
     check_options(options, places)
     for place in places:
         destinations.check_sink(place, options)

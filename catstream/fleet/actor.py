@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import logging
 import os
-import random
 import shutil
-import socket
 import threading
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from hashlib import sha256
+from pathlib import Path
 
 from catstream.base.addresses import is_live, without_password
 from catstream.client.address import Address
@@ -38,12 +37,11 @@ from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
-from catstream.wire.channels import CHANNELS
-from catstream.wire.discovery import private_folder
+from catstream.sinks.destinations import Origin, TrackedFrame
+from catstream.sinks.options import check_options
+from catstream.sinks.track_log import RunFiles, is_log
+from catstream.wire.discovery import free_ports, private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
-
-#: Ports that streams listen on, below those that the kernel gives to connections: each has a block of them.
-PORTS = range(21000, 32000, 1 + max(channel.port + len(channel.senders) for channel in CHANNELS.values()))
 
 FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled each time
 LONGEST_PAUSE_SECONDS = 60.0  # the most of these
@@ -84,7 +82,6 @@ class Stream:
         self._superseded = self._has_tracked = False
         self._files: set[tuple[str, int]] = set()  # of the state that was stored last, with their times
         self._follow: tuple[str, ...] = spec.follow
-        self._present: set[str] = set()  # objects that the last frame shows
         self._stack = ExitStack()
         self._folder = self._stack.enter_context(private_folder())
         self._keys = self._folder / "keys"
@@ -134,7 +131,7 @@ class Stream:
                     is_known = isinstance(error, CatstreamError)
                     self._failure = str(error) if is_known else f"{type(error).__name__}: {error}"
                     self._pipeline_trouble = ""
-                    self._status = replace(self._status, state="failed", endpoint="")
+                    self._status = replace(self._status, state="failed", endpoint="", present={})
             pause = FIRST_PAUSE_SECONDS if time.monotonic() - began > _FORGOTTEN_SECONDS else pause
             self._stop.wait(pause)
             pause = min(2 * pause, LONGEST_PAUSE_SECONDS)
@@ -155,7 +152,11 @@ class Stream:
                 return
             claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
-            pipeline = stack.enter_context(self._open_pipeline(claim, stack))
+            pipeline = self._open_pipeline(claim, stack)
+            write, resume = None, claim.state is not None
+            files = self._destinations(pipeline, resume=resume)
+            closed_last = stack.enter_context(ExitStack())  # after the processes
+            stack.enter_context(pipeline)
             with self._lock:
                 self._failure = ""
                 self._began_at, self._stored_at = time.time(), float(facts.get("time", 0.0))
@@ -172,6 +173,9 @@ class Stream:
             stack.callback(over.set)
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
                 self._take(pipeline, tracks)
+                if tracks and files.places:
+                    write = write or closed_last.enter_context(files.continued(pipeline.endpoint, resume=resume))
+                    write(TrackedFrame([*tracks.values()]))
                 if self._stop.is_set():
                     break
             else:
@@ -184,7 +188,7 @@ class Stream:
             self._write(claim, is_last=True, ended=ended)
             if not self._store_trouble:
                 with self._lock:
-                    self._status = replace(self._status, state="ended" if ended else self._status.state)
+                    self._status = replace(self._status, state="ended" if ended else self._status.state, present={})
                 return
             if not ended or self._stop.wait(self._every):
                 return
@@ -197,6 +201,16 @@ class Stream:
             return Pipeline(self._spec.source, self._spec.boxes or None, settings, state=state)
         restore(state, claim.state.files)
         return Pipeline(self._spec.source, settings=settings, resume=state)
+
+    def _destinations(self, pipeline: Pipeline, *, resume: bool) -> RunFiles:
+        """The destinations of the tracks; the frames continue those of a log on this node."""
+        options = self._spec.options
+        check_options(options, self._spec.write, pipeline.size)
+        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
+        files = RunFiles(origin, None, list(self._spec.write))
+        if resume and any(path.exists() for path in map(Path, files.places) if is_log(path)):
+            pipeline.first_frame = files.position()
+        return files
 
     def _sockets(self, stack: ExitStack) -> dict[str, object]:
         """The settings of the sockets: those of a private folder, or ports of this node with keys made here."""
@@ -240,7 +254,7 @@ class Stream:
     def _search_merged(self, pipeline: Pipeline, tokens: dict[str, int]) -> None:
         """Search for each followed object that is not present by a merged model that is newer than the last one."""
         for name in self._follow:
-            if name in self._present:
+            if self._status.present.get(name):
                 continue
             if (model := self._store.model(name).newest(tokens.get(name, 0))) is not None:
                 tokens[name] = model.token
@@ -255,12 +269,13 @@ class Stream:
             status = self._status
             if tracks:
                 self._has_tracked = True
-                self._present = {name for name, track in tracks.items() if track.box is not None}
                 models = {name: track.model_version for name, track in tracks.items()}
-                status = replace(status, frame=next(iter(tracks.values())).frame, models=models)
+                present = {name: track.box is not None for name, track in tracks.items()}
+                status = replace(status, frame=next(iter(tracks.values())).frame, models=models, present=present)
             state: StreamState = pipeline.holding or ("running" if self._has_tracked else "starting")
             skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
-            self._status = replace(status, state=state, skipped=skipped)
+            present = status.present if state == "running" else {}
+            self._status = replace(status, state=state, skipped=skipped, present=present)
             self._pipeline_trouble = "; ".join(troubles)
 
     def _keep_storing(self, claim: Claim, pipeline: Pipeline, over: threading.Event) -> None:
@@ -306,17 +321,3 @@ class Stream:
             trouble = f"its state cannot be stored: {error}"
         with self._lock:
             self._store_trouble = trouble
-
-
-def free_ports(address: str, stack: ExitStack) -> int:
-    """The first of some ports of this node that are free, and that no other stream takes while the stack is open."""
-    while True:
-        first = random.choice(PORTS)
-        with ExitStack() as block, suppress(OSError):
-            reserved = block.enter_context(socket.socket(socket.AF_UNIX))
-            reserved.bind(f"\0catstream-ports-{first}")  # the kernel frees it if this process dies
-            with ExitStack() as probes:
-                for port in range(first, first + PORTS.step):
-                    probes.enter_context(socket.socket()).bind((address, port))
-            stack.enter_context(block.pop_all())
-            return first

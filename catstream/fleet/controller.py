@@ -294,7 +294,7 @@ class Controller:
         if happened is None or (step := lifecycle.TABLE.get((before, happened))) is None:
             return
         after, action = step
-        _log.info("%s: %s, %s: %s %s", name, before, lifecycle.EVENTS[happened], after, action)
+        _log.info("%s: %s, %s: %s %s", name, before, happened, after, action)
         match action:
             case "start" if spec is not None:
                 self._start(spec, actor, now)
@@ -345,7 +345,8 @@ class Controller:
             leaves = self._phase == "up" and lifecycle.event(self._desired(name), actor, self._nodes, now) == "unwanted"
             return replace(last, node=node, state="moving" if leaves else last.state, trouble=trouble)
         age = None if last.stored_seconds is None else last.stored_seconds + now - actor.answered
-        last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age, trouble="")
+        last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age)
+        last = replace(last, trouble="", present={})
         if actor.ended == spec.digest:
             return replace(last, state="ended")
         if self._phase == "down":

@@ -45,7 +45,7 @@ from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
 from catstream.jobs import state
 from catstream.jobs.job import Job
-from catstream.jobs.saved_model import SavedModel, merge
+from catstream.jobs.saved_model import SavedModel, disjoint, merge
 from catstream.messages.kinds import FleetStatus
 from catstream.wire.discovery import private_folder
 
@@ -405,21 +405,6 @@ def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -
     if (before := stored.newest()) is None or before.files["model"] != content:  # followers get each new model
         stored.put({"model": content}, {"streams": chosen})
     return Merged(content, tuple(chosen), tuple(stream for stream in learned if stream not in chosen))
-
-
-def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
-    """The names of models that share no frames: those of the most streams of frames first, then of the most rows.
-
-    A part is the origins of the trees of a model, one for each stream of frames, and its rows.
-
-    >>> disjoint({"door": ({"a"}, 90), "yard": ({"b"}, 20), "both": ({"a", "c"}, 70)})
-    ['both', 'yard']
-    """
-    chosen: list[str] = []
-    for name in sorted(parts, key=lambda name: (-len(parts[name][0]), -parts[name][1], sorted(parts[name][0]))):
-        if all(parts[name][0].isdisjoint(parts[other][0]) for other in chosen):
-            chosen.append(name)
-    return chosen
 
 
 def _learned(store: Store, stream: str, name: str, *, named: bool) -> SavedModel | None:

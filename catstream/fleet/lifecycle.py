@@ -21,20 +21,10 @@ _PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die e
 
 #: There is no actor; Ray places it, or it starts; it reports; it stores its last state and ends, or was killed.
 State = Literal["absent", "pending", "working", "stopping"]
+#: "unwanted" if it was removed or changed, or has to leave its node; "interrupted" if its process died, and Ray starts
+#: it again; "gone" once the actor has ended.
 Event = Literal["wanted", "reports", "interrupted", "silent", "unwanted", "superseded", "ended", "gone"]
 Action = Literal["", "start", "stop", "restart", "kill"]
-
-#: What each event is, for the log.
-EVENTS: dict[Event, str] = {
-    "wanted": "the stream should run, and has not ended",
-    "reports": "the actor answers",
-    "interrupted": "its process died: Ray starts it again",
-    "silent": "it has not answered for so long that it hangs",
-    "unwanted": "the stream was removed or changed, or has to leave its node",
-    "superseded": "another process has claimed the stream",
-    "ended": "its source has ended, and its last state is stored",
-    "gone": "the actor has ended",
-}
 
 #: The next state and the action, by state and event; for an event that is not here, nothing changes.
 TABLE: dict[tuple[State, Event], tuple[State, Action]] = {

@@ -27,7 +27,9 @@ from catstream.base.names import UNNAMED, boxes_by_name, by_name, check_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
 from catstream.errors import CatstreamError, FleetError
-from catstream.jobs.job import Job, changed_setting
+from catstream.jobs.job import Job, SinkOptions, changed_setting
+from catstream.sinks.destinations import redacted
+from catstream.sinks.options import KEYS, destinations
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _HOST_AND_PORT = Annotated[str, Meta(pattern=r"^([A-Za-z0-9_.-]+:[0-9]{1,5})?$")]
@@ -39,8 +41,12 @@ _FLEET: dict[str, tuple[Any, str]] = {
     "every": (Annotated[float, Meta(gt=0, le=3600)], "a number of seconds above 0 and at most 3600"),
     "registry": (_HOST_AND_PORT, "HOST:PORT of a node, as in 10.0.0.1:5690"),
     "keys": (str, "a text"),
+    "defaults": (dict[str, Any], "a table [defaults]"),
     "streams": (dict[str, Any], "tables [streams.NAME]"),
 }
+
+#: Those that count from the start of the fleet.
+_AT_START = ("name", "store", "every", "registry", "keys")
 
 #: The same of a stream.
 _STREAM: dict[str, tuple[Any, str]] = {
@@ -53,7 +59,7 @@ _STREAM: dict[str, tuple[Any, str]] = {
     "cores": (Annotated[float, Meta(gt=0, le=4096)], "a number above 0"),
     "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
     "follow": (str | list[Annotated[str, Meta(min_length=1)]], 'names of objects, for example ["anna"]'),
-}
+} | KEYS
 
 #: Settings that the fleet sets for each stream.
 _OWN_SETTINGS = ("run.endpoint", "run.keys")
@@ -71,6 +77,8 @@ class StreamSpec:
     cores     cores that Ray reserves for it
     labels    labels that its node must have
     follow    objects whose merged model it searches for
+    write     destinations of its tracks
+    options   of these destinations
 
     It raises FleetError if a value is not valid.
     """
@@ -83,6 +91,8 @@ class StreamSpec:
     cores: float = 1.0
     labels: dict[str, str] = field(default_factory=dict)
     follow: tuple[str, ...] = ()
+    write: tuple[str, ...] = field(default=(), repr=False)  # an address may contain a password
+    options: SinkOptions = field(default_factory=SinkOptions)
 
     def __post_init__(self) -> None:
         check_fleet_name(self.name, "stream")
@@ -101,14 +111,16 @@ class StreamSpec:
             _checked({"cores": self.cores}, _STREAM)
 
     @classmethod
-    def parse(cls, name: str, table: Mapping[str, object], folder: Path) -> StreamSpec:
-        """Make a stream from the table of a file in `folder`; the docstring of the module shows one."""
+    def parse(
+        cls, name: str, table: Mapping[str, object], folder: Path, defaults: Mapping[str, Any] | None = None
+    ) -> StreamSpec:
+        """Make a stream from the table of a file in `folder`; values that it lacks are the defaults."""
         check_fleet_name(name, "stream")
         with _errors_in(f"the stream {name}"):
             if not isinstance(table, Mapping):
                 got = table if isinstance(table, int) else type(table).__name__  # a text may contain a password
                 raise FleetError(f"expected a table with a source, got {got}: write [streams.{name}]")
-            values: dict[str, Any] = {"source": ""} | _checked(table, _STREAM)
+            values: dict[str, Any] = {"source": "", **(defaults or {})} | _checked(table, _STREAM)
             for one, several in (("box", "boxes"), ("model", "models")):
                 if one in values and several in values:
                     raise FleetError(f"{one} and {several} are mutually exclusive: write all objects in {several}")
@@ -121,11 +133,13 @@ class StreamSpec:
             values["settings"] = flat(values.get("settings", {}))
             names = [follow] if isinstance(follow, str) else follow
             values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
+            given = {key: values.pop(key) for key in KEYS if key in values}
+            values["write"], values["options"] = destinations(given, folder, name, source)
         return cls(name, **values)
 
     @cached_property  # the controller asks for that of each stream twice a second
     def digest(self) -> str:
-        """Text that changes exactly if the stream has to start again: with its source, objects or settings.
+        """Text that changes exactly if the stream has to start again: with its source, objects, settings or `write`.
 
         A change of `cores`, `labels` or `follow` does not change it: the stream then continues from its state, on a
         node with the labels, and learns of other objects to search for while it runs. Settings count by their values,
@@ -134,6 +148,8 @@ class StreamSpec:
         models = {name: str(file) for name, file in self.models.items()}
         boxes = {name: list(map(float, box)) for name, box in self.boxes.items()}
         parts = [self.source, boxes, models, Settings.from_values(self.settings).changed()]
+        if self.write:
+            parts += [self.write, msgspec.to_builtins(self.options, enc_hook=str)]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -161,7 +177,12 @@ class FleetSpec:
     def __post_init__(self) -> None:
         check_fleet_name(self.name, "fleet")
         with _errors_in(f"the fleet {self.name}"):
-            _checked({key: getattr(self, key) for key in _FLEET}, _FLEET)
+            _checked({key: getattr(self, key) for key in _AT_START}, _FLEET)
+            owners: dict[str, str] = {}
+            for name, place in ((name, place) for name, stream in self.streams.items() for place in stream.write):
+                if (owner := owners.setdefault(place, name)) != name and not place.startswith("http"):  # a webhook
+                    where = redacted(place)
+                    raise FleetError(f"the streams {owner} and {name} write to {where}: put {{stream}} into write")
 
     @classmethod
     def load(cls, path: Path) -> FleetSpec:
@@ -177,8 +198,11 @@ class FleetSpec:
                 values["store"] = str(folder / store)
             if keys := values.get("keys"):
                 values["keys"] = str(folder / keys)
-            streams = {name: StreamSpec.parse(name, table, folder) for name, table in values["streams"].items()}
-            return cls(**values | {"streams": streams})
+            with _errors_in("the defaults"):
+                defaults = _checked(values.pop("defaults", {}), _STREAM)
+            tables = values.pop("streams")
+            streams = {name: StreamSpec.parse(name, table, folder, defaults) for name, table in tables.items()}
+            return cls(**values, streams=streams)
 
     def check_follows(self, earlier: FleetSpec) -> None:
         """Raise FleetError if this cannot take the place of an earlier spec of the fleet: its states stay in use."""
@@ -214,7 +238,7 @@ class FleetSpec:
                 lines.append(f"{name}: has ended")
             else:
                 lines.append(f"{name}: {same if before == after else 'continues with its changes'}")
-        later = [key for key in _FLEET if key != "streams" and getattr(self, key) != getattr(new, key)]
+        later = [key for key in _AT_START if getattr(self, key) != getattr(new, key)]
         return lines + [f"{key} changes at the next start, after catstream fleet down" for key in later if are_running]
 
 

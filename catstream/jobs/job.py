@@ -42,6 +42,8 @@ class SinkOptions:
     rate          messages per second at most about each object, in between its events
     picture       whether each event has the newest picture of the pipeline
     key           file of the key that signs what is sent, None to sign nothing
+    folder        folder of a picture of each event, None for none
+    folder_megabytes  limit of its size
     """
 
     zones: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
@@ -51,6 +53,13 @@ class SinkOptions:
     rate: float = 1.0
     picture: bool = False
     key: Path | None = None
+    folder: Path | None = None
+    folder_megabytes: float = 1000.0
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """The destinations among them."""
+        return () if self.folder is None else (f"folder://{self.folder}",)
 
 
 @dataclass(frozen=True, slots=True)

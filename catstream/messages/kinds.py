@@ -541,6 +541,7 @@ class StreamStatus:
     frame           number of the newest frame that was tracked
     skipped         frames of a live source that this pipeline did not track, because it was too slow
     models          version of the newest model of each object that has one, by name
+    present         whether each object is present in that frame, by name; empty if no frames are tracked
     stored_seconds  seconds since its state and that in the store were the same; None if there is none
     trouble         description of a problem, empty if there is none
     """
@@ -556,6 +557,7 @@ class StreamStatus:
     frame: int = 0
     skipped: int = 0
     models: dict[str, int] = field(default_factory=dict)
+    present: dict[str, bool] = field(default_factory=dict)
     stored_seconds: float | None = None
     trouble: str = ""
 

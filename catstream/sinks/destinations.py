@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Protocol, Self, cast
 
 import msgspec
 
-from catstream.base.addresses import without_password
+from catstream.base.addresses import is_live, without_password
 from catstream.base.box import Box
 from catstream.base.files import check_file, check_unlocked, remove_parts, writing
 from catstream.client.address import Address
@@ -196,7 +196,7 @@ class Row:
 
 
 #: Options of the sinks that send events.
-_EVENTS = ("zones", "margin", "events", "lost_seconds", "picture")
+_EVENTS = ("zones", "margin", "events", "lost_seconds")
 
 #: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
 SINKS = {
@@ -216,11 +216,16 @@ SINKS = {
         "mqtt_sink.MqttSink",
         "HOST/TOPIC: events and states of objects, for a broker",
         extra="mqtt",
-        options=(*_EVENTS, "rate"),
+        options=(*_EVENTS, "picture", "rate"),
     ),
-    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt", options=(*_EVENTS, "rate")),
-    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "key")),
-    "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "key")),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt", options=(*_EVENTS, "picture", "rate")),
+    "folder://": Row(
+        "events_folder.EventsFolder",
+        "DIR: a picture of each event, as with --events-folder",
+        options=(*_EVENTS, "folder", "folder_megabytes"),
+    ),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "picture", "key")),
+    "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "picture", "key")),
 }
 
 #: Name of a format -> the export.
@@ -278,9 +283,14 @@ def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | 
     check_file(path, overwrite=overwrite, made=made, kind=VideoError)
 
 
-def check_sink(place: str, options: SinkOptions) -> None:
-    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid."""
+def check_sink(place: str, options: SinkOptions, source: str = "") -> None:
+    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid.
+
+    Also if it is the video of a live `source`.
+    """
     home = sink_of(place).load()
+    if is_file(place) and place.endswith(".mp4") and is_live(source):
+        raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
     if hasattr(home, "check"):
         home.check(place, options)
 

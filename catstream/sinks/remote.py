@@ -7,6 +7,7 @@ import logging
 import ssl
 import time
 from base64 import b64encode
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from urllib.parse import SplitResult, urlsplit
@@ -26,7 +27,7 @@ QUEUED = 256
 CLOSE_SECONDS = 5.0
 
 _STABLE_SECONDS = 10.0  # without a failure, after which a destination has recovered
-_PICTURE_SECONDS = 2.0  # that events wait for the first picture
+_PICTURE_SECONDS = 2.0  # that an event waits for a picture of its frame
 
 _log = logging.getLogger(__name__)
 
@@ -62,50 +63,72 @@ class Warnings:
         _log.warning("%s: %s", self._address, text)
 
 
-class EventMessages:
-    """Makes a JSON object of each event: `Event.to_dict`, `id`, `sent` in seconds since 1970, and optionally `picture`.
+class PicturedEvents:
+    """Detects events, each with a picture: the first that the pipeline has sent of the frame of the event or later.
 
-    The picture is the newest that the pipeline has sent: the JPEG file in Base64, the number of its frame, and the
-    width and height of a frame, which may be larger. Before the first one, events wait for `_PICTURE_SECONDS`; then it
-    is null.
+    If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none.
     """
 
     def __init__(self, origin: Origin) -> None:
         self.events = Events(origin.options)
-        self._waiting: list[Event] = []
-        self._picture: dict[str, object] | None = None
-        self._picture_due = time.monotonic() + _PICTURE_SECONDS
-        self._previews: Subscription[Preview] | None = None
-        if origin.options.picture:
-            self._previews = subscribe(origin.address, "previews", timeout=0)
+        self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
+        self._picture: Preview | None = None
+        self._previews: Subscription[Preview] = subscribe(origin.address, "previews", timeout=0)
+
+    def update(self, tracks: Sequence[Track]) -> list[tuple[Event, Preview | None]]:
+        """Return the events of further tracks, and those that have waited, with their pictures."""
+        now = time.monotonic()
+        self._waiting += [(event, now + _PICTURE_SECONDS) for event in self.events.update(tracks)]
+        with suppress(SilenceError):  # no further picture has arrived
+            for preview in self._previews:
+                self._picture = preview
+        ready = []
+        while self._waiting:
+            event, due = self._waiting[0]
+            if now < due and (self._picture is None or self._picture.frame < event.track.frame):
+                break
+            ready.append((self._waiting.popleft()[0], self._picture))
+        return ready
+
+    def close(self) -> list[tuple[Event, Preview | None]]:
+        """Return the last events."""
+        self._previews.close()
+        return [(event, self._picture) for event in (*(event for event, _ in self._waiting), *self.events.close())]
+
+
+class EventMessages:
+    """Makes a JSON object of each event: `Event.to_dict`, `id`, `sent` in seconds since 1970, and optionally `picture`.
+
+    The picture is that of `PicturedEvents`: the JPEG file in Base64, the number of its frame, and the width and height
+    of a frame, which may be larger.
+    """
+
+    def __init__(self, origin: Origin) -> None:
+        self._pictured = PicturedEvents(origin) if origin.options.picture else None
+        self.events = self._pictured.events if self._pictured is not None else Events(origin.options)
 
     def update(self, tracks: Sequence[Track]) -> list[bytes]:
         """Return the messages of the events of further tracks, and of those that waited for a picture."""
-        self._waiting += self.events.update(tracks)
-        if self._previews is not None:
-            with suppress(SilenceError):  # no further picture has arrived
-                for preview in self._previews:
-                    size = {"width": preview.width, "height": preview.height}
-                    self._picture = {"frame": preview.frame, **size, "jpeg": b64encode(preview.jpeg).decode()}
-            if self._picture is None and time.monotonic() < self._picture_due:
-                return []
-        return self._messages()
+        if self._pictured is None:
+            return [_message(event) for event in self.events.update(tracks)]
+        return [_message(event, picture=_fields(picture)) for event, picture in self._pictured.update(tracks)]
 
     def close(self) -> list[bytes]:
         """Return the messages of the last events."""
-        self._waiting += self.events.close()
-        messages = self._messages()
-        if self._previews is not None:
-            self._previews.close()
-        return messages
+        if self._pictured is None:
+            return [_message(event) for event in self.events.close()]
+        return [_message(event, picture=_fields(picture)) for event, picture in self._pictured.close()]
 
-    def _messages(self) -> list[bytes]:
-        events, self._waiting = self._waiting, []
-        picture = {} if self._previews is None else {"picture": self._picture}
-        return [
-            json.dumps({"id": uuid4().hex, "sent": time.time(), **event.to_dict(), **picture}).encode()
-            for event in events
-        ]
+
+def _message(event: Event, **more: object) -> bytes:
+    return json.dumps({"id": uuid4().hex, "sent": time.time(), **event.to_dict(), **more}).encode()
+
+
+def _fields(picture: Preview | None) -> dict[str, object] | None:
+    if picture is None:
+        return None
+    size = {"width": picture.width, "height": picture.height}
+    return {"frame": picture.frame, **size, "jpeg": b64encode(picture.jpeg).decode()}
 
 
 def split(place: str, form: str) -> SplitResult:

@@ -19,12 +19,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import groupby, pairwise
 from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import IO, get_args
 
-from catstream.base.addresses import is_live
 from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
@@ -346,7 +346,7 @@ def places_of(name: str, results: Results) -> list[str]:
     """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
     kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
     own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
-    return [*dict.fromkeys([*own, *(results.write or ())])]
+    return [*dict.fromkeys([*own, *(results.write or ()), *results.options.places])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,9 +376,7 @@ class RunFiles:
         check_distinct([*files, *(others or {}).items()], VideoError)
         for place in self.places:
             row = sink_of(place)
-            check_sink(place, self.origin.options)
-            if is_file(place) and place.endswith(".mp4") and is_live(source):
-                raise VideoError(f"a video needs its frames once more, but {source} is live: omit the video")
+            check_sink(place, self.origin.options, source)
             if is_file(place):
                 continued = place in earlier and row.follows_log and self._log() is not None
                 if place in earlier and not continued and Path(place).exists():
@@ -434,6 +432,22 @@ class RunFiles:
                 for sink in sinks.values():
                     sink.write(frame)
 
+            yield write
+
+    @contextmanager
+    def continued(self, endpoint: str, *, resume: bool) -> Iterator[Callable[[TrackedFrame], None]]:
+        """The same for a run that nobody watches: a file that is not continued is renamed, and folders are made.
+
+        walk.ndjson becomes walk-20261128T133015.ndjson, by the time of its last change.
+        """
+        for place in map(Path, filter(is_file, self.places)):
+            with writing(place, VideoError):
+                place.parent.mkdir(parents=True, exist_ok=True)
+                if place.exists() and not (resume and sink_of(str(place)).follows_log and self._log() is not None):
+                    changed = datetime.fromtimestamp(place.stat().st_mtime)
+                    place.rename(place.with_stem(f"{place.stem}-{changed:%Y%m%dT%H%M%S}"))
+        self.check(overwrite=True, earlier=[])
+        with self.opened(endpoint, resume=resume) as write:
             yield write
 
     def _log(self) -> Path | None:

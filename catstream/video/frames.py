@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -123,7 +124,9 @@ class UprightConverter:
     def __call__(self, frame: VideoFrame) -> np.ndarray:
         image = self._reformatter.reformat(frame, format="bgr24", threads=1).to_ndarray()
         # With `frame.side_data`, the frame would refer to itself, and stay in memory until the next garbage collection.
-        matrix: Any = self._side_data(frame).get("DISPLAYMATRIX")
+        matrix: Any = None
+        with suppress(ValueError):  # side data of a type that PyAV does not know: EXIF of a JPEG picture
+            matrix = self._side_data(frame).get("DISPLAYMATRIX")
         if matrix is not None:
             image = _displayed(image, np.frombuffer(matrix, np.int32).reshape(3, 3)[:2, :2])
         return np.ascontiguousarray(image)

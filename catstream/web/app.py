@@ -6,6 +6,7 @@
 /healthz          200 while this server runs
 /readyz           200 while the pipeline tracks, or the fleet answers; 503 with the reason otherwise
 /pictures/T.jpg   the picture of a pipeline of the frame at time T
+/picture.jpg      the newest picture of a pipeline with its tracks drawn in
 /live.mjpeg       the newest pictures of a pipeline with their tracks drawn in, as an MJPEG stream
 /control          POST a command to a pipeline: the fields of `Command`
 /streams/NAME/    all of the above for the pipeline of a stream of a fleet
@@ -85,6 +86,7 @@ class Site:
         routes = [
             *common,
             Route("/pictures/{time:float}.jpg", self._picture),
+            Route("/picture.jpg", self._newest_picture),
             Route("/live.mjpeg", self._live),
             Route("/control", self._control, methods=["POST"]),
         ]
@@ -126,6 +128,13 @@ class Site:
         if preview is None:
             return PlainTextResponse("this picture is no longer available\n", 404)
         return Response(preview.jpeg, media_type="image/jpeg")
+
+    async def _newest_picture(self, request: Request) -> Response:
+        feed = self._pipeline(request)
+        feed.pictured = monotonic()
+        if (newest := feed.dashboard.newest) is None:
+            return PlainTextResponse("no picture has arrived yet\n", 404)
+        return Response(await run_in_threadpool(draw_preview, *newest, feed.dashboard.colours), media_type="image/jpeg")
 
     async def _live(self, request: Request) -> Response:
         pictures = self._annotated_pictures(self._pipeline(request))

@@ -327,7 +327,8 @@ class FleetDashboard(Parts):
                     "name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age),
                 },
                 "streams": lambda _: {  # JSON objects of a browser have numbers first
-                    name: _public(stream) | {"models": list(stream.models.items())}
+                    name: _public(stream)
+                    | {"models": list(stream.models.items()), "present": list(stream.present.items())}
                     for name, stream in self.status.streams.items()
                 },
                 "nodes": lambda _: {name: _public(node) for name, node in self.status.nodes.items()},

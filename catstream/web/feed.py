@@ -38,6 +38,7 @@ READ_SECONDS = 0.03  #: between two looks at the other channels than that of the
 PERIOD_SECONDS = 1.0  #: between two questions to the registry
 REGISTRY_SECONDS = 2.0  #: limit for its answer
 IDLE_SECONDS = 60.0  #: after which the feed of a stream that nobody looks at is closed
+PICTURE_SECONDS = 5.0  #: after a request for a picture, for which pictures are received
 
 _MAX_FEEDS = 32  # of streams of a fleet, each with a thread
 
@@ -113,8 +114,8 @@ class Feed(ABC):
 class PipelineFeed(Feed):
     """Receives the messages of a pipeline, and reconnects after each end, silence or restart.
 
-    Previews, which cost the pipeline processor time, are received only while a page is open. The address is
-    resolved at each connection.
+    Previews, which cost the pipeline processor time, are received only while a page is open, or a wall asks for
+    pictures. The address is resolved at each connection.
     """
 
     dashboard: Dashboard
@@ -125,6 +126,7 @@ class PipelineFeed(Feed):
         self._address = address
         self._endpoint: Endpoint | None = None  # of the current connection, with its keys
         self._has_end = threading.Event()
+        self.pictured = -inf  #: time of the last request for a picture
         self.dashboard = Dashboard()
 
     def problem_of(self, stream: str = "") -> str:  # noqa: ARG002  # there is one
@@ -165,9 +167,10 @@ class PipelineFeed(Feed):
         last_report, last_read, deadline = monotonic(), 0.0, inf
         has_reported = False
         while subscriptions and monotonic() < deadline and not self._stopped.is_set():
-            if self.viewers and deadline == inf and "previews" not in subscriptions:
+            is_watched = self.viewers or monotonic() - self.pictured < PICTURE_SECONDS
+            if is_watched and deadline == inf and "previews" not in subscriptions:
                 subscriptions["previews"] = Subscription(endpoint, "previews", timeout=0.0)
-            elif not self.viewers and "previews" in subscriptions:
+            elif not is_watched and "previews" in subscriptions:
                 subscriptions.pop("previews").close()
             due = monotonic() - last_read >= READ_SECONDS
             last_read = monotonic() if due else last_read

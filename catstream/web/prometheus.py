@@ -60,6 +60,8 @@ def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
         yield "stream_trouble", bool(stream.trouble), labels
         for name, version in stream.models.items():
             yield "stream_model_version", version, labels | {"object": name}
+        for name, is_present in stream.present.items():
+            yield "fleet_objects_present", is_present, {"stream": stream.name, "object": name}
     for node in status.nodes.values() if running else ():
         yield from _of_status("node", node, {"node": node.name})
 

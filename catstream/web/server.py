@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import hashlib
 import hmac
 import socket
@@ -55,12 +56,18 @@ class Server:
 
     Clients must have the token; None, which is possible on 127.0.0.1 only, lets every user of this machine watch and
     give commands. `url` is for a browser on this machine, with the token; `urls` has one for other machines, too, if
-    the server listens on all interfaces. ServiceError if the page would be public without a token, the token is too
-    short, or the port is in use.
+    the server listens on all interfaces. If the port is in use, `attempts - 1` next ones are tried. ServiceError if the
+    page would be public without a token, the token is too short, or the ports are in use.
     """
 
     def __init__(
-        self, site: Site | AnnotationSite, *, host: str = "127.0.0.1", port: int = 8000, token: str | None = None
+        self,
+        site: Site | AnnotationSite,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8000,
+        token: str | None = None,
+        attempts: int = 1,
     ) -> None:
         if token is None and host not in _LOOPBACK:
             raise ServiceError(
@@ -68,7 +75,7 @@ class Server:
                 "serve it with a token (without --token none), or listen on 127.0.0.1"
             )
         app = Guard(site.app, token)
-        self._socket = _listen(host, port)
+        self._socket = _listen(host, port, attempts)
         end = f":{self._socket.getsockname()[1]}/" + (f"?token={quote(token, safe='')}" if token else "")
         hosts = ["127.0.0.1", socket.gethostname()] if host in ("0.0.0.0", "::") else [host]
         self.urls = [f"http://{f'[{name}]' if ':' in name else name}{end}" for name in hosts]
@@ -131,13 +138,16 @@ class _Uvicorn(uvicorn.Server):
                 connection.transport.abort()
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int, attempts: int) -> socket.socket:
+    """Listen on a port, or on one of the next ones if it is in use."""
     try:
         families = {family for family, *_ in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
         if socket.AF_INET not in families:
             return socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=True)
         return socket.create_server((host, port))
     except OSError as error:
+        if error.errno == errno.EADDRINUSE and attempts > 1:
+            return _listen(host, port + 1, attempts - 1)
         why = (error.strerror or str(error)).partition(" (while")[0]  # Python adds the address
         at = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         raise ServiceError(f"cannot listen on {at} ({why}): choose another port or host") from None

@@ -8,7 +8,9 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import random
 import shutil
+import socket
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -18,7 +20,11 @@ from catstream.base.addresses import without_password
 from catstream.base.files import descriptor, is_locked, lock, writing
 from catstream.base.forks import forked, generation
 from catstream.errors import ServiceError
+from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, is_too_long, socket_files
+
+#: Ports that streams listen on, below those that the kernel gives to connections: each has a block of them.
+PORTS = range(21000, 32000, 1 + max(channel.port + len(channel.senders) for channel in CHANNELS.values()))
 
 _PREFIX = "catstream-"  # of private folders
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
@@ -193,3 +199,17 @@ def _base_folders() -> list[Path]:
     with contextlib.suppress(FileNotFoundError):  # there is no temporary folder that can be written to
         bases.insert(0, tempfile.gettempdir())
     return list(dict.fromkeys(Path(base) for base in bases if os.access(base, os.W_OK)))
+
+
+def free_ports(address: str, stack: contextlib.ExitStack) -> int:
+    """The first of some ports of this node that are free, and that no other stream takes while the stack is open."""
+    while True:
+        first = random.choice(PORTS)
+        with contextlib.ExitStack() as block, contextlib.suppress(OSError):
+            reserved = block.enter_context(socket.socket(socket.AF_UNIX))
+            reserved.bind(f"\0catstream-ports-{first}")  # the kernel frees it if this process dies
+            with contextlib.ExitStack() as probes:
+                for port in range(first, first + PORTS.step):
+                    probes.enter_context(socket.socket()).bind((address, port))
+            stack.enter_context(block.pop_all())
+            return first

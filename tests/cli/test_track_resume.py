@@ -20,7 +20,8 @@ from catstream.pipeline import Pipeline
 from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
-UNIT = Path(__file__).parents[2] / "services" / "catstream@.service"
+UNITS = Path(__file__).parents[2] / "services"
+UNIT = UNITS / "catstream@.service"
 OFTEN = ["--set", "run.checkpoint_seconds=0.05", "--lockstep"]
 
 
@@ -215,9 +216,11 @@ def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_i
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd-analyze: apt-get install systemd")
-def test_systemd_finds_nothing_wrong_in_the_unit(tmp_path):
-    unit = tmp_path / "catstream@gate.service"
-    unit.write_text(UNIT.read_text().replace("/opt/catstream/bin/catstream", shutil.which("true")))
+@pytest.mark.parametrize("name", ["catstream@gate", "catstream-sink@gate", "catstream-fleet"])
+def test_systemd_finds_nothing_wrong_in_a_unit(tmp_path, name):
+    unit = tmp_path / f"{name}.service"
+    text = (UNITS / unit.name.replace("gate", "")).read_text()
+    unit.write_text(text.replace("/opt/catstream/bin/catstream", shutil.which("true")))
     checked = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False)
     assert (checked.returncode, checked.stderr) == (0, "")
 

@@ -1,5 +1,6 @@
 """A stream of a fleet without Ray: its pipeline, its state in the store, and its end."""
 
+import json
 import threading
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -10,11 +11,14 @@ from catstream.base.box import Box
 from catstream.client.attach import control
 from catstream.errors import StoreError
 from catstream.fleet import actor as module
-from catstream.fleet.actor import PORTS, Stream, free_ports
+from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
+from catstream.jobs.job import SinkOptions
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
+from catstream.wire import discovery
+from catstream.wire.discovery import PORTS, free_ports
 
 FRAMES = 60
 LIVE = "demo:1"
@@ -58,6 +62,56 @@ def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
     assert not before.facts["ended"]
     assert second.report()[0].token > first.report()[0].token
     assert Store(store).stream("cam-7").newest().facts["frame"] == FRAMES - 1
+
+
+def frames_of(path):
+    """The numbers of the frames in a log, below its head."""
+    return [json.loads(line)["frame"] for line in path.read_text().splitlines()[1:]]
+
+
+def test_a_stream_continues_its_log_however_it_ends(spec, store, until, tmp_path):
+    log = tmp_path / "new" / "cam-7.ndjson"
+    spec = replace(spec, write=(str(log), str(log.with_suffix(".csv"))))
+    with started(spec, store) as first:
+        until(lambda: first.report()[0].frame >= 10)
+    with log.open("a") as file:
+        file.write('{"frame": 60')  # as if power failed
+    with started(spec, store) as second:
+        until(lambda: second.report()[0].state == "ended")
+    assert frames_of(log) == list(range(FRAMES))
+    assert len(log.with_suffix(".csv").read_text().splitlines()) == FRAMES + 1
+
+
+def test_a_live_stream_uses_no_frame_number_of_its_log_again(store, until, tmp_path):
+    spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)}, write=(str(tmp_path / "gate.ndjson"),))
+    with started(spec, store, every=0.2) as stream:
+        until(lambda: Store(store).stream("gate").newest() is not None)
+        stream._every = 60.0  # what follows is not stored
+        until(lambda: stream.report()[0].frame > 60)
+        Store(store).stream("gate").claim("another node")
+        stream._superseded = True
+    with started(spec, store, "n2") as stream:
+        last = frames_of(tmp_path / "gate.ndjson")[-1]
+        until(lambda: stream.report()[0].frame > last + 5)
+    frames = frames_of(tmp_path / "gate.ndjson")
+    assert frames == sorted(set(frames))
+
+
+def test_a_stream_that_begins_anew_keeps_the_log_before(spec, store, until, tmp_path):
+    log = tmp_path / "cam-7.ndjson"
+    log.write_text("of the last year")
+    with started(replace(spec, write=(str(log),)), store) as stream:
+        until(lambda: stream.report()[0].state == "ended")
+    (before,) = tmp_path.glob("cam-7-*.ndjson")
+    assert before.read_text() == "of the last year"
+    assert frames_of(log) == list(range(FRAMES))
+
+
+def test_a_zone_outside_the_frame_is_the_trouble_of_a_stream(spec, store, until):
+    options = SinkOptions(zones={"door": ((4000, 10), (4900, 10), (4900, 90))})
+    with started(replace(spec, write=("http://127.0.0.1:9/hook",), options=options), store) as stream:
+        until(lambda: stream.report()[0].state == "failed")
+    assert "zone door: it is outside the frame of 320x240 pixels" in stream.report()[0].trouble
 
 
 def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(long_spec, store, until):
@@ -156,9 +210,11 @@ def test_a_stream_that_has_lost_its_source_says_so(store, camera, demo_video, un
     gate = camera(lambda _: image)
     with started(StreamSpec("gate", gate.url, {"": boxes[0]}), store) as stream:
         until(lambda: stream.report()[0].state == "running")
+        assert stream.report()[0].present.keys() == {""}
         gate.leave()
         lost = until(lambda: (found := stream.report()[0]).state == "lost" and found)
     assert lost.trouble.startswith("its source has been lost for ")
+    assert lost.present == {}, "where the object is, is not known"
 
 
 def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store, until):
@@ -174,7 +230,7 @@ def test_a_live_stream_continues_on_another_node_with_what_it_has_learned(store,
 
 
 def test_no_two_streams_of_a_node_listen_on_the_same_ports(monkeypatch):
-    monkeypatch.setattr(module, "PORTS", PORTS[-8:])
+    monkeypatch.setattr(discovery, "PORTS", PORTS[-8:])
     with ExitStack() as stack:
         assert sorted(free_ports("127.0.0.1", stack) for _ in range(8)) == list(PORTS[-8:])
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import yaml
 
 from catstream.client.registry import REGISTRY, REGISTRY_PORT
-from catstream.fleet.actor import PORTS
+from catstream.wire.discovery import PORTS
 
 ROOT = Path(__file__).parents[2]
 MANIFEST = list(yaml.safe_load_all((ROOT / "deploy" / "kuberay.yaml").read_text()))

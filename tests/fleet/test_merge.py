@@ -12,10 +12,10 @@ from catstream.compression.forest import Forest
 from catstream.compression.reduce import energy
 from catstream.errors import FleetError
 from catstream.features.layout import row_length
-from catstream.fleet.fleet import disjoint, merge_streams
+from catstream.fleet.fleet import merge_streams
 from catstream.fleet.store import Store
 from catstream.jobs.job import Job
-from catstream.jobs.saved_model import SavedModel
+from catstream.jobs.saved_model import SavedModel, disjoint
 from catstream.jobs.state import files
 from catstream.messages.heads import APPEARANCE
 from catstream.messages.kinds import Features

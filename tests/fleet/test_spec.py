@@ -63,6 +63,39 @@ def test_paths_are_relative_to_the_fleet_file_and_passwords_are_redacted(load, t
     assert third == StreamSpec("cam_9", "0")
 
 
+def test_streams_write_to_the_destinations_of_the_defaults_with_their_names(load, tmp_path):
+    fleet = load("""
+        [defaults]
+        write = ["tracks/{stream}.ndjson", "http://127.0.0.1/hook?camera={stream}"]
+        when = "lost=10,entered"
+        zones = { door = [[300, 80], [420, 80], [420, 400]] }
+        [streams.gate]
+        source = "0"
+        [streams.yard]
+        source = "1"
+        write = ["mqtt://127.0.0.1/{stream}"]
+        when = "lost=5,entered"
+    """)
+    gate, yard = fleet.streams.values()
+    assert gate.write == (str(tmp_path / "tracks/gate.ndjson"), "http://127.0.0.1/hook?camera=gate")
+    assert (gate.options.events, gate.options.lost_seconds) == (("lost", "entered"), 10.0)
+    assert gate.options.zones == yard.options.zones == {"door": ((300, 80), (420, 80), (420, 400))}
+    assert (yard.write, yard.options.lost_seconds) == (("mqtt://127.0.0.1/yard",), 5.0)
+    assert from_json(to_json(fleet)) == fleet
+
+
+@pytest.mark.parametrize("place", ["tracks.ndjson", "mqtt://me:secret@127.0.0.1/yard"])
+def test_two_streams_may_not_write_to_one_destination(load, place):
+    with pytest.raises(FleetError, match=r"the streams a and b write to .*: put \{stream\} into write$") as caught:
+        load(f'[defaults]\nwrite = ["{place}"]\n[streams.a]\nsource = "0"\n[streams.b]\nsource = "1"')
+    assert "secret" not in str(caught.value)
+
+
+def test_an_error_of_the_defaults_names_them(load):
+    with pytest.raises(FleetError, match=r"the defaults: there is no key 'wriet', did you mean 'write'\?"):
+        load("[defaults]\nwriet = []\n[streams.a]\nsource = '0'")
+
+
 names = st.sampled_from(["anna", "b-2", "cam.7", "_"])
 numbers = st.sampled_from([2.0, 30.0, 47.25])
 made = st.builds(
@@ -94,6 +127,7 @@ def test_each_fleet_comes_back_from_json(fleet, streams):
         ({"settings": {"coreset.size": 128}}, True),
         ({"settings": {"run.lag_frames": 25}}, False),
         ({"boxes": {"": Box(1.0, 2.0, 30.0, 40.0)}}, False),
+        ({"write": ("/a.csv",)}, True),
         ({"cores": 2.0}, False),
         ({"labels": {"site": "north"}}, False),
         ({"follow": ("anna",)}, False),
@@ -149,6 +183,16 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
         ("source = '0'\ncores = nan", "cores must be a number above 0, got"),
         ("source = '0'\ncores = true", "cores must be a number above 0, got"),
         ("source = '0'\nlabels = { site = 1 }", 'labels must be a table of texts, for example { site = "north" }, got'),
+        ("source = '0'\nwrite = 'a.csv'", "write must be destinations, for example ["),
+        ("source = '0'\nwrite = ['a.txt']", "write: /"),
+        ("source = '0'\nwrite = ['-']", "write: there is no standard output: pass a file or an address"),
+        ("source = '0'\nwrite = ['a.mp4']", "write: a video needs its frames once more, but 0 is live"),
+        ("source = '0'\nwrite = ['mqtt://me:secret@host/#']", "write: mqtt://host/?... has no valid topic"),
+        ("source = '0'\nwrite = ['a.csv']\nwhen = 'lost'", "when has no effect on these destinations: add one with"),
+        ("source = '0'\nwrite = ['http://a/b']\nwhen = 'gone'", "when: expected some of found, lost, returned"),
+        ("source = '0'\nwrite = ['http://a/b']\nzones = { door = [[0, 0], [9, 9]] }", "zone door: a polygon has at"),
+        ("source = '0'\nwrite = ['http://a/b']\nzones = { door = '0,0 9,9' }", "zones must be polygons in pixels, for"),
+        ("source = '0'\nwrite = ['http://a/b']\nsecret_file = 'none'", "write: cannot read the key /"),
         ("source = '0'\nfollow = [1]", 'follow must be names of objects, for example ["anna"], got [1]'),
     ],
 )  # fmt: skip
@@ -208,6 +252,8 @@ def test_the_streams_of_the_example_begin_with_the_boxes_that_they_name():
         assert list(stream.boxes.values()) == [first_box(stream.source)]
 
 
-def test_the_file_in_the_docs_is_read(load):
+def test_the_files_in_the_docs_are_read(load):
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
-    assert load(page.partition("```toml\n")[2].partition("```")[0]).streams["cam-7"].follow == ("anna",)
+    six, whole = (part.partition("```")[0] for part in page.split("```toml\n")[1:])
+    assert load(six).streams["gate"].options.zones.keys() == {"door"}
+    assert load(whole).streams["cam-7"].follow == ("anna",)

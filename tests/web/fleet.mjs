@@ -9,7 +9,7 @@ const say = (name, value) => console.log(JSON.stringify([name, value]));
 await withBrowser(executablePath, profile, async (browser) => {
   const page = await browser.newPage();
   const wrong = errorsOf(page);
-  const shown = () => page.locator("#fleet tr:not([hidden]) td a").allInnerTexts();
+  const shown = () => page.locator("#fleet li:not([hidden]) > a").allInnerTexts();
   const until = (condition, value) => page.waitForFunction(condition, value, patience);
   const check = async (state) => {
     for (const [colorScheme, width, height] of [["light", 1440, 900], ["dark", 390, 844]]) {
@@ -22,10 +22,13 @@ await withBrowser(executablePath, profile, async (browser) => {
   };
 
   await page.goto(url);
-  await page.waitForSelector("#fleet tbody tr", patience);
+  await page.waitForSelector("#fleet .wall > li", patience);
   await until(() => document.querySelector("#state").textContent.trim() === "1 in trouble");
   await page.evaluate(axe);
   say("all", await shown());
+  say("wall", await page.locator("#fleet .bar li").allInnerTexts());
+  await until(() => document.querySelector(".wall img.there")?.naturalWidth > 0);
+  say("picture", true);
   say("nodes", await page.locator("#nodes tbody button").allInnerTexts());
   await check("all");
   await page.focus("#search");
@@ -45,11 +48,11 @@ await withBrowser(executablePath, profile, async (browser) => {
   await until(() => document.querySelector("#source")?.textContent.startsWith("cam-7, walk.mp4"));
   say("page", [new URL(page.url()).pathname, await page.title()]);
   await page.goBack();
-  await until(() => document.querySelector("#fleet tbody tr:not([hidden])"));
+  await until(() => document.querySelector("#fleet .wall > li:not([hidden])"));
   say("back", [await page.inputValue("#search"), ...(await shown())]);
   await page.goto(new URL("streams/cam-7/", url).href);
   await page.click("#all");
-  await until(() => document.querySelector("#fleet tbody tr:not([hidden])"));
+  await until(() => document.querySelector("#fleet .wall > li:not([hidden])"));
   say("fleet", await shown());
   console.log('["silence"]');
   await page.waitForSelector("#streams.old", patience);

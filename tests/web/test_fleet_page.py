@@ -16,10 +16,11 @@ def test_a_stream_can_be_opened_and_the_last_state_stays_if_the_fleet_is_silent(
     fleet, manager, serve_fleet, camera, turning, folder, script_of_browser, monkeypatch
 ):
     monkeypatch.setattr(feed, "REGISTRY_SECONDS", 1.0)
+    objects = {"anna": True, "ben": False}
     fleet.node("north", cores=4.0, used=1.5, labels={"site": "north"}, streams=1)
     fleet.node("south-2", cores=4.0)
     fleet.node("south", "dead", cores=4.0)
-    fleet.stream("cam-7", node="north", endpoint=str(folder), models={"anna": 3}, frame=25, stored_seconds=2.0)
+    fleet.stream("cam-7", node="north", endpoint=str(folder), models={"anna": 3}, frame=25, present=objects)
     fleet.stream("cam-10", "moving", node="south")
     fleet.stream("cam-9", "failed", trouble="cam-9 needs a node with site=west, there is none")
     fleet.stream("dock", "waiting", node="south-2")
@@ -33,6 +34,8 @@ def test_a_stream_can_be_opened_and_the_last_state_stays_if_the_fleet_is_silent(
             if name == "silence":
                 manager.close()
     assert said["all"] == [["cam-9", "cam-7", "cam-10", "dock"]]
+    assert said["wall"] == [["anna present", "ben absent"]]
+    assert said["picture"] == [True]
     assert said["nodes"] == [["south", "north", "south-2"]]
     assert (said["search"], said["trouble"]) == ([["cam-7"]], [["cam-9"]])
     assert said["node"] == [["node=south", "cam-10"]], "and no stream of the node south-2"

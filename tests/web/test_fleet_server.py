@@ -4,6 +4,8 @@ import asyncio
 import json
 import re
 
+import cv2
+import numpy as np
 import pytest
 from starlette.exceptions import HTTPException
 
@@ -73,6 +75,15 @@ def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, fo
         assert page.get(f"/streams/cam-7/{file}").status_code == 200
     until(lambda: source(page) == "walk.mp4", camera)
     assert page.get("/streams/cam-8/").status_code == 404
+
+
+def test_the_newest_picture_of_a_stream_is_received_only_while_somebody_asks(fleet, page, camera, folder, until):
+    fleet.stream("cam-7", endpoint=str(folder))
+    shown(page, until)
+    picture = until(lambda: (got := page.get("/streams/cam-7/picture.jpg")).status_code == 200 and got, camera)
+    assert picture.headers["content-type"] == "image/jpeg"
+    assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR).shape[1] == 640
+    assert page.get("/streams/cam-8/picture.jpg").status_code == 404
 
 
 def test_the_page_of_a_stream_follows_it_to_another_node(fleet, page, camera_at, folder, until, monkeypatch):

@@ -76,7 +76,7 @@ def test_the_state_is_a_metric_and_alerts_on_a_lost_source_or_a_pause_need_no_ot
 
 def test_each_number_of_a_stream_and_a_node_is_a_metric_with_their_names_as_labels(fleet):
     feed = FleetFeed(Address(fleet=fleet.address))
-    fleet.stream("cam-7", node="north", models={"anna": 3}, frame=25)
+    fleet.stream("cam-7", node="north", models={"anna": 3}, frame=25, present={"anna": True, "ben": False})
     fleet.stream("cam-8", "failed", trouble="no source")
     fleet.node("north", cores=4.0)
     feed.dashboard.take(fleet.status(), 0.0)
@@ -85,4 +85,7 @@ def test_each_number_of_a_stream_and_a_node_is_a_metric_with_their_names_as_labe
     assert found["catstream_stream_state"][1] == ('node="",state="failed",stream="cam-8"', 1.0)
     assert [value for _, value in found["catstream_stream_trouble"]] == [0.0, 1.0]
     assert found["catstream_stream_model_version"] == [('node="north",object="anna",stream="cam-7"', 3.0)]
+    assert found["catstream_fleet_objects_present"] == [
+        ('object="anna",stream="cam-7"', 1.0), ('object="ben",stream="cam-7"', 0.0)
+    ]  # fmt: skip
     assert found["catstream_node_cores"] == [('node="north"', 4.0)]

@@ -365,3 +365,10 @@ def test_a_port_in_use_is_an_error(page):
     port = urlsplit(str(page.base_url)).port
     with pytest.raises(ServiceError, match=rf"127.0.0.1:{port} \(Address already in use\): choose another port"):
         Server(pipeline_site(Address()), port=port)
+
+
+def test_the_next_free_port_is_taken_if_there_are_attempts(page):
+    port = urlsplit(str(page.base_url)).port
+    server = Server(pipeline_site(Address()), port=port, attempts=100)
+    server._socket.close()
+    assert port < urlsplit(server.url).port < port + 100

@@ -1,6 +1,7 @@
-// The page of a fleet: a table of the streams, each with a link to its page, and one of the nodes; those in trouble first.
+// The page of a fleet: a wall of the streams, each with a picture and a link to its page, and a table of the nodes; those
+// in trouble first.
 
-import { $, add, duration, Items, write } from "./dom.js";
+import { $, add, duration, Items, many, write } from "./dom.js";
 
 const STATES = ["trouble", "failed", "lost", "running", "waiting", "paused", "starting", "moving", "stopping", "ended"];
 const TONES = { running: "present", starting: "bootstrapping", waiting: "bootstrapping", moving: "bootstrapping",
@@ -15,12 +16,24 @@ export class FleetPage {
     this.server = server;
     this.fleet = { phase: "waiting", name: "", reason: "", age: 0 };
     this.streams = []; // pairs of name and value
-    this.rows = new Items($("#fleet tbody"), { make: makeStream, fill: fillStream });
+    this.wall = new Items($("#fleet .wall"), { make: makeStream, fill: fillStream });
     this.nodes = new Items($("#nodes tbody"), { make: (name) => makeNode(name, () => this.search.ask(`node=${name}`)), fill: fillNode });
     this.search = new Search($("#search"), $(".states"), () => this.showMatching());
     $("#streams").hidden = false;
-    setInterval(() => server.silent !== null && this.showState(), 1000);
+    setInterval(() => this.tick(), 1000);
     this.showState();
+  }
+
+  /** Once a second: ask for the pictures that are in view; the next one of a stream only after the one before. */
+  tick() {
+    if (this.server.silent !== null) this.showState();
+    if (document.hidden || $("#streams").classList.contains("old")) return;
+    for (const [name, { state }] of this.streams) {
+      const { element, picture } = this.wall.items.get(name), { top, bottom, height } = element.getBoundingClientRect();
+      if (state === "running" && picture.complete && height && bottom > 0 && top < innerHeight) {
+        picture.src = `streams/${encodeURIComponent(name)}/picture.jpg?${Date.now()}`;
+      }
+    }
   }
 
   take({ status, streams, nodes }) {
@@ -37,9 +50,10 @@ export class FleetPage {
     this.streams = inOrder(streams);
     for (const [name, one] of this.streams) {
       one.words = [name, one.state, one.level ? "trouble" : "", `node=${one.node}`, ...(this.labels?.[one.node] ?? []),
-        ...one.models.map(([object]) => object)].join(" ").toLowerCase();
+        ...one.models.map(([object]) => object), ...one.present.map(([object, here]) => `${object} ${here ? "present" : "absent"}`)]
+        .join(" ").toLowerCase();
     }
-    this.rows.show(this.streams);
+    this.wall.show(this.streams);
   }
 
   /** Show all nodes, how many are alive, and how many of their cores are used. */
@@ -55,10 +69,9 @@ export class FleetPage {
   showMatching() {
     const { search, fleet } = this, values = this.streams.map(([, one]) => one);
     search.offer(values);
-    for (const [name, one] of this.streams) this.rows.items.get(name).element.hidden = !search.matches(one);
+    for (const [name, one] of this.streams) this.wall.items.get(name).element.hidden = !search.matches(one);
     const shown = values.filter((one) => search.matches(one)).length;
     $(".find").hidden = !values.length;
-    $("#fleet .scrolled").hidden = !shown;
     write($(".none"), fleet.phase === "running" && !values.length ? "This fleet has no streams. Add some to its file, and apply it with “catstream fleet up”."
       : values.length && !shown ? `No stream matches “${search.text}”.` : "");
   }
@@ -110,43 +123,64 @@ function inOrder(values) {
 
 const labels = (node) => Object.entries(node.labels).map(([name, value]) => `${name}=${value}`).sort();
 
-/** A row: the name, which is a link or a button, with lines below it, the state, and cells of text. */
-function makeRow(tag, properties, cells) {
-  const element = document.createElement("tr");
-  const first = add(element, "td"), pill = add(add(element, "td"), "span", { className: "pill" });
+function makePill(parent) {
+  const pill = add(parent, "span", { className: "pill" });
   add(pill, "span", { ariaHidden: "true" });
-  return { element, pill, name: add(first, tag, properties), about: add(first, "p", { className: "quiet" }),
-    trouble: add(first, "p", { className: "trouble" }), word: add(pill, "b"), cells: cells.map((className) => add(element, "td", { className })) };
+  return { pill, word: add(pill, "b") };
 }
 
-function fillRow({ pill, word, trouble, cells }, { state, trouble: problem = "" }, texts) {
+function fillPill({ pill, word }, state, words = WORDS[state] ?? state) {
   pill.dataset.state = TONES[state] ?? state;
-  write(word, WORDS[state] ?? state);
-  write(trouble, problem);
-  texts.forEach((text, place) => write(cells[place], text));
+  write(word, words);
 }
 
-const makeStream = (name) => makeRow("a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name }, ["", "number", "number", "", ""]);
+/** A tile of the wall: the picture, the name, the state, the objects, what is wrong, and figures. */
+function makeStream(name) {
+  const element = document.createElement("li");
+  const link = add(element, "a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name });
+  const frame = add(element, "div", { className: "shot" }), picture = add(frame, "img", { alt: "" });
+  picture.onload = () => picture.classList.add("there");
+  picture.onerror = () => picture.classList.remove("there");
+  const objects = new Items(add(element, "ul", { className: "bar" }), {
+    make: () => { const item = document.createElement("li"); return { element: item, ...makePill(item) }; },
+    fill: (item, [object, here]) => fillPill(item, here ? "present" : "absent", `${object && `${object} `}${here ? "present" : "absent"}`),
+  });
+  return { element, link, picture, ...makePill(element), objects, trouble: add(element, "p", { className: "trouble" }),
+    about: add(element, "p", { className: "quiet number" }) };
+}
 
 function fillStream(item, one) {
-  item.name.title = one.source;
-  fillRow(item, one, [one.node || "–", one.frame.toLocaleString("en"), one.skipped.toLocaleString("en"),
-    one.models.map(([name, version]) => (name ? `${name}: ${version}` : version)).join(", ") || "–", stored(one.stored_seconds)]);
+  item.link.title = one.source;
+  fillPill(item, one.state);
+  item.element.classList.toggle("wrong", one.level > 0);
+  item.picture.hidden = one.state !== "running";
+  item.objects.show(one.present.map((pair) => [pair[0], pair]));
+  write(item.trouble, one.trouble);
+  const models = one.models.map(([name, version]) => (name ? `${name} ${version}` : version)).join(", ");
+  write(item.about, [one.node, `frame ${one.frame.toLocaleString("en")}`, one.skipped && `${many(one.skipped, "frame")} skipped`,
+    models && `model ${models}`, stored(one.stored_seconds)].filter(Boolean).join(" · "));
 }
 
-const makeNode = (name, onclick) => makeRow("button", { type: "button", textContent: name, onclick }, ["number", "number"]);
+function makeNode(name, onclick) {
+  const element = document.createElement("tr"), first = add(element, "td");
+  const button = add(first, "button", { type: "button", textContent: name, onclick });
+  return { element, button, about: add(first, "p", { className: "quiet" }), ...makePill(add(element, "td")),
+    used: add(element, "td", { className: "number" }), streams: add(element, "td", { className: "number" }) };
+}
 
 function fillNode(item, one) {
   write(item.about, labels(one).join(" · "));
-  item.name.title = `Show the streams of this node${one.address && `, at ${one.address}`}`;
-  fillRow(item, one, [one.state === "dead" ? "–" : `${round(one.used)} of ${round(one.cores)}`, String(one.streams)]);
+  item.button.title = `Show the streams of this node${one.address && `, at ${one.address}`}`;
+  fillPill(item, one.state);
+  write(item.used, one.state === "dead" ? "–" : `${round(one.used)} of ${round(one.cores)}`);
+  write(item.streams, String(one.streams));
 }
 
 /** The age of the state in the store; it changes only when it passes a limit. */
 function stored(seconds) {
-  if (seconds === null) return "–";
+  if (seconds === null) return "";
   const limit = [5, 10, 15, 30, 60].find((each) => seconds < each);
-  return limit ? `< ${limit} s ago` : `${duration(Math.floor(seconds / 60) * 60)} ago`;
+  return `stored ${limit ? `< ${limit} s ago` : `${duration(Math.floor(seconds / 60) * 60)} ago`}`;
 }
 
 /** The search field, and buttons that search for the streams in a state. The search is kept in the address of the page. */
