@@ -22,7 +22,7 @@ from table import Table, benchmark, command
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import ServiceError
-from catstream.jobs.state import TREES
+from catstream.jobs.state import CHECKPOINTS
 from catstream.sinks.track_log import Log
 from catstream.video.rendered import write
 
@@ -47,7 +47,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     log = Log(out / f"{video.stem}.csv").frames()
     rows = [(track.frame, track.object) for frame in log for track in frame.tracks]
     lost, twice = frames * len(boxes) - len(set(rows)), len(rows) - len(set(rows))
-    stored = CheckpointStore(kept / TREES).load(Settings()).seq
+    stored = CheckpointStore(kept / CHECKPOINTS).load(Settings()).seq
     columns = ("killed", "frames", "objects", "rows lost", "rows twice", "messages stored", "s to a new row", "longest")
     row = (moments, frames, len(boxes), lost, twice, stored)
     yield Table("Resume", columns, [(*row, float(np.median(seconds)), max(seconds))], f"seed {options.seed}")

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+from rich.progress import Progress
 
 from catstream.base.files import locked_folder, write_atomically, writing
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.base.threads import cores
-from catstream.cli.common import INTERRUPTS, line_of, messages, stopped, text
+from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, with_listen, with_token
 from catstream.errors import VideoError, require_extra
@@ -84,7 +84,6 @@ def annotate(
       catstream annotate walk.mp4 --box anna@0=120,80,64,48 --output out
       catstream annotate walk.mp4 --boxes out/keyframes.csv --box anna@412=300,90,60,50 --output out --overwrite
     """
-    # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.annotation.annotation import Annotation
         from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes
@@ -93,7 +92,7 @@ def annotate(
     if not drawn:
         require_extra("view")
     jobs = jobs or cores()
-    bar = line_of(messages(), text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = line_of(messages())
     settings = Settings.from_values(overrides)
     with Annotation(
         video, drawn, settings, jobs=jobs if drawn else 2 * jobs, progress=lambda *done: _show(bar, *done)

@@ -56,7 +56,6 @@ def batch(overrides: dict[str, object], boxes: Path, output: Path, jobs: int | N
       catstream batch boxes.csv --output out
       catstream export out dataset --format yolo
     """
-    # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.batch import check_results, read_summaries, read_videos, track_videos, write_summaries
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+from rich.progress import BarColumn
 from rich.table import Table
 
 from catstream.base.files import writing
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from catstream.evaluation.datasets import Sequence
     from catstream.loadtest.load_test import Limit, Result
 
-_FAILED = 1  # exit status if a limit was exceeded or a stream failed
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 #: Limits of a search if none are given.
 _SEARCH_LIMITS = ("p99=0.1", "skipped=0")
@@ -114,7 +113,6 @@ def evaluate(
       catstream evaluate sequences/walk --jitter 7 --set coreset.size=128
       catstream evaluate sequences/ --keyframes 8 --jobs 4 --json keyframes.json
     """
-    # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.evaluation import accuracy, datasets, onepass
 
@@ -133,8 +131,7 @@ def evaluate(
     by_sequence = {} if attributes is None else datasets.read_attributes(attributes)
 
     try:
-        columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
-        with line_of(messages(), *columns) as progress:
+        with line_of(messages()) as progress:
             task = progress.add_task("starting", total=None)
             runs = onepass.evaluate(
                 sequences,
@@ -182,8 +179,7 @@ def _evaluate_keyframes(
         from catstream.evaluation import keyframes
         from catstream.reports.provenance import provenance
 
-    columns = text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn()
-    with line_of(messages(), *columns) as progress:
+    with line_of(messages()) as progress:
         task = progress.add_task("starting", total=len(sequences))
         rows = keyframes.evaluate_keyframes(
             sequences,
@@ -296,7 +292,6 @@ def loadtest(
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
       catstream loadtest --find-streams --rate 25 --size 1920x1080 --source h264
     """
-    # Imported here so that --help and the other commands start faster.
     from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
     from catstream.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
 
@@ -337,7 +332,7 @@ def loadtest(
     for line in load_test.violations:
         complain(f"limit exceeded: {line}")
     if load_test.violations:
-        sys.exit(_FAILED)
+        sys.exit(1)
 
 
 def _print_run(result: Result, limits: list[Limit]) -> None:

@@ -100,7 +100,6 @@ def find(
       catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output detections
       catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
     """
-    # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.finding.files import find_files
         from catstream.finding.find import Search, load_models

@@ -32,7 +32,6 @@ def report(log: Path, page: Path | None, skip_damaged: bool, overwrite: bool) ->
       catstream report out/walk.ndjson
       catstream report out
     """
-    # Imported here so that --help and the other commands start faster.
     with INTERRUPTS.leaving():
         from catstream.base.files import check_file
         from catstream.reports.tracks import Section, write_report

@@ -17,7 +17,7 @@ from catstream.base.names import split_name
 from catstream.base.text import counted, listed
 from catstream.cli.attach import wait_for_pipeline, with_address, with_silence_warnings, with_wait
 from catstream.cli.common import INTERRUPTS
-from catstream.cli.options import PATH, NumberRange, combined, with_overwrite
+from catstream.cli.options import PATH, Command, NumberRange, combined, with_overwrite
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SettingsError, SilenceError
@@ -27,8 +27,6 @@ from catstream.sinks import options as sink_options
 from catstream.sinks.destinations import SINKS, Head, Origin, Row, TrackedFrame
 from catstream.sinks.events import KINDS, check_zones
 from catstream.sinks.options import parse_when
-
-Command = Callable[..., Any]
 
 _REPORTS = 12  # of all processes, in which one of the detector says what it tracks: those of four seconds
 

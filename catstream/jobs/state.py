@@ -32,13 +32,13 @@ from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 
 #: Folder of the checkpoints, in that of the state.
-TREES = "trees"
+CHECKPOINTS = "trees"
 #: Folder of the saved models that objects are searched for by, in that of the state.
 SEARCHED = "searched_models"
 
 _SMALL = ("job.safetensors", "desired_state.json")
 _NAMES = re.compile(
-    rf"job\.safetensors|desired_state\.json|{TREES}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
+    rf"job\.safetensors|desired_state\.json|{CHECKPOINTS}/[0-9]+\.safetensors|{SEARCHED}/[0-9a-f]+\.safetensors"
 )
 _ATTEMPTS = 5  # to read a checkpoint that is replaced meanwhile
 
@@ -52,17 +52,17 @@ def contains_run(folder: Path) -> bool:
 
 def files_of_state(folder: Path) -> dict[str, Path]:
     """The folder and the files in it that nothing else may write, by their purpose."""
-    return {"the state folder": folder} | {f"{name} of the state": folder / name for name in (*_SMALL, TREES)}
+    return {"the state folder": folder} | {f"{name} of the state": folder / name for name in (*_SMALL, CHECKPOINTS)}
 
 
 def last_seq(folder: Path) -> int:
     """Number of the last message in the newest valid checkpoint: the run is resumed after it."""
-    return CheckpointStore(folder / TREES).position()[0]
+    return CheckpointStore(folder / CHECKPOINTS).position()[0]
 
 
 def last_time(folder: Path) -> float:
     """Time of the frame of that message, in seconds."""
-    return CheckpointStore(folder / TREES).position()[1]
+    return CheckpointStore(folder / CHECKPOINTS).position()[1]
 
 
 def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> SavedModel:
@@ -70,7 +70,7 @@ def learned(folder: Path, settings: Settings, name: str = UNNAMED) -> SavedModel
 
     ObjectError if there is no such object; ServiceError if nothing was learned before a checkpoint.
     """
-    forest = CheckpointStore(folder / TREES).load(settings)
+    forest = CheckpointStore(folder / CHECKPOINTS).load(settings)
     if name == UNNAMED and len(forest.compressors) == 1:
         (name,) = forest.compressors
     if forest.compressors and name not in forest.compressors:
@@ -88,7 +88,7 @@ def files(folder: Path) -> dict[str, bytes]:
         with contextlib.suppress(FileNotFoundError):  # a newer file has just taken its place
             # The desired state is read before the folder of the saved models that it names: they are stored before it.
             content = {name: (folder / name).read_bytes() for name in _SMALL if (folder / name).exists()}
-            checkpoints = sorted((folder / TREES).glob("[0-9]*.safetensors"))
+            checkpoints = sorted((folder / CHECKPOINTS).glob("[0-9]*.safetensors"))
             for path in [*(folder / SEARCHED).glob("[0-9a-f]*.safetensors"), *checkpoints[-1:]]:
                 content[f"{path.parent.name}/{path.name}"] = path.read_bytes()
             return content if checkpoints else {}
@@ -127,7 +127,7 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
 def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
     """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
-        if resumed is None and any((folder / name).exists() for name in (_SMALL[0], TREES)):
+        if resumed is None and any((folder / name).exists() for name in (_SMALL[0], CHECKPOINTS)):
             if contains_run(folder):
                 hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
             else:

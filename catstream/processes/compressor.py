@@ -13,7 +13,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import prepare
 from catstream.errors import ServiceError
 from catstream.jobs.saved_model import SavedModel, continued
-from catstream.jobs.state import TREES, locked
+from catstream.jobs.state import CHECKPOINTS, locked
 from catstream.messages.kinds import End, Features, ModelFile, Position
 from catstream.processes.decisions import checkpoint_is_due, stored, with_end
 from catstream.processes.process import MESSAGE_SECONDS, Process
@@ -55,7 +55,7 @@ class CompressorLoop:
     def __init__(self, process: Process, stack: ExitStack) -> None:
         settings, endpoint = process.settings, process.endpoint
         self._process = process
-        self._checkpoints = CheckpointStore(stack.enter_context(locked(process.state / TREES, _LOCK_SECONDS)))
+        self._checkpoints = CheckpointStore(stack.enter_context(locked(process.state / CHECKPOINTS, _LOCK_SECONDS)))
         self._forest = self._checkpoints.load(settings)
         seq = self._forest.seq
         self._position = Position(seq, seq, versions=self._forest.versions)

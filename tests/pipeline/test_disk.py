@@ -8,7 +8,7 @@ import pytest
 from catstream.base.settings import Settings
 from catstream.client.attach import subscribe
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.jobs.state import TREES
+from catstream.jobs.state import CHECKPOINTS
 from catstream.pipeline import Pipeline
 
 #: A small window is soon full, a short pause soon over: the disk is noticed within this video.
@@ -43,15 +43,15 @@ def test_a_run_continues_and_reports_a_disk_that_cannot_be_written(long_video, d
         for track in pipeline:
             tracks.append(track.frame)
             if track.frame == 15:
-                until(lambda: list((state / TREES).glob("*.safetensors")))
+                until(lambda: list((state / CHECKPOINTS).glob("*.safetensors")))
                 spoil(disk, until)
             if track.frame == 40:
                 with subscribe(pipeline.endpoint, "health", timeout=150) as reports:
                     said = next(report.trouble for report in reports if report.trouble)
-                assert 0 < CheckpointStore(state / TREES).load(SETTINGS).seq < 40, "what was kept before is whole"
+                assert 0 < CheckpointStore(state / CHECKPOINTS).load(SETTINGS).seq < 40, "what was kept before is whole"
                 mend(disk)
     assert reason in said
     assert tracks == list(range(len(boxes)))
     totals = pipeline.totals
     assert totals["sent"] == totals["stored"] == len(boxes), "checkpoints went on once there was room"
-    assert CheckpointStore(state / TREES).load(SETTINGS).seq == len(boxes)
+    assert CheckpointStore(state / CHECKPOINTS).load(SETTINGS).seq == len(boxes)

@@ -18,7 +18,7 @@ from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.errors import CatstreamError, ServiceError
 from catstream.jobs.job import Job
-from catstream.jobs.state import TREES
+from catstream.jobs.state import CHECKPOINTS
 from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.processes.shared import RUNNING_SECONDS
@@ -48,7 +48,7 @@ def test_processes_started_manually_in_any_order_complete_a_run(video, folder, t
     order = "detector", "trainer", "compressor"
     processes = by_hand("--resume", path, box=boxes[0], order=order, endpoint=tcp)
     assert [process.wait(120) for process in processes] == [0, 0, 0]
-    assert CheckpointStore(folder / TREES).load(Settings()).seq == len(boxes)
+    assert CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq == len(boxes)
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, f
     errors = [process.communicate(timeout=150)[1] for process in processes]
     assert [process.returncode for process in processes] == [3, 3, 3], errors
     assert "5.png' (frame 5): replace or remove it" in errors[-1]
-    assert CheckpointStore(folder / TREES).load(Settings()).seq == 5
+    assert CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq == 5
 
 
 PROGRAM = """
@@ -113,7 +113,7 @@ def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folde
         processed = next(counters["processed"] for counters in told if counters["processed"])
         compressor.send_signal(signal.SIGTERM)
         assert compressor.wait(150) == 0
-        stored = CheckpointStore(folder / TREES).load(Settings()).seq
+        stored = CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq
         assert stored >= processed
         by_hand(path, order=("compressor",), **run)  # tells it, if the last answer was lost
         until(lambda: next(told)["stored"] >= stored)
