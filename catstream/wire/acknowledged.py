@@ -1,4 +1,4 @@
-"""The acknowledged channel (`features`): every message arrives once and in order, whichever side is restarted.
+"""The acknowledged channel (`all-features`): every message arrives once and in order, whichever side is restarted.
 
 The receiver binds a ROUTER socket, the sender connects a DEALER. The protocol is go-back-N;
 `catstream.wire.go_back_n` describes and implements it. Here its two state machines are connected to sockets and to the

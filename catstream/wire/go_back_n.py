@@ -42,7 +42,7 @@ class SendWindow:
     sent          newest seq that was pushed
     acknowledged  newest seq that the receiver will not ask for again while it lives
     stored        newest seq that survives the receiver's death; below `acknowledged` while its disk cannot be written
-    processed         newest seq that the receiver has processed
+    processed     newest seq that the receiver has processed
     """
 
     def __init__(self, channel: str, size: int, now: float) -> None:

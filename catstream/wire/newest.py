@@ -1,4 +1,4 @@
-"""Published channels (`samples`, `models`, `tracks`, `health`, `previews`, `training`): any number of subscribers.
+"""Published channels, all that no single process receives: any number of subscribers.
 
 The publisher binds an XPUB socket, subscribers connect SUB sockets. They subscribe to everything (the empty topic), to
 one kind of message, or to the messages of one kind about one object (the bytes that these messages begin with, see
