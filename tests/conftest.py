@@ -32,6 +32,7 @@ from catstream.cli.common import INTERRUPTS
 from catstream.fleet.registry import RegistryServer
 from catstream.messages.kinds import Answer, Command
 from catstream.video.rendered import render, write
+from catstream.video.source import open_source
 from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
@@ -99,6 +100,18 @@ def demo_video(once):
         return folder / "demo.mp4", [Box(*box) for box in boxes.tolist()]
 
     return rendered
+
+
+@pytest.fixture
+def endless(demo_video, tmp_path):
+    """A folder of so many images that no run reaches its end, all of the same frame."""
+    folder = tmp_path / "endless"
+    folder.mkdir()
+    with open_source(demo_video(32)[0]) as source:
+        cv2.imwrite(str(folder / "00000.png"), next(source).image)
+    for number in range(1, 5000):
+        (folder / f"{number:05d}.png").hardlink_to(folder / "00000.png")
+    return str(folder)
 
 
 @pytest.fixture(scope="session")

@@ -82,10 +82,11 @@ def test_a_live_source_cannot_be_annotated(fail, tmp_path):
     )
 
 
-def test_existing_results_are_replaced_with_overwrite_only(demo, fail, tmp_path):
-    (tmp_path / "next.csv").touch()
-    box = f"@0={demo[1][0]}"
-    assert "next.csv exists already" in fail("annotate", demo[0], "--box", box, "--output", tmp_path)
+@pytest.mark.parametrize("options", [["--box", "@0=1,2,30,40"], []], ids=["boxes", "page"])
+@pytest.mark.parametrize("name", ["next.csv", "demo.ndjson"])
+def test_existing_results_are_replaced_with_overwrite_only(demo, fail, tmp_path, options, name):
+    (tmp_path / name).touch()
+    assert f"{name} exists already" in fail("annotate", demo[0], *options, "--output", tmp_path)
 
 
 def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, monkeypatch):
@@ -104,8 +105,3 @@ def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, mo
 def test_the_page_without_its_extra_is_an_error_with_the_install_command(demo, fail, tmp_path, monkeypatch):
     monkeypatch.setattr("catstream.errors.find_spec", lambda _: None)
     assert 'install "catstream[view]"' in fail("annotate", demo[0], "--output", tmp_path / "out")
-
-
-def test_the_page_does_not_replace_the_results_of_another_run(demo, fail, tmp_path):
-    (tmp_path / "demo.ndjson").write_text("{}\n")
-    assert "demo.ndjson exists already" in fail("annotate", demo[0], "--output", tmp_path)

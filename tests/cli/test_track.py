@@ -102,7 +102,7 @@ def test_a_reader_that_wants_no_more_ends_the_run_in_silence(video, catstream):
     assert process.wait(150) == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])  # test_track_live.py has SIGINT
 def test_a_stopped_run_keeps_its_results(long_video, said, until, tmp_path, number):
     source, box = long_video  # it is not over before the signal comes
     more = ["--video", "--save-model", tmp_path / "model", "--set", "run.unstored_frames=1", "--lockstep"]

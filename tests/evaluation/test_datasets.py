@@ -151,11 +151,6 @@ def test_the_ground_truth_of_otb_david_begins_at_its_300th_image(tmp_path):
     check(folder(tmp_path / "mine" / "david", "groundtruth_rect.txt", "img", lines(TRUTH)), "david")
 
 
-def test_a_rotated_polygon_is_read_as_its_bounding_box(tmp_path):
-    place = folder(tmp_path / "walk", "groundtruth.txt", ".", 2 * "10,5,15,10,10,15,5,10\n", frames=1)
-    np.testing.assert_allclose(find_sequences(place)[0].boxes, 2 * [[5, 5, 10, 10]])
-
-
 @pytest.mark.parametrize(
     ("name", "line", "box"),
     [

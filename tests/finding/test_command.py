@@ -102,7 +102,7 @@ def test_a_name_that_is_not_utf_8_stays_in_the_tables_and_the_report(run, video,
         assert b"caf\xe9.mp4" in (tmp_path / "found" / name).read_bytes()
 
 
-@pytest.mark.parametrize(("sizes", "code"), [("1", 2), ("a,b", 2), ("2,1", 1)])
-def test_sizes_that_are_not_two_numbers_in_order_are_an_error(run, video, sizes, code):
-    found, output = run(video, "--sizes", sizes)
-    assert (found, "0.5,2" in output) == (code, True)
+@pytest.mark.parametrize("sizes", ["1", "a,b"])
+def test_sizes_that_are_not_two_numbers_are_an_error(run, video, sizes):
+    code, output = run(video, "--sizes", sizes)
+    assert (code, "0.5,2" in output) == (2, True)

@@ -5,12 +5,9 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-import cv2
 import numpy as np
 import psutil
 import pytest
-
-from catstream.video.source import open_source
 
 FRAMES = 32
 SERVICES = Path(__file__).parents[2] / "services"
@@ -34,18 +31,6 @@ def long_video(demo_video):
     """The same with more frames, for events that take longer."""
     path, boxes = demo_video(60)
     return str(path), boxes
-
-
-@pytest.fixture
-def endless(video, tmp_path):
-    """A folder of so many images that no run reaches its end, all of the same frame."""
-    folder = tmp_path / "endless"
-    folder.mkdir()
-    with open_source(video[0]) as source:
-        cv2.imwrite(str(folder / "00000.png"), next(source).image)
-    for number in range(1, 5000):
-        (folder / f"{number:05d}.png").hardlink_to(folder / "00000.png")
-    return str(folder)
 
 
 @pytest.fixture

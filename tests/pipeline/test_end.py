@@ -4,8 +4,8 @@ import os
 import signal
 import time
 from itertools import islice
+from pathlib import Path
 
-import cv2
 import pytest
 
 from catstream.base.settings import Settings
@@ -14,25 +14,21 @@ from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import START_ORDER
 from catstream.processes.supervisor import Child
-from catstream.video.source import open_source
 
 
-def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_error(demo_video, tmp_path):
+def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_error(endless, video):
     """The compressor has stored nothing yet, so all frames that the owner has are repeated."""
-    video = demo_video(200)  # not complete when its processes die
-    with open_source(video[0]) as source:
-        for frame in source:
-            cv2.imwrite(str(tmp_path / f"{frame.number:03d}.png"), frame.image)
     settings = Settings(run={"checkpoint_seconds": 600.0})
-    with Pipeline(tmp_path, video[1][0], settings) as pipeline:
+    with Pipeline(endless, video[1][0], settings) as pipeline:
         tracks = list(islice(pipeline, 11))
-        (tmp_path / "005.png").write_bytes(b"damaged meanwhile")
+        Path(endless, "00005.png").unlink()  # the others are links to the same image
+        Path(endless, "00005.png").write_bytes(b"damaged meanwhile")
         for victim in ("detector", "compressor"):
             os.kill(pipeline.pids[victim], signal.SIGKILL)
-        with pytest.raises(VideoError, match=r"005\.png"):
+        with pytest.raises(VideoError, match=r"00005\.png"):
             tracks.extend(pipeline)
         assert [track.frame for track in tracks] == list(range(len(tracks)))
-        assert "005.png" in pipeline.reason
+        assert "00005.png" in pipeline.reason
         assert pipeline.totals["sent"] == pipeline.totals["stored"] == 5
 
 

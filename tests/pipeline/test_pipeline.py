@@ -35,9 +35,8 @@ def run(video):
 
 def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
     tracks, pipeline, _ = run
-    assert [track.frame for track in tracks] == list(range(pipeline.frames))
-    assert [track.frame for track in tracks] == list(range(pipeline.frames))
     n = pipeline.frames
+    assert [track.frame for track in tracks] == list(range(n))
     assert pipeline.totals == {"sent": n, "stored": n, "rows": n, "restarts": 0}
     assert pipeline.reason == "the source has ended"
 

@@ -1,5 +1,6 @@
 """The files from which a run continues on another machine."""
 
+import shutil
 from dataclasses import replace
 from itertools import islice
 
@@ -13,12 +14,19 @@ from catstream.processes.decisions import DESIRED, DesiredState
 from tests.pipeline.conftest import share_found
 
 
-@pytest.fixture
-def state(video, tmp_path):
+@pytest.fixture(scope="module")
+def finished(video, tmp_path_factory):
     path, truth = video
-    with Pipeline(path, truth[0], {"run.lockstep": True}, part=slice(0, 12), state=tmp_path / "here") as pipeline:
+    folder = tmp_path_factory.mktemp("finished") / "state"
+    with Pipeline(path, truth[0], {"run.lockstep": True}, part=slice(0, 12), state=folder) as pipeline:
         assert len(list(pipeline)) == 12
-    return tmp_path / "here"
+    return folder
+
+
+@pytest.fixture
+def state(finished, tmp_path):
+    """The state of a run of 12 frames that has ended."""
+    return shutil.copytree(finished, tmp_path / "here")
 
 
 def test_a_restored_state_is_at_the_same_position(state, tmp_path):

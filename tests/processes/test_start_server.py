@@ -122,15 +122,6 @@ def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
 
 
-def test_nothing_outlives_a_program_that_is_killed(until):
-    program = "import time; from catstream.processes.start_server import start_server; "
-    program += "print(start_server().pid, flush=True); time.sleep(600)"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as owner:
-        server = psutil.Process(int(owner.stdout.readline()))
-        owner.kill()
-    until(lambda: has_ended(server))
-
-
 @pytest.mark.parametrize("closed", ["os.closerange(0, 3)", ""], ids=["by itself", "before its start"])
 def test_a_program_without_standard_streams_has_processes_that_run(tmp_path, folder, closed):
     job, log = Job(endpoint=str(folder)).save(tmp_path), tmp_path / "log"

@@ -9,7 +9,6 @@ from math import nan
 from pathlib import Path
 from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import pytest
 from pycocotools.coco import COCO
@@ -151,20 +150,6 @@ def test_yolo_has_a_file_for_each_frame_with_centres_in_parts_of_it(tmp_path):
         "walk_000002.txt": "",
     }
     assert (folder / "data.yaml").read_text().endswith('names:\n  0: "object"\n  1: "anna"\n')
-
-
-def test_the_reader_of_supervision_finds_the_boxes_of_yolo(tmp_path):
-    supervision = pytest.importorskip("supervision", reason="no supervision: pip install supervision")
-    folder = made(tmp_path / "set", "yolo", ANNOTATED, size=(100, 80), label="person")
-    (folder / "images").mkdir()
-    for number in range(4):
-        cv2.imwrite(str(folder / "images" / f"walk_{number:06d}.jpg"), np.zeros((80, 100, 3), np.uint8))
-    images, labels, names = (str(folder / name) for name in ("images", "labels", "data.yaml"))
-    read = supervision.DetectionDataset.from_yolo(images, labels, names)
-    assert read.classes == ["person"]
-    boxes = {Path(path).stem[-1]: found.xyxy.round(2).tolist() for path, _, found in read}
-    assert boxes["0"] == [[10.0, 20.0, 40.5, 60.0], [0.0, 20.0, 20.0, 60.0]]
-    assert [len(boxes[number]) for number in "0123"] == [2, 1, 1, 1]
 
 
 def test_via_has_a_row_for_each_box_as_movement_reads_it(tmp_path):

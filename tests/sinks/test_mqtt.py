@@ -15,11 +15,10 @@ import paho.mqtt.client as mqtt
 import pytest
 
 from catstream.base.box import Box
-from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.sinks import mqtt_sink
-from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
+from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
 needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
@@ -317,27 +316,3 @@ def test_tls_needs_a_certificate_that_this_machine_trusts(tmp_path, until, monke
         until(lambda: events(got)[-1:] == [("ended", 0.0)])
     finally:
         broker.stop()
-
-
-@pytest.mark.parametrize(
-    ("place", "words"),
-    [
-        ("mqtt://host", "has no valid topic"),
-        ("mqtt://host/", "has no valid topic"),
-        ("mqtt://host/a/#", "has no valid topic"),
-        ("mqtt://host/a/+", "has no valid topic"),
-        ("mqtt://me:1/secret@host/a", "percent-encode a /"),
-        ("mqtt://host:99999/a", "port has to be 1 to 65535"),
-        ("mqtt://host:0/a", "port has to be 1 to 65535"),
-        ("mqtt://host:one/a", "port has to be 1 to 65535"),
-        ("mqtt://fe80::1:2/a", "IPv6 address is in brackets"),
-        ("mqtt://:1883/a", "host is missing"),
-        ("mqtt:///a", "expected mqtt://"),
-        ("mqtt://me:secret@host:0/a", "expected mqtt://"),
-        ("mqtts://me:sec/secret@host/a", "expected mqtt://"),
-    ],
-)
-def test_an_address_that_is_none_is_an_error_before_the_run_that_tells_no_password(place, words):
-    with pytest.raises(VideoError, match=words) as error:
-        check_sink(place, SinkOptions())
-    assert "secret" not in str(error.value)

