@@ -137,12 +137,19 @@ def _memory(frames: DecodedFrames, keyframes: Keyframes, settings: Settings) -> 
     """The merged model of the boxes of an object. The rows of each box fill a leaf, which is 16 tracked frames."""
     models: dict[tuple[str, ...], SavedModel] = {}  # by their rows, which frames of a still video share
     for number, box in keyframes.items():
-        if box is not None:
-            tracker = MultiTracker(settings)
-            try:
-                tracker.init(frames[number], {UNNAMED: box})
-            except BoxError:
-                continue
-            model = tracker.saved_model()
+        if box is not None and (model := _model(frames, number, box, settings)):
             models[model.origins] = model
     return merge(models.values(), force=True) if len(models) > 1 else next(iter(models.values()), None)
+
+
+def _model(frames: DecodedFrames, number: int, box: Box, settings: Settings) -> SavedModel | None:
+    """The model of one box, trained once: it is saved beside the frames. None if tracking cannot start at the box."""
+    file = frames.path.with_name(f"{number}={','.join(map(str, box))}.safetensors")
+    if not file.exists():
+        tracker = MultiTracker(settings)
+        try:
+            tracker.init(frames[number], {UNNAMED: box})
+        except BoxError:
+            return None
+        tracker.saved_model().save(file)
+    return SavedModel.load(file)

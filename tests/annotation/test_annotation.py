@@ -5,6 +5,7 @@ import multiprocessing
 import pytest
 
 from catstream.annotation import annotation as module
+from catstream.annotation import passes
 from catstream.annotation.annotation import Annotation, annotate
 from catstream.base.box import Box
 from catstream.errors import BoxError, CatstreamError, ObjectError, VideoError
@@ -84,6 +85,16 @@ def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(de
         annotation.add(12, truth[12], "anna")
         assert {*multiprocessing.active_children()} == processes
     assert not multiprocessing.active_children()
+
+
+def test_the_model_of_a_box_is_trained_once(demo, both_ends, monkeypatch):
+    def second_pass():
+        keyframes = both_ends.keyframes["anna"]
+        return passes.run_pass(both_ends.frames, 0, 3, keyframes, both_ends.settings, use_memory=True).boxes.tolist()
+
+    trained = second_pass()
+    monkeypatch.delattr(passes, "MultiTracker")
+    assert second_pass() == trained
 
 
 def test_where_an_object_is_absent_it_has_no_box(demo):
