@@ -27,8 +27,8 @@ class _StoppedError(Exception):
 class Session:
     """Changes the boxes of an annotation, while a thread decodes the video and tracks what is missing.
 
-    The passes of the newest box run first. The methods may be called from any thread. Use it in a `with`; the owner
-    of the annotation closes it afterwards.
+    Objects take turns, beginning with that of the newest box, and the passes of the newest box of each run first. The
+    methods may be called from any thread. Use it in a `with`; the owner of the annotation closes it afterwards.
 
     Parameters
     ----------
@@ -58,7 +58,8 @@ class Session:
         self.problem: CatstreamError | None = None
         self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())
         self._history: list[tuple[str, int, dict[str, dict[int, Box | None]]]] = []  # object, frame, boxes before
-        self._newest: tuple[str, int] | None = None  # object and frame of the last change
+        self._newest: dict[str, int] = {}  # frame of the newest box of each object
+        self._turns: dict[str, int] = {}  # number of the newest pass of each object, without one its turn is next
         self._missing: list[Task] = []
         self._running: dict[Future[Any], tuple[Task, Path]] = {}  # with the file that counts its frames
         self._wakes, self._closed = True, False
@@ -82,7 +83,8 @@ class Session:
         """Add or replace the box of an object at a frame, None if it is absent there; errors as of `Annotation`."""
         with self.lock:
             before = self.annotation.keyframes
-            self._newest = object, frame
+            self._newest[object] = frame
+            self._turns.pop(object, None)
             self._replace({**before, object: {**before.get(object, {}), frame: box}})
             self._history.append((object, frame, before))
 
@@ -171,22 +173,27 @@ class Session:
             if task not in self._missing:
                 count.unlink()  # ends it
                 del self._running[future]
-        running = [task for task, _ in self._running.values()]
-        for task in sorted(self._missing, key=self._priority):
-            alike = [other for other in running if (other.frames > _LONG) == (task.frames > _LONG)]
-            if task not in running and len(alike) < self._jobs:
-                running.append(task)
-                future, count = self.annotation.submit(task)
-                self._running[future] = task, count
-                future.add_done_callback(lambda _: self._wake())
+        while task := self._next_task():
+            self._turns[task.object] = max(self._turns.values(), default=0) + 1
+            future, count = self.annotation.submit(task)
+            self._running[future] = task, count
+            future.add_done_callback(lambda _: self._wake())
         self.tracks = self.annotation.tracks
         least = _WORTHWHILE if self._missing else 0.0
         frames = (frame for frame in self.annotation.next_frames() if frame.errors >= least)
         self.next_frames = [frame for frame in frames if not self._is_tracked(frame)]
         self.revision += 1
 
-    def _priority(self, task: Task) -> tuple[bool, int]:
-        return (task.object, task.start) != self._newest and (task.object, task.stop) != self._newest, task.frames
+    def _next_task(self) -> Task | None:
+        """The missing pass that starts next: the shortest beside the newest box of the object whose turn it is."""
+        running = [task for task, _ in self._running.values()]
+        full = [long for long in (False, True) if sum(_is_long(task) == long for task in running) >= self._jobs]
+        waiting = (task for task in self._missing if task not in running and _is_long(task) not in full)
+        return min(waiting, key=self._priority, default=None)
+
+    def _priority(self, task: Task) -> tuple[int, bool, int]:
+        is_newest = self._newest.get(task.object) in (task.start, task.stop)
+        return self._turns.get(task.object, 0), not is_newest, task.frames
 
     def _is_tracked(self, following: NextFrame) -> bool:
         """Return True if a missing pass may check the frame soon: none can at an end of the video without a box."""
@@ -197,6 +204,10 @@ class Session:
         )
 
 
+def _is_long(task: Task) -> bool:
+    return task.frames > _LONG
+
+
 def _is_refinement(task: Task) -> bool:
-    """Return True for a long second pass, in which a person need not wait to add a box."""
-    return task.use_memory and task.frames > _LONG
+    """Return True for a long second pass: a person need not wait for it to add a box."""
+    return task.use_memory and _is_long(task)

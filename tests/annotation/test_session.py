@@ -78,6 +78,17 @@ def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo,
     assert len(session.annotation.passes("anna")) == 1
 
 
+def test_objects_take_turns(demo, until, monkeypatch):
+    drawn = {frame: demo[1][frame] for frame in (0, 8, 16)}
+    order = []
+    with Annotation(demo[0], {"anna": drawn, "ben": drawn}, jobs=1) as annotation:
+        submit = annotation.submit
+        monkeypatch.setattr(annotation, "submit", lambda task: order.append(task.object) or submit(task))
+        with Session(annotation, 1, lambda: None, lambda: None):
+            until(lambda: len(order) >= 6)
+    assert order[:6] == ["anna", "ben"] * 3
+
+
 @pytest.mark.parametrize(
     ("change", "error"),
     [
