@@ -15,6 +15,7 @@ from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import UInt8
 from catstream.base.files import writing
 from catstream.base.settings import Settings
+from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.video.frames import Source
 from catstream.video.source import ALL_FRAMES, open_source
@@ -82,11 +83,14 @@ def decode(video: Source, frames: DecodedFrames, progress: Callable[[int, int | 
     with closing(video), writing(frames.path, VideoError), frames.path.open("wb") as file:
         width, height = frames.size
         _check_space(frames.path.parent, (video.frames or 0) * width * height * 3)
-        for frame in video:
-            file.write(frame.image.tobytes())
-            file.flush()  # before its number is counted
-            frames.times.append(frame.time)
-            progress(len(frames), video.frames)
+        try:
+            for frame in video:
+                file.write(frame.image.tobytes())
+                file.flush()  # before its number is counted
+                frames.times.append(frame.time)
+                progress(len(frames), video.frames)
+        except VideoError as error:
+            raise VideoError(f"{counted(len(frames), 'frame')} could be read: {error}") from None
 
 
 def _check_space(folder: Path, required: int) -> None:

@@ -13,6 +13,7 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from itertools import groupby
+from secrets import token_hex
 from typing import Literal
 
 from starlette.applications import Starlette
@@ -26,7 +27,7 @@ from starlette.staticfiles import StaticFiles
 from catstream.annotation.session import Session
 from catstream.base.box import Box
 from catstream.base.names import check_name
-from catstream.errors import CatstreamError
+from catstream.errors import CatstreamError, CommandRejectedError
 from catstream.messages.kinds import Track
 from catstream.video.drawing import PALETTE
 from catstream.video.frames import jpeg
@@ -40,6 +41,7 @@ class AnnotationSite:
 
     def __init__(self, session: Session) -> None:
         self._session, self._closed = session, False
+        self._id = token_hex(8)  # a tab of an earlier server at the same port has another one
         routes = [
             Route("/", lambda _: FileResponse(PAGE / "annotate.html")),
             Route("/events", lambda request: endless(request, self._states(), "text/event-stream")),
@@ -84,6 +86,8 @@ class AnnotationSite:
 
     async def _edit(self, request: Request) -> Response:
         edit = await json_of(request, Edit)
+        if edit.server != self._id:
+            raise CommandRejectedError("this page belongs to an earlier command: reload it")
         return JSONResponse({"done": True, **await run_in_threadpool(self._change, edit)})
 
     def _change(self, edit: Edit) -> dict[str, object]:
@@ -124,6 +128,7 @@ class AnnotationSite:
                 for number, (name, drawn) in enumerate(session.annotation.keyframes.items())
             ]
         return {
+            "server": self._id,
             "video": frames.name,
             "size": frames.size,
             "frames": len(frames),
@@ -141,6 +146,7 @@ class AnnotationSite:
 class Edit:
     """A change of the page.
 
+    server  that of the state of the page
     verb    "draw" a box at a frame, none if the object is absent; "undo" the last one; "rename" an object; "done"
     object  name of the object
     frame   number of the frame
@@ -148,6 +154,7 @@ class Edit:
     name    the new name
     """
 
+    server: str
     verb: Literal["draw", "undo", "rename", "done"]
     object: str = ""
     frame: int = 0

@@ -122,6 +122,7 @@ def test_the_frames_before_one_that_cannot_be_decoded_are_annotated(walk, until,
     with Annotation(images, {}) as annotation, Session(annotation, 1, lambda: None, lambda: None) as session:
         until(lambda: session.decoded)
         assert len(annotation.frames) == 5
+        assert str(session.problem).startswith("5 frames could be read: ")
         assert "0006.png" in str(session.problem)
         session.draw("anna", 4, Box(20, 20, 30, 30))
         until(lambda: len(session.tracks.get("anna", [])) == 5)

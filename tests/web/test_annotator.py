@@ -35,11 +35,15 @@ def page(session, serve_site):
 
 @pytest.fixture
 def edit(page):
-    def send(verb, **fields):
-        answer = page.post("/edit", json={"verb": verb, **fields})
+    def change(verb, **fields):
+        answer = send(page, verb, **fields)
         return answer.status_code, answer.json()
 
-    return send
+    return change
+
+
+def send(page, verb, **fields):
+    return page.post("/edit", json={"server": state(page)["server"], "verb": verb, **fields})
 
 
 def state(page):
@@ -108,10 +112,19 @@ def test_a_second_box_in_the_same_frame_replaces_the_first(edit, session, demo):
 
 
 def test_a_page_of_another_origin_changes_nothing(page, session):
-    body = {"verb": "draw", "object": "anna", "frame": 0, "box": [9, 2, 30, 40]}
+    body = {"server": state(page)["server"], "verb": "draw", "object": "anna", "frame": 0, "box": [9, 2, 30, 40]}
     assert page.post("/edit", json=body, headers={"origin": "https://example.org"}).status_code == 403
     assert page.post("/edit", content=json.dumps(body), headers={"content-type": "text/plain"}).status_code == 415
     assert session.annotation.keyframes == {}
+
+
+def test_a_tab_of_an_earlier_server_changes_nothing(session, serve_site, demo):
+    earlier, page = serve_site(AnnotationSite(session)), serve_site(AnnotationSite(session))
+    fields = {"server": state(earlier)["server"], "verb": "draw", "object": "anna", "frame": 0, "box": [*demo[1][0]]}
+    answer = page.post("/edit", json=fields)
+    assert (answer.status_code, answer.json()["reason"]) == (409, "this page belongs to an earlier command: reload it")
+    assert session.annotation.keyframes == {}
+    assert earlier.post("/edit", json=fields).status_code == 200
 
 
 def test_done_ends_the_session(edit, session):
@@ -141,7 +154,7 @@ def test_the_command_continues_where_it_was_interrupted_until_it_is_done(serving
     box = [*demo[1][0]]
     with serving() as (process, client):
         until(lambda: state(client)["decoded"])
-        client.post("/edit", json={"verb": "draw", "object": "anna", "frame": 0, "box": box})
+        send(client, "draw", object="anna", frame=0, box=box)
         process.terminate()
         assert process.wait(150) == 143
     assert (tmp_path / "out" / "keyframes.csv").read_text().splitlines()[1].startswith("0,anna,")
@@ -149,8 +162,8 @@ def test_the_command_continues_where_it_was_interrupted_until_it_is_done(serving
     with serving() as (process, client):
         until(lambda: state(client)["decoded"])
         assert [one["name"] for one in state(client)["objects"]] == ["anna"]
-        client.post("/edit", json={"verb": "draw", "object": "anna", "frame": FRAMES - 1})
-        assert client.post("/edit", json={"verb": "done"}).json() == {"done": True}
+        send(client, "draw", object="anna", frame=FRAMES - 1)
+        assert send(client, "done").json() == {"done": True}
         assert process.wait(150) == 0
         assert "2 keyframes" in process.stdout.read()
     assert len((tmp_path / "out" / "demo.csv").read_text().splitlines()) == FRAMES + 1
@@ -159,6 +172,6 @@ def test_the_command_continues_where_it_was_interrupted_until_it_is_done(serving
 def test_an_annotation_that_ends_without_a_box_says_so(serving, until):
     with serving() as (process, client):
         until(lambda: state(client)["decoded"])
-        client.post("/edit", json={"verb": "done"})
+        send(client, "done")
         assert process.wait(150) == 0
         assert process.stdout.read().startswith("no box was drawn\n")

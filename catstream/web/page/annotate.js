@@ -24,7 +24,7 @@ class FrameStage extends Stage {
 
 class AnnotatePage {
   constructor() {
-    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: false });
+    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: "" });
     this.work = { began: 0, done: 0, remaining: 0 }; // time of the start of the passes that run, and their frames
     this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {} });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
@@ -38,14 +38,15 @@ class AnnotatePage {
     addEventListener("keydown", (event) => this.key(event));
     addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // Enter means next again
     new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
-    const events = new EventSource("events");
-    events.onmessage = ({ data }) => this.receive(JSON.parse(data));
-    events.onerror = () => { this.silent = true; this.show(); };
+    this.events = new EventSource("events");
+    this.events.onmessage = ({ data }) => this.receive(JSON.parse(data));
+    this.events.onerror = () => { this.silent = true; this.show(); };
     this.choose(null);
   }
 
   /** Show another state of the server, or that it has ended. */
   receive({ closed, ...state }) {
+    if (!closed && this.state && state.server !== this.state.server) return this.end("Another command serves this address now: reload the page.");
     this.silent = Boolean(closed);
     if (!closed) {
       const { work } = this;
@@ -141,7 +142,7 @@ class AnnotatePage {
   async send(verb, more = {}) {
     let answer;
     try {
-      const response = await fetch("edit", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ verb, ...more }) });
+      const response = await fetch("edit", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ server: this.state.server, verb, ...more }) });
       const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
       answer = json ? await response.json() : { done: false, reason: (await response.text()).trim() };
     } catch {
@@ -187,8 +188,13 @@ class AnnotatePage {
   }
 
   async done() {
-    if (!(await this.send("done"))) return;
-    this.ended = true;
+    if (await this.send("done")) this.end("Done: the results are written, and the command has ended. This tab can be closed.");
+  }
+
+  /** Show no other state from now on, but the reason. */
+  end(reason) {
+    this.events.close();
+    this.ended = reason;
     this.show();
   }
 
@@ -278,7 +284,7 @@ class AnnotatePage {
   /** What the server does, as a state for its colour and in words. */
   progress() {
     const { state, ended, silent, work } = this;
-    if (ended) return ["ended", "done"];
+    if (ended) return ["ended", "page ended"];
     if (silent || !state) return ["silent", silent ? "page stopped" : "connecting"];
     if (!state.decoded) return ["bootstrapping", `decoding: ${many(state.frames, "frame")}`];
     if (!state.remaining) return ["present", "all boxes saved"];
@@ -287,7 +293,7 @@ class AnnotatePage {
   }
 
   overlay() {
-    if (this.ended) return "Done: the results are written, and the command has ended. This tab can be closed.";
+    if (this.ended) return this.ended;
     if (this.silent) return "The server of this page does not answer. All boxes that were drawn are saved: run the same command to continue.";
     return this.stage.picture ? "" : "Waiting for the first frame";
   }
