@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
 
@@ -226,41 +226,18 @@ class Annotation:
     @property
     def tracks(self) -> dict[str, list[Track]]:
         """The track of each object in all frames, by name, with `checked` and `probability`; doubtful if unchecked."""
-        tracks = {}
-        for name in self.keyframes:
-            boxes, probabilities, scores = self._fused(name)
-            tracks[name] = [
-                Track(
-                    *(frame, self.frames.times[frame], "absent" if np.isnan(box[0]) else "present"),
-                    None if np.isnan(box[0]) else Box(*box.tolist()),
-                    float(scores[frame]),
-                    model_version=0,
-                    object=name,
-                    doubtful=check == "unchecked",
-                    checked=check,
-                    probability=float(probabilities[frame]),
-                )
-                for frame, (box, check) in enumerate(zip(boxes, self._checks(name, probabilities), strict=True))
-            ]
-        return tracks
+        return {name: [*self._tracks(name)] for name in self.keyframes}
 
     @property
     def checked(self) -> dict[str, list[Check]]:
         """The check of each frame (keyframe, checked or unchecked), by the name of the object."""
-        return {name: self._checks(name, probabilities) for name, probabilities in self.probabilities.items()}
-
-    @property
-    def probabilities(self) -> dict[str, Float64]:
-        """Probability that each frame is right, float64 (frames,), by the name of the object.
-
-        Right is an IoU above 0.5 with the true box, or no box where the object is absent.
-        """
-        return {name: self._fused(name)[1] for name in self.keyframes}
+        return {name: [track.checked for track in tracks] for name, tracks in self.tracks.items()}
 
     @property
     def share_checked(self) -> float:
         """Share of frames that are keyframes or checked, over all objects, from 0 to 1."""
-        return float(np.mean([probabilities >= _CHECKED for probabilities in self.probabilities.values()]))
+        checks = [*chain.from_iterable(self.checked.values())]
+        return 1 - checks.count("unchecked") / len(checks) if checks else 0.0
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
@@ -281,8 +258,7 @@ class Annotation:
                     place = abs(frame - start) - 1
                     best = max(filter(None, parts), key=lambda part: part.scores[place], default=None)
                     if best is not None:
-                        box = best.boxes[place]
-                        boxes[stop > start] = None if np.isnan(box[0]) else Box(*box.tolist())
+                        boxes[stop > start] = _box(best.boxes[place])
         return boxes
 
     def next_frame(self) -> NextFrame | None:
@@ -340,11 +316,18 @@ class Annotation:
                 tasks.append(task)
         return tasks
 
-    def _checks(self, name: str, probabilities: Float64) -> list[Check]:
-        checks: list[Check] = ["checked" if value >= _CHECKED else "unchecked" for value in probabilities]
-        for frame in self.keyframes[name]:
-            checks[frame] = "keyframe"
-        return checks
+    def _tracks(self, name: str) -> Iterator[Track]:
+        for frame, (row, probability, score) in enumerate(zip(*self._fused(name), strict=True)):
+            box = _box(row)
+            check: Check = "checked" if probability >= _CHECKED else "unchecked"
+            yield Track(
+                *(frame, self.frames.times[frame], "absent" if box is None else "present", box, float(score)),
+                model_version=0,
+                object=name,
+                doubtful=check == "unchecked",
+                checked="keyframe" if frame in self.keyframes[name] else check,
+                probability=float(probability),
+            )
 
     def _fused(self, name: str) -> tuple[Float64, Float64, Float64]:
         """Boxes, probabilities and scores of an object in all frames; the last two are 1 at keyframes."""
@@ -407,6 +390,10 @@ def annotate(
 def _work(task: Task, frames: DecodedFrames, settings: Settings) -> tuple[Task, Pass | None]:
     one = run_pass(frames, task.start, task.stop, dict(task.keyframes), settings, use_memory=task.use_memory)
     return task, one
+
+
+def _box(row: Float64) -> Box | None:
+    return None if np.isnan(row[0]) else Box(*row.tolist())
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, Box | None]]:

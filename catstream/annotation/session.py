@@ -173,10 +173,10 @@ class Session:
             if task not in self._missing:
                 count.unlink()  # ends it
                 del self._running[future]
-        while task := self._next_task():
-            self._turns[task.object] = max(self._turns.values(), default=0) + 1
-            future, count = self.annotation.submit(task)
-            self._running[future] = task, count
+        while following := self._next_task():
+            self._turns[following.object] = max(self._turns.values(), default=0) + 1
+            future, count = self.annotation.submit(following)
+            self._running[future] = following, count
             future.add_done_callback(lambda _: self._wake())
         self.tracks = self.annotation.tracks
         least = _WORTHWHILE if self._missing else 0.0

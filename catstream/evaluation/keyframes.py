@@ -150,11 +150,11 @@ def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[Keyfra
 
 def _row(sequence: Sequence, annotation: Annotation) -> KeyframeRow:
     ((name, tracks),) = annotation.tracks.items()
-    probabilities, keyframes = annotation.probabilities[name], annotation.keyframes[name]
+    keyframes = annotation.keyframes[name]
     right = _right(np.array([track.box or [np.nan] * 4 for track in tracks], np.float64), sequence.boxes)
-    states = np.array(annotation.checked[name])
+    states = np.array([track.checked for track in tracks])
     checked, success = states == "checked", float(right.mean())
-    expected = float(probabilities.mean())
+    expected = fmean(track.probability or 0.0 for track in tracks)
     return KeyframeRow(
         name=sequence.name,
         boxes=len(keyframes),

@@ -38,7 +38,7 @@ def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_en
 def test_a_keyframe_keeps_its_box(demo, both_ends):
     _, truth = demo
     assert [both_ends.tracks["anna"][frame].box for frame in (0, -1)] == [truth[0], truth[-1]]
-    assert both_ends.probabilities["anna"][[0, -1]].tolist() == [1, 1]
+    assert [both_ends.tracks["anna"][frame].probability for frame in (0, -1)] == [1, 1]
 
 
 def test_tracks_count_frames_and_have_their_times(both_ends):
@@ -87,7 +87,7 @@ def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(de
     assert not multiprocessing.active_children()
 
 
-def test_the_model_of_a_box_is_trained_once(demo, both_ends, monkeypatch):
+def test_the_model_of_a_box_is_trained_once(both_ends, monkeypatch):
     def second_pass():
         keyframes = both_ends.keyframes["anna"]
         return passes.run_pass(both_ends.frames, 0, 3, keyframes, both_ends.settings, use_memory=True).boxes.tolist()
