@@ -79,6 +79,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await says("#check", "ben in frame 23");
   await name("carl");
   await says("#timelines", "carl");
+  await says("#check", "carl in frame 23: your box");
   await keys("Control+z");
   await undone();
   await page.locator("#timelines svg").first().click();
