@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import struct
 import tempfile
@@ -380,6 +381,16 @@ def test_videos_are_turned_and_mirrored_as_their_display_matrix_says(video, matr
     np.testing.assert_array_equal(image, seen(stored))
     assert image.flags.c_contiguous
     assert source.size == image.shape[1::-1]
+
+
+def test_a_jpeg_picture_with_exif_data_is_read():
+    image = np.full((48, 64, 3), 90, np.uint8)
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x0f\0\x02\0\0\0\x04cam\0\0\0\0\0"  # the maker is "cam"
+    marked = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2) + exif + jpeg[2:]
+    with av.open(io.BytesIO(marked), format="mjpeg") as container:
+        (frame,) = container.decode(video=0)
+    assert np.abs(UprightConverter()(frame).astype(int) - image).max() <= 2
 
 
 def test_the_aspect_of_pixels_is_that_of_the_frame_as_it_is_turned(tmp_path):
