@@ -62,9 +62,12 @@ def broken(video, tmp_path):
     return tmp_path, boxes[0]
 
 
-def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, by_hand):
+def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, by_hand, until):
     source, box = broken
-    processes = by_hand(source, box=box)
+    with Subscriber(HEALTH, Endpoint.parse(str(folder))) as health:
+        processes = by_hand(source, box=box, order=("compressor", "trainer"))
+        until(lambda: (report := health.receive(0.1)) and report.process == "trainer")
+    processes += by_hand(source, box=box, order=("detector",))  # its six frames need no trainer: none waits for it
     errors = [process.communicate(timeout=150)[1] for process in processes]
     assert [process.returncode for process in processes] == [3, 3, 3], errors
     assert "5.png' (frame 5): replace or remove it" in errors[-1]
