@@ -16,6 +16,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   const is = (name) => page.waitForSelector(`#state[data-state="${name}"]`, patience);
 
   await page.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
+  await page.locator("#state", { hasNotText: "starting" }).waitFor(patience); // the picture may be there before the state
   console.log("state", await state.innerText());
   const draw = async (left, top, wide, tall) => {
     const view = await placeOf(page, "#picture");
