@@ -46,8 +46,8 @@ class Records(dict[str, Any]):
     def rows(self, name: str, table: int | str = 0) -> dict[str, dict[str, Any]]:
         """Return the rows of a table, given by its number or title, by their first cell; each cell by its column."""
         tables = self[name]["tables"]
-        found = tables[table] if isinstance(table, int) else next(one for one in tables if one["title"] == table)
-        return {row[0]: dict(zip(found["columns"], row, strict=True)) for row in found["rows"]}
+        selected = tables[table] if isinstance(table, int) else next(one for one in tables if one["title"] == table)
+        return {row[0]: dict(zip(selected["columns"], row, strict=True)) for row in selected["rows"]}
 
     def sequences(self, name: str, tracker: str = "catstream") -> dict[str, dict[str, Any]]:
         """Return the accuracy of a tracker on each sequence."""
@@ -437,6 +437,6 @@ BLOCKS: dict[str, Callable[[Records], str]] = {
 
 
 if __name__ == "__main__":
-    found_records = Records()
+    all_records = Records()
     for path in PAGES:
-        path.write_text(filled(path.read_text(encoding="utf-8"), found_records), encoding="utf-8")
+        path.write_text(filled(path.read_text(encoding="utf-8"), all_records), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What MkDocs adds to the pages when it builds them: commands, settings, and lists of decisions and of all pages."""
+"""Hooks of MkDocs: they add commands, settings, and lists of decisions and of pages to the documentation."""
 
 from __future__ import annotations
 

@@ -51,8 +51,8 @@ class NanoTrackV3:
         rate = penalty[best] * scores[best] * _RATE
         limits = np.array(frame.shape[1::-1], float)
         self._center = (self._center + move / scale).clip(0, limits)
-        found = np.array([width[best], height[best]]) / scale
-        self._size = (self._size * (1 - rate) + found * rate).clip(_LEAST, np.maximum(limits, _LEAST))
+        detected = np.array([width[best], height[best]]) / scale
+        self._size = (self._size * (1 - rate) + detected * rate).clip(_LEAST, np.maximum(limits, _LEAST))
         return True, (*(self._center - self._size / 2), *self._size)
 
     def getTrackingScore(self) -> float:

@@ -203,7 +203,7 @@ class Stream:
         return Pipeline(self._spec.source, settings=settings, resume=state)
 
     def _destinations(self, pipeline: Pipeline, *, resume: bool) -> RunFiles:
-        """The destinations of the tracks; the frames continue those of a log on this node."""
+        """The destinations of the tracks. If this node has a log, the run continues its frame numbers."""
         options = self._spec.options
         check_options(options, self._spec.write, pipeline.size)
         origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)

@@ -133,8 +133,8 @@ class StreamSpec:
             values["settings"] = flat(values.get("settings", {}))
             names = [follow] if isinstance(follow, str) else follow
             values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
-            given = {key: values.pop(key) for key in KEYS if key in values}
-            values["write"], values["options"] = destinations(given, folder, name, source)
+            outputs = {key: values.pop(key) for key in KEYS if key in values}
+            values["write"], values["options"] = destinations(outputs, folder, name, source)
         return cls(name, **values)
 
     @cached_property  # the controller asks for that of each stream twice a second

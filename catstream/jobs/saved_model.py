@@ -302,7 +302,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
 
 
 def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
-    """The names of models that share no frames: those of the most streams of frames first, then of the most rows.
+    """Select models that share no frames, by name. Models of more streams are preferred, then models of more rows.
 
     A part is the origins of the trees of a model, one for each stream of frames, and its rows.
 

@@ -196,8 +196,8 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
 def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(start, folder, until):
     job = Job("rtsp://me:secret@10.0.0.7/gate", endpoint=str(folder)).save(folder)
     process, _, _ = start(job)
-    shown = psutil.Process(process.pid)
-    until(lambda: shown.cmdline()[0] == "catstream trainer rtsp://10.0.0.7/gate"[: len(shown.cmdline()[0])])
+    trainer = psutil.Process(process.pid)
+    until(lambda: trainer.cmdline()[0] == "catstream trainer rtsp://10.0.0.7/gate"[: len(trainer.cmdline()[0])])
     assert Path(f"/proc/{process.pid}/comm").read_text() == "trainer:gate\n"
     assert "secret" not in Path(f"/proc/{process.pid}/cmdline").read_text()
 
@@ -205,9 +205,9 @@ def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(sta
 @pytest.mark.parametrize(("source", "more"), [("rtsp://10.0.0.7/gate", 10), ("a.mp4", 0)])
 def test_training_has_a_lower_priority_than_detection_if_the_source_is_live(start, folder, until, source, more):
     process, _, _ = start(Job(source, endpoint=str(folder)).save(folder))
-    shown = psutil.Process(process.pid)
-    until(lambda: shown.name() == f"trainer:{Path(source).name}")
-    assert shown.nice() == min(psutil.Process().nice() + more, 19)
+    trainer = psutil.Process(process.pid)
+    until(lambda: trainer.name() == f"trainer:{Path(source).name}")
+    assert trainer.nice() == min(psutil.Process().nice() + more, 19)
 
 
 @pytest.mark.parametrize(
