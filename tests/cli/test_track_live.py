@@ -184,7 +184,7 @@ def test_ctrl_c_ends_a_run_whose_stream_is_lost(camera, following, said, story, 
         next(tracks)
         cam.leave()
         run.until(lambda counters: counters.get("lost_seconds", 0) > 0)
-        code, status, _ = said("status", "--endpoint", tmp_path / "run")
+        code, status, _ = said("status", "--endpoint", tmp_path / "run", "--wait", 150)
         assert code == 0, "the processes are well"
         assert re.search(r"^state +source lost for \d+ s$", status, re.MULTILINE)
         assert re.search(r"^source +\d+ frames? skipped, 0 reconnects$", status, re.MULTILINE)
