@@ -24,9 +24,11 @@ from __future__ import annotations
 import logging
 import os
 import secrets
+import signal
 import socket
 import sys
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Collection, Iterable, Sequence
@@ -306,6 +308,7 @@ class Fleet(AbstractContextManager["Fleet"]):
                 if (other := _gcs_address()) != address:
                     raise FleetError(f"this process uses the cluster at {other}: it can use one cluster only")
                 return
+            handler = signal.getsignal(signal.SIGTERM)
             try:
                 ray.init(
                     address or "local", namespace=NAMESPACE, log_to_driver=False, logging_level=logging.ERROR, **options
@@ -319,6 +322,8 @@ class Fleet(AbstractContextManager["Fleet"]):
                     "(`ray start --address ...`), with the same versions of Python and Ray, and its token "
                     "(RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH)"
                 ) from None
+            if callable(handler) and threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, handler)  # Ray aborts the process in its place
 
     def _end_ray(self) -> None:
         """Disconnect, and end the node that this object has started."""

@@ -71,7 +71,8 @@ def local(file, until, *options):
 @pytest.mark.usefixtures("home")
 def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, home, until):
     with local(file, until) as up:
-        found = set().union(*map(listening, psutil.Process(up.pid).children(recursive=True)))
+        processes = psutil.Process(up.pid).children(recursive=True)
+        found = set().union(*map(listening, processes))
         assert found
         assert found <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
         folder = home / "local"
@@ -84,13 +85,27 @@ def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, 
         done = subprocess.run(words, env=stranger, capture_output=True, text=True, timeout=120, check=False)
         assert (done.returncode, "let in" in done.stdout) == (1, False)
         assert "token" in done.stderr.lower()
-        started = [each for each in psutil.Process(up.pid).children(recursive=True) if "StreamActor" in each.name()]
+        started = [each for each in processes if "StreamActor" in each.name()]
         assert [each.nice() for each in started] == [os.getpriority(os.PRIO_PROCESS, 0)]
         os.killpg(up.pid, signal.SIGINT)  # as a terminal does
-        assert up.communicate(timeout=120)[0].splitlines()[-1] == "the fleet local is down"
+        check_ended(up, processes, home)
+
+
+def check_ended(up, processes, home):
+    """Check that a local fleet ends in order: its streams have stored their states, and no process is left."""
+    assert up.communicate(timeout=120)[0].splitlines()[-1] == "the fleet local is down"
     assert up.returncode == 0
+    assert psutil.wait_procs(processes, timeout=60)[1] == []
     assert not module._is_up(home / "local")
     assert Store(str(home / "local" / "store")).stream("gate").newest().facts["frame"] > 0
+
+
+@pytest.mark.usefixtures("home")
+def test_sigterm_ends_a_local_fleet_as_ctrl_c_does(file, home, until):
+    with local(file, until) as up:
+        processes = psutil.Process(up.pid).children(recursive=True)
+        up.terminate()  # as systemd does; Ray has a handler of its own
+        check_ended(up, processes, home)
 
 
 @pytest.mark.usefixtures("home")
