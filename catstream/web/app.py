@@ -36,7 +36,7 @@ from catstream.client.address import Address
 from catstream.errors import BoxError, CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
 from catstream.video.drawing import draw_preview
 from catstream.web import prometheus
-from catstream.web.feed import Feed, FleetFeed, PipelineFeed
+from catstream.web.feed import REGISTRY_SECONDS, Feed, FleetFeed, PipelineFeed
 from catstream.wire.codec import decode_json
 
 _Kind = TypeVar("_Kind")
@@ -102,6 +102,8 @@ class Site:
     @asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         self._feed.start()
+        if isinstance(self._feed, FleetFeed):  # the first requests wait, so that each stream is known
+            await asyncio.to_thread(self._feed.has_asked.wait, REGISTRY_SECONDS)
         yield
         await asyncio.to_thread(self._feed.stop)
 

@@ -221,6 +221,7 @@ class FleetFeed(Feed):
         self._address = address
         self._registry: Registry | None = None
         self._streams: dict[str, PipelineFeed] = {}
+        self.has_asked = threading.Event()  #: set once the registry has answered for the first time, or has not
         self.dashboard = FleetDashboard()
 
     def problem_of(self, stream: str = "") -> str:
@@ -266,7 +267,10 @@ class FleetFeed(Feed):
 
     def _feed(self) -> None:
         self._call(self.close_unused)
-        if self._registry is None:
-            self._registry = self._address.registry
-            self._registry.timeout = REGISTRY_SECONDS
-        self._call(self.dashboard.take, self._registry.streams(), monotonic())
+        try:
+            if self._registry is None:
+                self._registry = self._address.registry
+                self._registry.timeout = REGISTRY_SECONDS
+            self._call(self.dashboard.take, self._registry.streams(), monotonic())
+        finally:
+            self.has_asked.set()

@@ -163,9 +163,9 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatc
         ("starting", "", (503, "starting\n")),
     ],
 )
-def test_the_first_question_whether_a_stream_is_ready_is_answered(fleet, page, until, state, trouble, answer):
+def test_the_first_question_whether_a_stream_is_ready_is_answered(fleet, serve_fleet, state, trouble, answer):
     fleet.stream("cam-7", state=state, trouble=trouble)
-    until(lambda: page.get("/streams/cam-7/").status_code == 200)  # the fleet has answered
+    page = serve_fleet()
     ready = page.get("/streams/cam-7/readyz")
     assert (ready.status_code, ready.text[: len(answer[1])]) == answer
     assert page.get("/streams/cam-8/readyz").status_code == 404
