@@ -39,11 +39,8 @@ from catstream.base.threads import limit_process
 from catstream.base.workers import name_process
 from catstream.errors import ServiceError
 
-#: The processes that a server can start, in the order in which a pipeline ends them.
+#: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
-
-#: The order in which a pipeline starts them: the imports of the trainer take longest, beside those of the server.
-START_ORDER = ("trainer", "detector", "compressor")
 
 _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
 _EXIT_SECONDS = 1.0  # limit for a server that has closed its sockets to end
@@ -268,7 +265,7 @@ def main(descriptor: int, program: int) -> None:
     for readable in (requests.fileno(), has_ended, os.pidfd_open(program)):
         poll.register(readable, select.POLLIN)
     running: dict[int, socket.socket] = {}  # the sockets for the answers, by process id
-    to_import = [*START_ORDER]
+    to_import = [*NAMES]
     while True:
         ready = [readable for readable, _ in poll.poll(0 if to_import else None)]
         if not ready:

@@ -28,7 +28,7 @@ from catstream.jobs.job import Job
 from catstream.messages.kinds import End, Health, Track, Tracks
 from catstream.processes.process import PERMANENT_FAILURE, SOURCE_FAILED, STOPPED_EARLY, TURN_SECONDS
 from catstream.processes.shared import SharedMemory
-from catstream.processes.start_server import NAMES, START_ORDER, StartedProcess, start_server, starting
+from catstream.processes.start_server import NAMES, StartedProcess, start_server, starting
 from catstream.wire.channels import HEALTH
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
@@ -198,7 +198,7 @@ class Supervisor:
             for name in NAMES:
                 child = self._children[name] = Child(name, file, folder)
                 stack.callback(child.close)
-            for name in START_ORDER:
+            for name in NAMES:
                 self._children[name].start(after)
             self._stack = stack.pop_all()
         self._thread = threading.Thread(target=self._run, name="catstream supervisor", daemon=True)

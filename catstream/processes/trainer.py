@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from catstream.messages.kinds import End
 from catstream.processes.process import MESSAGE_SECONDS, Process
-from catstream.training.motion_em import prepare
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
@@ -14,8 +13,6 @@ _NONE = {"version": 0.0, "trained": 0.0}
 
 def main(process: Process) -> None:
     """Train a model from each sample that arrives, until the stream ends; the objects take turns."""
-    process.watchdog.allow()
-    prepare()  # in this process, while the start server imports what the others need
     trainer = Trainer(process.settings)
     trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:

@@ -12,7 +12,7 @@ from catstream.base.settings import Settings
 from catstream.client.attach import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
-from catstream.processes.start_server import START_ORDER
+from catstream.processes.start_server import NAMES
 from catstream.processes.supervisor import Child
 
 
@@ -40,7 +40,7 @@ def test_no_process_is_started_again_because_the_owner_is_slow(video, monkeypatc
     with Pipeline(video[0], video[1][0]) as pipeline:
         for track in pipeline:
             time.sleep(pace if track.frame else pause)
-    assert tuple(started) == START_ORDER
+    assert tuple(started) == NAMES
 
 
 def test_a_process_that_a_signal_ends_before_the_run_is_started_again(video):

@@ -22,7 +22,7 @@ from catstream.jobs.state import CHECKPOINTS
 from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
 from catstream.processes.shared import RUNNING_SECONDS
-from catstream.processes.start_server import NAMES, START_ORDER
+from catstream.processes.start_server import NAMES
 from catstream.processes.supervisor import Child, Supervisor
 from catstream.video.source import open_source
 from catstream.wire.channels import HEALTH, TRACKS
@@ -145,7 +145,7 @@ def test_processes_that_have_started_end_if_one_after_them_cannot_start(video, f
     start, pids = Child.start, []
 
     def start_two(child, after):
-        if child.name == START_ORDER[-1]:
+        if child.name == NAMES[-1]:
             raise OSError(24, "Too many open files")
         start(child, after)
         pids.append(child.process.pid)
