@@ -57,6 +57,12 @@ def name_process(name: str, command: str = "") -> None:
         ctypes.memmove(first, text.ljust(end - first, b"\0"), end - first)
 
 
+def release_memory() -> None:
+    """Return freed memory to the kernel, which glibc keeps for later arrays; other C libraries need no call."""
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
+
+
 @contextmanager
 def sigint_blocked() -> Iterator[None]:
     """Block SIGINT in the processes that are started inside a `with`; a Ctrl-C that arrives inside is handled after it.

@@ -12,11 +12,6 @@ from catstream.base.arrays import Float32, Float64
 _TINY = np.float32(1e-30)  # divisor in place of an energy of 0
 
 
-def prepare() -> None:
-    """Import scipy's linear algebra: a fifth of a second, which no client of a pipeline has to wait for."""
-    import scipy.linalg  # noqa: F401
-
-
 def energy(rows: np.ndarray) -> float:
     """||A||^2, the sum of the squares of all elements, summed in float64.
 

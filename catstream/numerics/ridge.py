@@ -11,6 +11,11 @@ from functools import partial
 import numpy as np
 
 
+def prepare() -> None:
+    """Import scipy's linear algebra: a fifth of a second, which no client of a pipeline has to wait for."""
+    import scipy.linalg  # noqa: F401
+
+
 def discriminant(background: np.ndarray, difference: np.ndarray, penalty: float) -> np.ndarray:
     """The regularised linear discriminant of two classes: w = (S + penalty I)^-1 difference, float32 (d,).
 
@@ -48,7 +53,7 @@ class Regression:
 
 def _solver(gram: np.ndarray, penalty: float) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that solves (gram + penalty I) z = y by the Cholesky factor; overwrites `gram`."""
-    import scipy.linalg  # a fifth of a second
+    import scipy.linalg
 
     gram[np.diag_indices_from(gram)] += np.float32(penalty)
     factor = scipy.linalg.cho_factor(gram, overwrite_a=True, check_finite=False)

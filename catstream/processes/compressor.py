@@ -10,11 +10,11 @@ from time import monotonic
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.compressor import Compressor
-from catstream.compression.reduce import prepare
 from catstream.errors import ServiceError
 from catstream.jobs.saved_model import SavedModel, continued
 from catstream.jobs.state import CHECKPOINTS, locked
 from catstream.messages.kinds import End, Features, ModelFile, Position
+from catstream.numerics import ridge
 from catstream.processes.decisions import checkpoint_is_due, stored, with_end
 from catstream.processes.process import MESSAGE_SECONDS, Process
 from catstream.wire.acknowledged import Receiver
@@ -26,7 +26,7 @@ _LOCK_SECONDS = 10.0  # limit for an earlier compressor to end
 _SENDER_SECONDS = 5.0  # limit for the detector to send the end, once this process was asked to end
 _SAVED_MODEL_SECONDS = 1.0  # shortest time between two files of one object, for subscribers that save it
 
-prepare()  # once in the start server, not in each process
+ridge.prepare()  # once in the start server, not in each process
 
 
 def main(process: Process) -> None:

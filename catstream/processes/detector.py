@@ -20,6 +20,7 @@ from catstream.base.addresses import is_live, without_password
 from catstream.detection.objects import Detectors
 from catstream.errors import VideoError
 from catstream.messages.kinds import Features, Model, Track, Tracks, run_state
+from catstream.numerics import ridge
 from catstream.processes.beginnings import Beginning, Beginnings
 from catstream.processes.commands import Commands
 from catstream.processes.decisions import TrainingLag, have_arrived, resume_at
@@ -35,7 +36,8 @@ from catstream.wire.newest import Subscriber
 _SKIP_SECONDS = 0.1  # limit for decoding a skipped frame
 _LONGEST_SOURCE = 1000  # characters of the source that are published with the health
 
-video_source.prepare()  # imports PyAV: once in the start server, not in each process
+for module in (video_source, ridge):
+    module.prepare()  # imports a library: once in the start server, not in each process
 _log = logging.getLogger(__name__)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from catstream.base.addresses import is_live, without_password
-from catstream.base.workers import die_with, name_process
+from catstream.base.workers import die_with, name_process, release_memory
 from catstream.errors import CatstreamError, StreamRewoundError
 from catstream.jobs.job import Job
 from catstream.messages.kinds import Health, run_state
@@ -77,13 +77,14 @@ class Process:
         objects: Callable[[], dict[str, dict[str, float]]],
         now: bool = False,
     ) -> None:
-        """Count a turn of the loop, and publish the health once a second or `now`; call it in each turn."""
+        """Count a turn of the loop; once a second or `now`, publish the health and release memory; for each turn."""
         self.watchdog.beat()
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
             own = counters() | rejects()
             state = run_state(own)[0] if self.name == "detector" else None
             self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects(), state))
+            release_memory()
         else:
             self._health.serve_late_joiners()
 

@@ -46,8 +46,9 @@ _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the ne
 _EXIT_SECONDS = 1.0  # limit for a server that has closed its sockets to end
 _LONGEST = 1 << 16  # bytes of a request
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
-#: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time.
-_MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
+#: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time. Each
+#: process releases its memory once a second. All threads share one arena: what one has freed, another can use.
+_MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_ARENA_MAX": "1"}
 #: Modules that numba imports if they are installed, for kernels that call BLAS or C; they take a sixth of a second.
 _UNUSED = ("scipy.linalg.cython_blas", "cffi")
 
