@@ -95,6 +95,7 @@ class Annotation:
     ----------
     frames : DecodedFrames
     keyframes : dict of the boxes of each object, by name and frame
+    counters : dict of the counters of the video by name, see `catstream.video.frames.describe_counters`
     progress : as of the parameters
 
     Raises
@@ -119,6 +120,7 @@ class Annotation:
     ) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         self._jobs, self.progress = jobs or cores(), progress
+        self.counters: dict[str, float] = {}
         self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
@@ -178,7 +180,7 @@ class Annotation:
             try:
                 decode(self._video, self.frames, lambda *done: self.progress("decoding", *done))
             finally:
-                self._video = None
+                self.counters, self._video = self._video.counters, None
         self._check(self.keyframes)
 
     def track(self) -> None:

@@ -211,6 +211,10 @@ class _ResultFiles:
 
 def _report(annotation: Annotation) -> None:
     """Print how many frames of each object are checked, and the frame to look at next."""
+    from catstream.video.frames import describe_counters
+
+    for line in describe_counters(annotation.counters):
+        click.echo(line)
     for name, checks in annotation.checked.items():
         count = len(checks) - checks.count("unchecked")
         boxes = counted(len(annotation.keyframes[name]), "keyframe")

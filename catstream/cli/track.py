@@ -42,6 +42,7 @@ from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
 from catstream.sinks.destinations import SINKS, STDOUT, Origin, TrackedFrame, check_result, is_file, redacted
 from catstream.sinks.track_log import RunFiles, places_of
+from catstream.video.frames import describe_counters
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
 _SHORTEST_SECONDS = 1.0  # a shorter run is reported without its frames per second
@@ -450,7 +451,7 @@ class RunProgress:
     def _figures(self, tracks: Mapping[str, Track]) -> str:
         figures = [f"{self._rate():.0f} frames/s"]
         if self._pipeline.live:
-            figures.append(f"{self._detector('skipped'):.0f} skipped")
+            figures.append(f"{self._counters.get('skipped', 0):.0f} skipped")
         if len(tracks) == 1:
             (track,) = tracks.values()
             figures += [f"score {track.score:+.2f}", f"model {track.model_version}"]
@@ -474,13 +475,10 @@ class RunProgress:
                 present = f"present in {counts.present} of {counts.frames} frames"
                 lines.append(f"  {name or '(no name)'}: {present}, model version {counts.version}")
         if self._pipeline.live:
-            skipped = counted(self._detector("skipped"), "frame")
-            reconnects = counted(self._detector("reconnects"), "reconnect")
+            skipped = counted(self._counters.get("skipped", 0), "frame")
+            reconnects = counted(self._counters.get("reconnects", 0), "reconnect")
             lines.append(f"live: {skipped} skipped, {reconnects}")
-        if damaged := self._detector("damaged"):
-            lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
-        if scaled := self._detector("scaled"):
-            lines.append(f"scaled: {counted(scaled, 'frame')} had another size than the first one")
+        lines += describe_counters(self._counters)
         if totals := self._pipeline.totals:
             sent = counted(totals["sent"], "message")
             lines.append(f"features: {sent} sent, {totals['stored']} stored in the coreset trees")
@@ -491,9 +489,10 @@ class RunProgress:
             lines.append(f"results: {', '.join(place.removeprefix(here) for place in results)}")
         return "\n".join(lines)
 
-    def _detector(self, counter: str) -> float:
-        """A counter of the detector: the final one, or before the end that of its last report."""
-        return (self._pipeline.health.get("detector", {}) | self._pipeline.totals).get(counter, 0)
+    @property
+    def _counters(self) -> dict[str, float]:
+        """The counters of the detector: the final ones, or before the end those of its last report."""
+        return self._pipeline.health.get("detector", {}) | self._pipeline.totals
 
     def _rate(self) -> float:
         return (self.frames - 1) / max(self._seconds(), 1e-9)

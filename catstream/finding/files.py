@@ -89,6 +89,8 @@ class File:
                     _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
                 if skipped := source.counters.get("damaged"):
                     reading.problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
+                if missing := source.counters.get("truncated"):
+                    reading.problems.append(f"{str(self.path)!r} is truncated: it lacks {missing:.0f} s at the end")
             return
         pages = first_pages([*self.files]) if self.kind == "images" else pages_of(self.path)
         reading.frames = len(pages)

@@ -459,7 +459,7 @@ class End(_Numbered):
     reason  description of why the stream ended
     failed  whether it ended because of an error
     totals  final counters, by name: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
-            and the `reconnects` of a live source
+            the `truncated` seconds of a file, and the `reconnects` of a live source
     """
 
     frame: Integer

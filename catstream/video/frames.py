@@ -7,7 +7,7 @@ libraries.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from catstream.base.arrays import is_finite
+from catstream.base.text import counted
 from catstream.errors import FrameError, VideoError
 
 if TYPE_CHECKING:
@@ -93,6 +94,22 @@ class Source(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def describe_counters(counters: Mapping[str, float]) -> list[str]:
+    """The counters of a file or of images in words, a line each.
+
+    >>> describe_counters({"truncated": 2})
+    ['truncated: the video ends 2 s before the end that its header states']
+    """
+    lines = []
+    if damaged := counters.get("damaged"):
+        lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
+    if scaled := counters.get("scaled"):
+        lines.append(f"scaled: {counted(scaled, 'frame')} had another size than the first one")
+    if missing := counters.get("truncated"):
+        lines.append(f"truncated: the video ends {missing:.0f} s before the end that its header states")
+    return lines
 
 
 def read_ahead(source: Source) -> Generator[Frame]:

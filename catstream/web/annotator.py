@@ -30,7 +30,7 @@ from catstream.base.names import check_name
 from catstream.errors import CatstreamError, CommandRejectedError
 from catstream.messages.kinds import Track
 from catstream.video.drawing import PALETTE
-from catstream.video.frames import jpeg
+from catstream.video.frames import describe_counters, jpeg
 from catstream.web.app import PAGE, UPDATE_SECONDS, endless, event, failed, json_of
 
 _SIDE = 1920  #: longest side of a picture in pixels; a larger frame is scaled down
@@ -138,7 +138,7 @@ class AnnotationSite:
             "remaining": session.remaining(),
             "revision": session.revision,
             "undo": session.can_undo,
-            "problem": str(session.problem or ""),
+            "problem": str(session.problem or ", ".join(describe_counters(session.annotation.counters))),
         }
 
 

@@ -284,6 +284,15 @@ def test_a_whole_file_is_read_to_its_last_frame_and_its_times_grow(video, name, 
         assert [frame.time for frame in frames] == pytest.approx(wanted, abs=0.002)
 
 
+def test_the_seconds_that_a_truncated_matroska_file_lacks_are_counted(video):
+    path = video("a.mkv", 100, sound=4.0)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    for part, lacks in ((slice(None), True), (slice(0, 5), False)):
+        with open_source(path, part=part) as source:
+            last = [frame.time for frame in source][-1]
+            assert source.counters.get("truncated", 0) == (round(4 - last) if lacks else 0)
+
+
 def test_a_matroska_file_with_laced_sound_is_whole(tmp_path):
     assert numbers(open_source(laced_matroska(tmp_path / "a.mkv"))) == list(range(50))
 
