@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
@@ -50,10 +50,11 @@ class NextFrame(NamedTuple):
     errors: float
 
 
-class Task(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Task:
     """A pass to be tracked, and the boxes that it begins with: that at `start`; with a memory, all of the object."""
 
-    object: str
+    object: str = field(compare=False)  # the pass depends on the boxes only
     start: int
     stop: int
     keyframes: tuple[tuple[int, Box | None], ...]
@@ -166,14 +167,6 @@ class Annotation:
         self._check(parsed)
         self.keyframes: dict[str, dict[int, Box | None]] = parsed
 
-    def rename(self, object: str, name: str) -> None:
-        """Rename an object, and keep its passes. ObjectError if the name is not valid, or that of another object."""
-        if check_name(name) in self.keyframes:
-            raise ObjectError(f"there is an object {name} already: use another name")
-        self.keyframes = {name if other == object else other: drawn for other, drawn in self.keyframes.items()}
-        passes = self._passes.items()
-        self._passes = {task._replace(object=name) if task.object == object else task: one for task, one in passes}
-
     def decode(self) -> None:
         """Decode the frames, if they are not yet. VideoError if one cannot be decoded: those before it are there."""
         if self._video is not None:
@@ -243,7 +236,8 @@ class Annotation:
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
-        passes = [one for task, one in self._passes.items() if one is not None and self._is_valid(task, name)]
+        drawn = self.keyframes.get(name, {}).items()
+        passes = [one for task, one in self._passes.items() if one is not None and set(task.keyframes) <= drawn]
         return sorted(passes, key=lambda one: (one.start, one.stop, one.with_memory))
 
     def proposals(self, name: str, frame: int) -> dict[bool, Box | None]:
@@ -302,10 +296,6 @@ class Annotation:
         ways = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
         return [way for way in ways if way[0] in drawn]
 
-    def _is_valid(self, task: Task, name: str) -> bool:
-        """Return True if a task is of this object, and the boxes that it began with are there."""
-        return task.object == name and set(task.keyframes) <= self.keyframes.get(name, {}).items()
-
     def _missing_of(self, stretch: _Stretch, *, use_memory: bool) -> list[Task]:
         name, drawn = stretch.object, self.keyframes[stretch.object]
         tasks = []
@@ -319,7 +309,15 @@ class Annotation:
         return tasks
 
     def _tracks(self, name: str) -> Iterator[Track]:
-        for frame, (row, probability, score) in enumerate(zip(*self._fused(name), strict=True)):
+        drawn, count = self.keyframes[name], len(self.frames)
+        boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
+        for frame, box in drawn.items():
+            boxes[frame] = [np.nan] * 4 if box is None else box
+        for stretch in self._stretches():
+            if stretch.object == name:
+                part = slice(stretch.start, stretch.stop)
+                boxes[part], probabilities[part], scores[part] = self._fused_stretch(stretch)
+        for frame, (row, probability, score) in enumerate(zip(boxes, probabilities, scores, strict=True)):
             box = _box(row)
             check: Check = "checked" if probability >= _CHECKED else "unchecked"
             yield Track(
@@ -327,21 +325,9 @@ class Annotation:
                 model_version=0,
                 object=name,
                 doubtful=check == "unchecked",
-                checked="keyframe" if frame in self.keyframes[name] else check,
+                checked="keyframe" if frame in drawn else check,
                 probability=float(probability),
             )
-
-    def _fused(self, name: str) -> tuple[Float64, Float64, Float64]:
-        """Boxes, probabilities and scores of an object in all frames; the last two are 1 at keyframes."""
-        count = len(self.frames)
-        boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
-        for frame, box in self.keyframes[name].items():
-            boxes[frame] = [np.nan] * 4 if box is None else box
-        for stretch in self._stretches():
-            if stretch.object == name:
-                part = slice(stretch.start, stretch.stop)
-                boxes[part], probabilities[part], scores[part] = self._fused_stretch(stretch)
-        return boxes, probabilities, scores
 
     def _fused_stretch(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
         drawn = self.keyframes[stretch.object]

@@ -52,7 +52,8 @@ def read_keyframes(path: Path) -> list[Keyframe]:
         rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise VideoError(
-            f"cannot read the boxes in {str(path)!r} ({error}): pass a CSV file {','.join(_HEADER)}"
+            f"cannot read the boxes in {str(path)!r} ({getattr(error, 'strerror', error)}): pass a CSV file "
+            f"{','.join(_HEADER)}"
         ) from None
     return [parse_row(path, line, row) for line, row in enumerate(rows, start=2)]
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from catstream.annotation.annotation import Annotation, NextFrame, Task
 from catstream.base.box import Box
-from catstream.errors import CatstreamError, VideoError
+from catstream.errors import CatstreamError, ObjectError, VideoError
 from catstream.messages.kinds import Track
 
 #: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
@@ -57,7 +57,7 @@ class Session:
         self.next_frames: list[NextFrame] = []
         self.problem: CatstreamError | None = None
         self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())
-        self._history: list[tuple[str, int, dict[str, dict[int, Box | None]]]] = []  # object, frame, boxes before
+        self._history: list[tuple[str, int | None, dict[str, dict[int, Box | None]]]] = []  # with the boxes before
         self._newest: dict[str, int] = {}  # frame of the newest box of each object
         self._turns: dict[str, int] = {}  # number of the newest pass of each object, without one its turn is next
         self._missing: list[Task] = []
@@ -88,26 +88,23 @@ class Session:
             self._replace({**before, object: {**before.get(object, {}), frame: box}})
             self._history.append((object, frame, before))
 
-    def undo(self) -> tuple[str, int] | None:
-        """Undo the last change of a box; return its object and frame, None if there is none."""
+    def rename(self, object: str, name: str) -> None:
+        """Rename an object, which keeps its passes; ObjectError if there is an object with this name."""
+        with self.lock:
+            before = self.annotation.keyframes
+            if name in before:
+                raise ObjectError(f"there is an object {name} already: use another name")
+            self._replace({name if other == object else other: drawn for other, drawn in before.items()})
+            self._history.append((object, None, before))
+
+    def undo(self) -> tuple[str, int | None] | None:
+        """Undo the last change; return its object, and the frame of its box. None if there is none."""
         with self.lock:
             if not self._history:
                 return None
             object, frame, before = self._history.pop()
             self._replace(before)
             return object, frame
-
-    def rename(self, object: str, name: str) -> None:
-        """Rename an object, also in the changes that can be undone; ObjectError as of `Annotation.rename`."""
-        with self.lock:
-            self.annotation.rename(object, name)
-            self._save()
-            names = {object: name}
-            self._history = [
-                (names.get(one, one), frame, {names.get(each, each): drawn for each, drawn in before.items()})
-                for one, frame, before in self._history
-            ]
-            self._wake()
 
     def finish(self) -> None:
         """Write the results of what is tracked so far, and set `finished`. VideoError if they cannot be written."""
@@ -198,16 +195,12 @@ class Session:
     def _is_tracked(self, following: NextFrame) -> bool:
         """Return True if a missing pass may check the frame soon: none can at an end of the video without a box."""
         frame, ends = following.frame, (0, len(self.annotation.frames) - 1)
-        soon = (task for task in self._missing if task.object == following.object and not _is_refinement(task))
         return frame not in ends and any(
-            min(task.start, task.stop) <= frame <= max(task.start, task.stop) for task in soon
+            task.object == following.object and min(task.start, task.stop) <= frame <= max(task.start, task.stop)
+            for task in self._missing
+            if not (task.use_memory and _is_long(task))  # a person need not wait for it to add a box
         )
 
 
 def _is_long(task: Task) -> bool:
     return task.frames > _LONG
-
-
-def _is_refinement(task: Task) -> bool:
-    """Return True for a long second pass: a person need not wait for it to add a box."""
-    return task.use_memory and _is_long(task)

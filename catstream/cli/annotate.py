@@ -121,8 +121,7 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
     with bar:
         bar.add_task("decoding", total=None)
         annotation.decode()
-        results.lock()
-        results.save()
+        results.begin()
         try:
             annotation.track()
         except KeyboardInterrupt:
@@ -140,8 +139,7 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
 
     with Session(annotation, jobs, results.save, results.write) as session:
         server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
-        results.lock()
-        results.save()
+        results.begin()
         with server.in_background():
             for url in server.urls:
                 click.echo(url)
@@ -178,12 +176,12 @@ class _ResultFiles:
                 raise VideoError(f"{table} exists already: pass --overwrite, or another --output")
         self._log().check(overwrite=overwrite, earlier=[])
 
-    def lock(self) -> None:
-        """Lock the folder, which is made, until the command ends; VideoError if another process has locked it."""
+    def begin(self) -> None:
+        """Lock the folder until the command ends, and save the keyframes; VideoError if another process locked it."""
         click.get_current_context().with_resource(locked_folder(self.folder, VideoError))
+        self.save()
 
     def save(self) -> None:
-        """Write the keyframes."""
         from catstream.annotation.keyframes import write_keyframes
 
         write_keyframes(self.keyframes, self._annotation.keyframes)

@@ -92,8 +92,7 @@ class AnnotationSite:
 
     def _change(self, edit: Edit) -> dict[str, object]:
         if edit.verb == "undo":
-            undone = self._session.undo()
-            return {} if undone is None else {"object": undone[0], "frame": undone[1]}
+            return dict(zip(("object", "frame"), self._session.undo() or (), strict=False))
         if edit.verb == "rename":
             self._session.rename(edit.object, edit.name)
         elif edit.verb == "done":

@@ -56,15 +56,18 @@ def test_a_change_that_is_undone_brings_the_earlier_box_and_passes_back(session,
     assert session.undo() is None
 
 
-def test_a_renamed_object_keeps_its_passes_and_can_be_undone(session, demo, until):
+def test_a_renamed_object_keeps_its_passes_and_gets_its_name_back(session, demo, until):
     until(lambda: session.decoded)
     session.draw("anna", 0, demo[1][0])
     until(lambda: session.annotation.passes("anna"))
     session.rename("anna", "ben")
     assert session.annotation.passes("ben")
     session.draw("ben", 3, None)
+    with pytest.raises(ObjectError, match="there is an object ben already"):
+        session.rename("ben", "ben")
     assert session.undo() == ("ben", 3)
-    assert session.annotation.keyframes == {"ben": {0: demo[1][0]}}
+    assert session.undo() == ("anna", None)
+    assert session.annotation.keyframes == {"anna": {0: demo[1][0]}}
 
 
 def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo, until, monkeypatch):
@@ -79,9 +82,12 @@ def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo,
 
 
 def test_objects_take_turns(demo, until, monkeypatch):
-    drawn = {frame: demo[1][frame] for frame in (0, 8, 16)}
+    drawn = {
+        name: {frame: demo[1][frame]._replace(x=10 + step) for frame in (0, 8, 16)}
+        for step, name in enumerate(("anna", "ben"))
+    }
     order = []
-    with Annotation(demo[0], {"anna": drawn, "ben": drawn}, jobs=1) as annotation:
+    with Annotation(demo[0], drawn, jobs=1) as annotation:
         submit = annotation.submit
         monkeypatch.setattr(annotation, "submit", lambda task: order.append(task.object) or submit(task))
         with Session(annotation, 1, lambda: None, lambda: None):

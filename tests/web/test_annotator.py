@@ -65,7 +65,8 @@ def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo):
     (ben,) = state(page)["objects"]
     assert (ben["name"], ben["keyframes"]) == ("ben", [0, 11])
     assert page.get("/frames/11").json()["ben"] == {"box": None, "checked": "keyframe", "proposals": [None, None]}
-    assert edit("undo") == (200, {"done": True, "object": "ben", "frame": 11})
+    assert edit("undo") == (200, {"done": True, "object": "anna", "frame": None})
+    assert edit("undo") == (200, {"done": True, "object": "anna", "frame": 11})
 
 
 def test_an_unchecked_frame_has_the_proposals_of_both_directions(page, edit, demo, session, until):

@@ -1,6 +1,6 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
 
-import { $, add, duration, Items, make, many, write } from "./dom.js";
+import { $, add, duration, Items, make, many, post, write } from "./dom.js";
 import { Stage } from "./stage.js";
 
 const JUMP = 25; // frames of a page key
@@ -140,14 +140,7 @@ class AnnotatePage {
 
   /** Send a change; returns the answer, null if it was rejected, after showing the reason. */
   async send(verb, more = {}) {
-    let answer;
-    try {
-      const response = await fetch("edit", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ server: this.state.server, verb, ...more }) });
-      const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
-      answer = json ? await response.json() : { done: false, reason: (await response.text()).trim() };
-    } catch {
-      answer = { done: false, reason: "the server of this page does not answer: the last change is not saved" };
-    }
+    const answer = await post("edit", { server: this.state.server, verb, ...more });
     write($("#message"), answer.reason ?? "");
     return answer.done ? answer : null;
   }
@@ -184,7 +177,7 @@ class AnnotatePage {
 
   async undo() {
     const { object, frame } = (await this.send("undo")) ?? {};
-    if (object !== undefined) this.go(frame, object);
+    if (object !== undefined) this.go(frame ?? this.frame, object);
   }
 
   async done() {
@@ -270,7 +263,7 @@ class AnnotatePage {
     const [[place, name, errors] = []] = following;
     const all = objects.length && state.decoded && !state.next.length && !state.remaining;
     write($("#next span"), place !== undefined ? `Look next at frame ${place}, ${name || "the object"}: about ${many(Math.max(1, Math.round(errors)), "frame")} around it may be wrong`
-      : all ? "All frames are checked" : objects.length ? "Tracking" : "Draw the first box");
+      : all ? "All frames are checked" : state.next.length ? "Draw the box here, or take one" : objects.length ? "Tracking" : "Draw the first box");
     const off = silent || ended;
     $("#next").disabled = off || place === undefined;
     $("#absent").disabled = off || !known;
@@ -294,7 +287,7 @@ class AnnotatePage {
 
   overlay() {
     if (this.ended) return this.ended;
-    if (this.silent) return "The server of this page does not answer. All boxes that were drawn are saved: run the same command to continue.";
+    if (this.silent) return "The server of this page does not answer. The boxes that it has shown are saved: run the same command to continue.";
     return this.stage.picture ? "" : "Waiting for the first frame";
   }
 }

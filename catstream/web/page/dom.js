@@ -32,6 +32,18 @@ export function duration(seconds) {
   return seconds < 7200 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`;
 }
 
+/** Send fields to the server as JSON; returns its answer, or the reason why there is none. */
+export async function post(url, fields) {
+  try {
+    const headers = { "Content-Type": "application/json" };
+    const response = await fetch(url, { method: "POST", headers, keepalive: true, body: JSON.stringify(fields) }); // also if the page is closed
+    const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
+    return json ? await response.json() : { done: false, reason: (await response.text()).trim() };
+  } catch {
+    return { done: false, reason: "the server of this page does not answer" };
+  }
+}
+
 /** A figure with a left and a right caption, and an SVG drawing below. */
 export function figure(parent, className, title) {
   const element = add(parent, "figure", { className });

@@ -1,7 +1,7 @@
 // The page of a stream: passes updates to the parts of the page, and commands of the user to the pipeline.
 
 import { Charts } from "./charts.js";
-import { $, write } from "./dom.js";
+import { $, post, write } from "./dom.js";
 import { BoxForm, Objects } from "./objects.js";
 import { Stage } from "./stage.js";
 import { Trees } from "./trees.js";
@@ -72,20 +72,8 @@ export class StreamPage {
     return answer.done ? answer : null;
   }
 
-  /** Send a command; returns the answer, or why there is none. */
-  async command(verb, more = {}) {
-    try {
-      const response = await fetch("control", {
-        method: "POST",
-        headers: { "Content-Type": "application/json" },
-        keepalive: true, // also if the page is closed
-        body: JSON.stringify({ verb, ...more }),
-      });
-      const json = (response.headers.get("Content-Type") || "").startsWith("application/json");
-      return json ? await response.json() : { done: false, reason: (await response.text()).trim() };
-    } catch {
-      return { done: false, reason: "the server of this page does not answer" };
-    }
+  command(verb, more = {}) {
+    return post("control", { verb, ...more });
   }
 
   /**
