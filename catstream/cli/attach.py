@@ -170,8 +170,8 @@ def watch(channel: str, address: Address, wait: float, name: str | None, as_json
         click.echo(f"{received} {channel}, {messages.losses()}{reason}", err=True)
 
 
-def with_silence_warnings(messages: Subscription[Any]) -> Iterator[Any]:
-    """Yield the messages; warn if they are old, and if none arrives, once for each reason."""
+def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] = lambda: None) -> Iterator[Any]:
+    """Yield the messages; warn if they are old, and if none arrives, once for each reason, and call `idle` then."""
     messages.timeout, reason, old = _SILENT_SECONDS, "", False
     while True:
         try:
@@ -183,6 +183,7 @@ def with_silence_warnings(messages: Subscription[Any]) -> Iterator[Any]:
                 yield message
             return
         except SilenceError as error:
+            idle()
             before, reason = reason, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
             if reason != before:
                 click.echo(f"waiting: {error}", err=True)

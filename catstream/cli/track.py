@@ -338,6 +338,8 @@ class _Run:
                 self._say_what_holds(pipeline, line.console)
             if not tracks:
                 progress.idle()
+                if write is not None:
+                    write(None)
                 continue
             # New files are opened with the first track: a run that cannot start does not change older results. They are
             # checked again: while this one started or waited, another run may have written them.

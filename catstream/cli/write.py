@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
+from functools import partial
 from inspect import cleandoc
 from itertools import islice
 from pathlib import Path
@@ -70,11 +71,12 @@ def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
 with_sink_options = combined(
     "options",
-    lambda zone, margin, when, rate, picture, secret, folder, megabytes: SinkOptions(
+    lambda zone, margin, when, rate, picture, secret, folder, megabytes, clips: SinkOptions(
         *(zone, margin, when[0], when[1], rate, picture),
         secret and secret.absolute(),
         folder and folder.absolute(),
         megabytes,
+        clips,
     ),
     click.option(
         "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A polygon in pixels; repeatable."
@@ -110,8 +112,9 @@ with_sink_options = combined(
         type=NumberRange(0, min_open=True),
         default=1000,
         metavar="N",
-        help="Size of DIR, above which the oldest pictures are removed; default: 1000.",
+        help="Size of DIR, above which the oldest files are removed; default: 1000.",
     ),
+    click.option("--events-clips", "clips", is_flag=True, help="Also write a clip of 5 s before and after each event."),
 )
 
 
@@ -126,6 +129,7 @@ _FLAGS = {
     "key": "--secret-file",
     "folder": "--events-folder",
     "folder_megabytes": "--events-megabytes",
+    "clips": "--events-clips",
 }
 
 
@@ -196,7 +200,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in with_silence_warnings(tracks):
+            for track in with_silence_warnings(tracks, partial(destinations.idle, sinks)):
                 run = run or tracks.run
                 if tracks.run != run and not address.stream:  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"

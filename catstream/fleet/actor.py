@@ -175,7 +175,8 @@ class Stream:
                 self._take(pipeline, tracks)
                 if tracks and files.places:
                     write = write or closed_last.enter_context(files.continued(pipeline.endpoint, resume=resume))
-                    write(TrackedFrame([*tracks.values()]))
+                if write is not None:
+                    write(TrackedFrame([*tracks.values()]) if tracks else None)
                 if self._stop.is_set():
                     break
             else:

@@ -152,7 +152,7 @@ class Sink(Protocol):
     """Takes the frames in their order; made as `Class(place, origin)`.
 
     Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
-    option is not valid.
+    option is not valid, and a method `idle()`, which is called several times a second while no frame arrives.
     """
 
     def write(self, frame: TrackedFrame) -> None:
@@ -222,7 +222,7 @@ SINKS = {
     "folder://": Row(
         "events_folder.EventsFolder",
         "DIR: a picture of each event, as with --events-folder",
-        options=(*_EVENTS, "folder", "folder_megabytes"),
+        options=(*_EVENTS, "folder", "folder_megabytes", "clips"),
     ),
     "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "picture", "key")),
     "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "picture", "key")),
@@ -311,6 +311,13 @@ def redacted(place: str) -> str:
 def open_sink(place: str, origin: Origin) -> Sink:
     """Open the sink of a destination; raises VideoError or MissingExtraError if that is not possible."""
     return cast(Sink, sink_of(place).load()(place, origin))
+
+
+def idle(sinks: Iterable[Sink]) -> None:
+    """Tell sinks that no frame has arrived for a while."""
+    for sink in sinks:
+        if hasattr(sink, "idle"):
+            sink.idle()
 
 
 def check_export(path: Path, row: Row, *, overwrite: bool, append: bool, log: Path) -> None:

@@ -88,8 +88,7 @@ class MqttSink:
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
-        for body in self._messages.update(frame.tracks):
-            self._publish(f"{self._topic}/events", body)
+        self._publish_events(self._messages.update(frame.tracks))
         now, status_of = time.monotonic(), self._messages.events.status
         for track in frame.tracks:
             if track.object not in self._sent:
@@ -107,10 +106,13 @@ class MqttSink:
             self._announce(name, ended=True)
             self._remove(name)
 
+    def idle(self) -> None:
+        """Publish the events that have waited for a picture."""
+        self._publish_events(self._messages.update(()))
+
     def close(self) -> None:
         """Publish the last events; wait some seconds until the broker has everything, and warn about what it missed."""
-        for body in self._messages.close():
-            self._publish(f"{self._topic}/events", body)
+        self._publish_events(self._messages.close())
         for name in [*self._sent]:
             self._remove(name)
         self._publish(self._availability, "offline", retain=True)
@@ -123,6 +125,10 @@ class MqttSink:
         self.missed += self._published - self._acknowledged
         if self.missed:
             self._warnings.log(f"the broker has not received {counted(self.missed, 'message')}")
+
+    def _publish_events(self, bodies: list[bytes]) -> None:
+        for body in bodies:
+            self._publish(f"{self._topic}/events", body)
 
     def _publish(self, topic: str, payload: bytes | str, *, retain: bool = False) -> None:
         if self._client.publish(topic, payload, 1, retain).rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:

@@ -67,33 +67,45 @@ class PicturedEvents:
     """Detects events, each with a picture: the first that the pipeline has sent of the frame of the event or later.
 
     If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none.
+
+    pictures  the newest ones, at most `kept`, oldest first
+    arrived   moment at which the last one arrived, on a monotonic clock
     """
 
-    def __init__(self, origin: Origin) -> None:
+    def __init__(self, origin: Origin, kept: int = 1) -> None:
         self.events = Events(origin.options)
+        self.pictures: deque[Preview] = deque(maxlen=kept)
+        self.arrived = time.monotonic()
         self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
-        self._picture: Preview | None = None
         self._previews: Subscription[Preview] = subscribe(origin.address, "previews", timeout=0)
 
     def update(self, tracks: Sequence[Track]) -> list[tuple[Event, Preview | None]]:
-        """Return the events of further tracks, and those that have waited, with their pictures."""
+        """Return the events of further tracks, and those that have waited, with their pictures.
+
+        Call it without tracks while no frame arrives: events wait no longer then.
+        """
         now = time.monotonic()
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in self.events.update(tracks)]
         with suppress(SilenceError):  # no further picture has arrived
             for preview in self._previews:
-                self._picture = preview
-        ready = []
+                self.pictures.append(preview)
+                self.arrived = now
+        newest, ready = self._newest(), []
         while self._waiting:
             event, due = self._waiting[0]
-            if now < due and (self._picture is None or self._picture.frame < event.track.frame):
+            if now < due and (newest is None or newest.frame < event.track.frame):
                 break
-            ready.append((self._waiting.popleft()[0], self._picture))
+            ready.append((self._waiting.popleft()[0], newest))
         return ready
 
     def close(self) -> list[tuple[Event, Preview | None]]:
         """Return the last events."""
         self._previews.close()
-        return [(event, self._picture) for event in (*(event for event, _ in self._waiting), *self.events.close())]
+        events = (*(event for event, _ in self._waiting), *self.events.close())
+        return [(event, self._newest()) for event in events]
+
+    def _newest(self) -> Preview | None:
+        return self.pictures[-1] if self.pictures else None
 
 
 class EventMessages:

@@ -40,6 +40,7 @@ from catstream.sinks.destinations import (
     TrackedFrame,
     check_result,
     check_sink,
+    idle,
     is_file,
     open_sink,
     sink_of,
@@ -406,8 +407,10 @@ class RunFiles:
     @contextmanager
     def opened(
         self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False
-    ) -> Iterator[Callable[[TrackedFrame], None]]:
-        """Yield a function that writes a frame everywhere; at the end, everything is closed.
+    ) -> Iterator[Callable[[TrackedFrame | None], None]]:
+        """Yield a function that writes a frame everywhere, or takes None if none has arrived for a while.
+
+        At the end, everything is closed.
 
         If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
         raise VideoError if a destination cannot be written any more.
@@ -428,14 +431,17 @@ class RunFiles:
                 for sink in followers:
                     sink.write(frame)
 
-            def write(frame: TrackedFrame) -> None:
+            def write(frame: TrackedFrame | None) -> None:
+                if frame is None:
+                    idle(sinks.values())
+                    return
                 for sink in sinks.values():
                     sink.write(frame)
 
             yield write
 
     @contextmanager
-    def continued(self, endpoint: str, *, resume: bool) -> Iterator[Callable[[TrackedFrame], None]]:
+    def continued(self, endpoint: str, *, resume: bool) -> Iterator[Callable[[TrackedFrame | None], None]]:
         """The same for a run that nobody watches: a file that is not continued is renamed, and folders are made.
 
         walk.ndjson becomes walk-20261128T133015.ndjson, by the time of its last change.

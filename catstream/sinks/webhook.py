@@ -58,6 +58,10 @@ class Webhook:
             self._warnings.working()
         self._queue(self._messages.update(frame.tracks))
 
+    def idle(self) -> None:
+        """Queue the events that have waited for a picture."""
+        self._queue(self._messages.update(()))
+
     def close(self) -> None:
         """Queue the last events, and deliver for some seconds what waits; warn about what was missed."""
         self._queue(self._messages.close())

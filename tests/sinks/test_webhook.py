@@ -20,6 +20,7 @@ from catstream.messages.kinds import Preview, Track
 from catstream.pipeline import Pipeline
 from catstream.sinks import remote, webhook
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
+from catstream.sinks.track_log import RunFiles
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.newest import Publisher
 
@@ -129,11 +130,12 @@ def test_an_event_has_a_picture_of_its_frame_or_a_later_one_if_that_is_wanted(re
     assert [body["picture"] for body in receiver.bodies] == [picture, picture]
 
 
-def test_events_wait_for_a_picture_for_some_seconds_only(receiver, endpoint, monkeypatch, until):
+def test_events_wait_for_a_picture_for_some_seconds_only_even_if_frames_stop(receiver, endpoint, monkeypatch, until):
     monkeypatch.setattr(remote, "_PICTURE_SECONDS", 0.1)
-    url = f"http://127.0.0.1:{receiver.port}"
-    with closing(open_sink(url, Origin(address=Address(str(endpoint)), options=SinkOptions(picture=True)))) as sink:
-        until(lambda: receiver.requests, lambda: sink.write(TrackedFrame([FOUND])))
+    files = RunFiles(Origin(options=SinkOptions(picture=True)), None, [f"http://127.0.0.1:{receiver.port}"])
+    with files.opened(str(endpoint)) as write:
+        write(TrackedFrame([FOUND]))
+        until(lambda: receiver.requests, lambda: write(None))
     assert [body["picture"] for body in receiver.bodies] == [None, None]
 
 
