@@ -24,8 +24,10 @@ from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
 from catstream.cli.options import PATH, with_json, with_overwrite
 from catstream.cli.view import HostPort, fleet_view, with_token, with_view
+from catstream.cli.write import check_options, with_sink_options
 from catstream.client.address import Address
 from catstream.errors import FleetError, require_extra
+from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import FleetStatus, StreamStatus
 
 if TYPE_CHECKING:
@@ -195,6 +197,8 @@ fleet.add_command(fleet_view)
 @click.option("--cores", type=float, metavar="N", help="Processor cores that Ray reserves for it; default: 1.")
 @click.option("--label", "labels", multiple=True, metavar="NAME=VALUE", help="Label that its node must have.")
 @click.option("--follow", multiple=True, metavar="OBJECT", help="Search for an object by its merged model.")
+@click.option("--write", multiple=True, metavar="DEST", help="Destination of its tracks, as for catstream track.")
+@with_sink_options
 @with_fleet
 def add(
     running: Fleet,
@@ -206,12 +210,22 @@ def add(
     cores: float | None,
     labels: tuple[str, ...],
     follow: tuple[str, ...],
+    write: tuple[str, ...],
+    options: SinkOptions,
 ) -> None:
     """Add a stream, or change the one of that name.
 
-    To keep the change, put it into the file of the fleet too.
+    The defaults of the file of the fleet are not for it. To keep the change,
+    put it into the file too.
+
+    \b
+    EXAMPLE
+      catstream fleet add gate --source rtsp://10.0.0.1/1 --box 120,80,64,48 --write "tracks/{stream}.ndjson"
     """
     from catstream.fleet.spec import StreamSpec
+    from catstream.sinks.options import resolved
+
+    check_options(options, [*write, *options.places])
 
     table = {
         "source": source,
@@ -222,7 +236,8 @@ def add(
         "follow": list(follow),
     }
     spec = StreamSpec.parse(name, table | ({} if cores is None else {"cores": cores}), Path.cwd())
-    for line in running.add(spec):
+    places, options = resolved(write, options, Path.cwd(), name, source)
+    for line in running.add(dataclasses.replace(spec, write=places, options=options)):
         click.echo(line)
 
 

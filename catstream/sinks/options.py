@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,19 +53,29 @@ _KEY_OF = {
 def destinations(
     values: Mapping[str, Any], folder: Path, stream: str, source: str
 ) -> tuple[tuple[str, ...], SinkOptions]:
-    """The destinations of a stream and their options, from keys whose values have their types.
-
-    Paths count from `folder`, and `{stream}` in a destination is the name of the stream. SettingsError if a value is
-    invalid.
-    """
+    """The destinations of a stream and their options, from keys whose values have their types; see `resolved`."""
     fields = {field: values[key] for field, key in _KEY_OF.items() if key in values}
     if "when" in values:
         with _errors_of("when"):
             fields["events"], fields["lost_seconds"] = parse_when(values["when"])
     for field in {"key", "folder"} & fields.keys():
-        fields[field] = folder / fields[field].replace("{stream}", stream)
-    options = SinkOptions(**fields)
-    named = dict.fromkeys(place.replace("{stream}", stream) for place in values.get("write", ()))
+        fields[field] = Path(fields[field])
+    return resolved(values.get("write", ()), SinkOptions(**fields), folder, stream, source)
+
+
+def resolved(
+    write: Iterable[str], options: SinkOptions, folder: Path, stream: str, source: str
+) -> tuple[tuple[str, ...], SinkOptions]:
+    """Return the destinations and options of a stream: paths are in `folder`, and `{stream}` is the stream's name.
+
+    SettingsError if one is invalid.
+    """
+
+    def placed(path: Path | None) -> Path | None:
+        return path and folder / str(path).replace("{stream}", stream)
+
+    options = replace(options, key=placed(options.key), folder=placed(options.folder))
+    named = dict.fromkeys(place.replace("{stream}", stream) for place in write)
     places = [*(str(folder / place) if is_file(place) else place for place in named), *options.places]
     with _errors_of("write"):
         for place in places:

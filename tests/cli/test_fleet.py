@@ -35,3 +35,16 @@ def test_without_a_home_directory_a_fleet_is_an_error_of_one_line(command, fail,
     monkeypatch.setattr(os, "getuid", lambda: 54321)  # no line in /etc/passwd
     words = {"up": [file], "drain": ["node"]}
     assert "set HOME or XDG_STATE_HOME" in fail("fleet", command, *words.get(command, []))
+
+
+def test_a_stream_that_is_added_has_destinations_as_one_of_the_file(succeed, fail, tmp_path, monkeypatch):
+    added = []
+    site = SimpleNamespace(add=lambda spec: [added.append(spec)] and ["gate: is added"])
+    monkeypatch.setattr(fleet, "Fleet", lambda *_, **__: nullcontext(site))
+    monkeypatch.chdir(tmp_path)
+    words = ["fleet", "add", "gate", "--source", "demo:1", "--write", "{stream}.ndjson"]
+    succeed(*words, "--events-folder", "{stream}", "--when", "lost=10")
+    folder = tmp_path / "gate"
+    assert added[0].write == (f"{folder}.ndjson", f"folder://{folder}")
+    assert (added[0].options.folder, added[0].options.lost_seconds) == (folder, 10.0)
+    assert "--when has no effect on these destinations" in fail(*words, "--when", "lost")
