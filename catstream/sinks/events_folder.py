@@ -34,7 +34,7 @@ _OURS = re.compile(r"\d{8}T\d{6}\.\d{3}Z-.*\.(jpg|mp4)")
 _UNSAFE = re.compile(r"[^\w.]+")
 _TRACKS = 1024  # frames whose tracks are kept for the pictures
 _CLIP_SECONDS = 5.0  # before and after an event; also without a picture, after which a clip ends
-_PICTURES = 256  # that are kept for clips, of ten a second at most: about 10 MB
+_PICTURES = 256  # that are kept for clips, of ten a second at most: about 15 MB
 _RATE = 10.0  # average of pictures per second in a clip
 
 

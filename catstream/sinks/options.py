@@ -127,6 +127,7 @@ def check_options(
     for name, flag in names.items():
         if getattr(options, name) != getattr(default, name) and name not in used:
             users = " or ".join(scheme for scheme, row in SINKS.items() if name in row.options)
+            users = users.replace("folder://", names["folder"])
             raise SettingsError(f"{flag} has no effect on these destinations: add one with {users}, or omit it")
     zones, when, margin = names["zones"], names["events"], names["margin"]
     of_zones = [kind for kind in ("entered", "left") if kind in options.events]
