@@ -14,9 +14,10 @@ from typing import NamedTuple, Self, cast
 
 import numpy as np
 
-from catstream.annotation.decoded import DecodedFrames, decode, open_frames
+from catstream.annotation.decoded import DecodedFrames, decode
 from catstream.annotation.fusion import fuse
-from catstream.annotation.passes import Pass, run_pass
+from catstream.annotation.passes import Pass, box_of, row_of, run_pass
+from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED, check_count, check_name, errors_about
@@ -24,10 +25,10 @@ from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.threads import cores
 from catstream.base.workers import Workers
-from catstream.errors import BoxError, ObjectError
+from catstream.errors import BoxError, ObjectError, VideoError
 from catstream.messages.kinds import Check, Track
 from catstream.video.frames import Source
-from catstream.video.source import ALL_FRAMES
+from catstream.video.source import ALL_FRAMES, open_source
 
 #: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
 Progress = Callable[[str, int, int | None], object]
@@ -121,13 +122,18 @@ class Annotation:
     ) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         self._jobs, self.progress = jobs or cores(), progress
+        if is_live(os.fspath(video)):
+            redacted = without_password(os.fspath(video))
+            raise VideoError(f"cannot annotate a live source ({redacted}): record it to a file first")
         self.counters: dict[str, float] = {}
         self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
             self._video: Source | None
-            self._video, self.frames = open_frames(os.fspath(video), Path(self._folder.name), self.settings, part)
+            self._video = opened = open_source(os.fspath(video), part=part, settings=self.settings.run)
+            file = Path(self._folder.name, "frames")
+            self.frames = DecodedFrames(file, opened.size, [], opened.rate, opened.name)
             self.set_boxes(boxes)
         except BaseException:
             self._folder.cleanup()
@@ -246,15 +252,11 @@ class Annotation:
         The best one has the highest score there. A direction without a pass is left out.
         """
         boxes: dict[bool, Box | None] = {}
-        drawn = self.keyframes[name]
         for stretch in self._stretches():
             if stretch.object == name and stretch.start <= frame < stretch.stop:
-                for start, stop in self._ways(stretch):
-                    parts = (one.part(start, stop, drawn) for one in self.passes(name))
-                    place = abs(frame - start) - 1
-                    best = max(filter(None, parts), key=lambda part: part.scores[place], default=None)
-                    if best is not None:
-                        boxes[stop > start] = _box(best.boxes[place])
+                here = [(part, abs(frame - part.start) - 1) for part in self._parts(stretch)]
+                for part, place in sorted(here, key=lambda one: one[0].scores[one[1]]):  # the best one last
+                    boxes[part.is_forward] = box_of(part.boxes[place])
         return boxes
 
     def next_frame(self) -> NextFrame | None:
@@ -312,13 +314,13 @@ class Annotation:
         drawn, count = self.keyframes[name], len(self.frames)
         boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
         for frame, box in drawn.items():
-            boxes[frame] = [np.nan] * 4 if box is None else box
+            boxes[frame] = row_of(box)
         for stretch in self._stretches():
             if stretch.object == name:
                 part = slice(stretch.start, stretch.stop)
-                boxes[part], probabilities[part], scores[part] = self._fused_stretch(stretch)
+                boxes[part], probabilities[part], scores[part] = self._fused(stretch)
         for frame, (row, probability, score) in enumerate(zip(boxes, probabilities, scores, strict=True)):
-            box = _box(row)
+            box = box_of(row)
             check: Check = "checked" if probability >= _CHECKED else "unchecked"
             yield Track(
                 *(frame, self.frames.times[frame], "absent" if box is None else "present", box, float(score)),
@@ -329,16 +331,20 @@ class Annotation:
                 probability=float(probability),
             )
 
-    def _fused_stretch(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
+    def _parts(self, stretch: _Stretch) -> list[Pass]:
+        """The parts of the finished passes that run over a stretch."""
         drawn = self.keyframes[stretch.object]
-        parts = [one.part(*way, drawn) for way in self._ways(stretch) for one in self.passes(stretch.object)]
-        return fuse([part for part in parts if part is not None], stretch.start, stretch.stop, drawn)
+        parts = (one.part(*way, drawn) for way in self._ways(stretch) for one in self.passes(stretch.object))
+        return [part for part in parts if part is not None]
+
+    def _fused(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
+        return fuse(self._parts(stretch), stretch.start, stretch.stop, self.keyframes[stretch.object])
 
     def _is_checked(self, stretch: _Stretch) -> bool:
-        return bool((self._fused_stretch(stretch)[1] >= _CHECKED).all())
+        return bool((self._fused(stretch)[1] >= _CHECKED).all())
 
     def _next_in(self, stretch: _Stretch) -> NextFrame:
-        errors = 1 - self._fused_stretch(stretch)[1]
+        errors = 1 - self._fused(stretch)[1]
         drawn = self.keyframes[stretch.object]
         if stretch.start - 1 not in drawn:
             frame = 0
@@ -378,10 +384,6 @@ def annotate(
 def _work(task: Task, frames: DecodedFrames, settings: Settings) -> tuple[Task, Pass | None]:
     one = run_pass(frames, task.start, task.stop, dict(task.keyframes), settings, use_memory=task.use_memory)
     return task, one
-
-
-def _box(row: Float64) -> Box | None:
-    return None if np.isnan(row[0]) else Box(*row.tolist())
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, Box | None]]:

@@ -11,14 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import UInt8
 from catstream.base.files import writing
-from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.video.frames import Source
-from catstream.video.source import ALL_FRAMES, open_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,22 +48,6 @@ class DecodedFrames:
         width, height = self.size
         pixels = 3 * height * width
         return np.fromfile(self.path, np.uint8, pixels, offset=number * pixels).reshape(height, width, 3)
-
-
-def open_frames(
-    source: str | Path, folder: Path, settings: Settings, part: slice = ALL_FRAMES
-) -> tuple[Source, DecodedFrames]:
-    """Open a part of a file or folder; its frames, none of which is decoded yet, will be in a file in `folder`.
-
-    Raises
-    ------
-    VideoError
-        If the source is live or cannot be read.
-    """
-    if is_live(source):
-        raise VideoError(f"cannot annotate a live source ({without_password(str(source))}): record it to a file first")
-    video = open_source(source, part=part, settings=settings.run)
-    return video, DecodedFrames(folder / "frames", video.size, [], video.rate, video.name)
 
 
 def decode(video: Source, frames: DecodedFrames, progress: Callable[[int, int | None], object]) -> None:

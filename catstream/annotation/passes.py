@@ -60,8 +60,7 @@ class Pass:
 
     def is_near(self, frame: int, box: Box | None) -> bool:
         """Return True if it has the object at the box of a frame after its start, or rightly has no box there."""
-        drawn = np.array([np.nan] * 4 if box is None else box)
-        return bool(iou(self.boxes[abs(frame - self.start) - 1], drawn) > _NEAR)
+        return bool(iou(self.boxes[abs(frame - self.start) - 1], row_of(box)) > _NEAR)
 
     def part(self, start: int, stop: int, keyframes: Keyframes) -> Pass | None:
         """Its part from a keyframe on to `stop`; None if it does not cover it, or has lost the object before."""
@@ -74,19 +73,25 @@ class Pass:
         return Pass(start, stop, self.boxes[part], self.scores[part], self.with_memory)
 
 
+def row_of(box: Box | None) -> Float64:
+    """A box as float64 (4,), NaN without one."""
+    return np.array([np.nan] * 4 if box is None else box, np.float64)
+
+
+def box_of(row: Float64) -> Box | None:
+    """The box of a row; None if it is NaN."""
+    return None if np.isnan(row[0]) else Box(*row.tolist())
+
+
 def iou(one: Float64, other: Float64) -> Float64:
     """Intersection over union of boxes (..., 4); 1 if both are NaN, 0 if one is."""
-    low, high = np.maximum(one[..., :2], other[..., :2]), np.minimum(_ends(one), _ends(other))
+    low = np.maximum(one[..., :2], other[..., :2])
+    high = np.minimum(one[..., :2] + one[..., 2:], other[..., :2] + other[..., 2:])
     shared = np.prod(np.maximum(high - low, 0), axis=-1)
     union = np.prod(one[..., 2:], axis=-1) + np.prod(other[..., 2:], axis=-1) - shared
     both_absent = np.isnan(one[..., 0]) & np.isnan(other[..., 0])
     ratios: Float64 = np.where(both_absent, 1.0, np.nan_to_num(shared / union))
     return ratios
-
-
-def _ends(boxes: Float64) -> Float64:
-    ends: Float64 = boxes[..., :2] + boxes[..., 2:]
-    return ends
 
 
 @one_thread(opencv=True)
@@ -109,7 +114,7 @@ def run_pass(
         tracks = [*_tracks((frames[number] for number in route), box, learned, settings)][1:]
     except BoxError:
         return None
-    boxes = np.array([track.box or [np.nan] * 4 for track in tracks], np.float64).reshape(-1, 4)
+    boxes = np.stack([row_of(track.box) for track in tracks])
     return Pass(start, stop, boxes, np.array([track.score for track in tracks], np.float64), use_memory)
 
 

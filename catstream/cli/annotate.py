@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation
     from catstream.sinks.track_log import RunFiles
 
-_LOOK_SECONDS = 0.5  # from one look at whether the page is done to the next
-
 
 @click.command()
 @click.argument("video")
@@ -144,7 +142,7 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
             for url in server.urls:
                 click.echo(url)
             with suppress(KeyboardInterrupt):
-                while not session.finished.wait(_LOOK_SECONDS):
+                while not session.finished.wait(0.5):
                     pass  # without a limit, a signal that arrives just before it waits is handled after it only
     interrupted = not session.finished.is_set()
     if interrupted and session.decoded:

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from catstream.annotation.annotation import Annotation
+from catstream.annotation.passes import box_of, iou, row_of
 from catstream.base.arrays import Bool, Float64
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.base.workers import run_tasks
 from catstream.errors import BoxError, CatstreamError, VideoError
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.scores import overlaps
 
 #: The measures of a row, with their headings.
 MEASURES = {
@@ -128,11 +128,11 @@ def _annotated(sequence: Sequence, most: int, settings: Settings) -> list[Keyfra
 def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[KeyframeRow]:
     truth, size = sequence.boxes, sequence.size()
     usable = [frame for frame in range(len(truth)) if _is_usable(truth[frame], size)]
-    first = next((frame for frame in usable if _box(truth[frame]) is not None), None)
+    first = next((frame for frame in usable if box_of(truth[frame]) is not None), None)
     if first is None:
         raise VideoError("tracking cannot start at any box of the ground truth: use another sequence")
     part = slice(sequence.begin, sequence.begin + len(sequence))
-    drawn = {first: _box(truth[first])}
+    drawn = {first: box_of(truth[first])}
     with Annotation(sequence.path, drawn, settings, part=part, jobs=1) as annotation:
         annotation.track()
         while True:
@@ -142,7 +142,7 @@ def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[Keyfra
             if following is None or not free or len(keyframes) >= most:
                 break
             frame = min(free, key=lambda frame: abs(frame - following.frame))
-            annotation.add(frame, _box(truth[frame]))
+            annotation.add(frame, box_of(truth[frame]))
         last = _row(sequence, annotation)
         for boxes in range(len(keyframes) + 1, most + 1):  # more boxes are not asked for
             yield dataclasses.replace(last, boxes=boxes)
@@ -151,7 +151,7 @@ def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[Keyfra
 def _row(sequence: Sequence, annotation: Annotation) -> KeyframeRow:
     ((name, tracks),) = annotation.tracks.items()
     keyframes = annotation.keyframes[name]
-    right = _right(np.array([track.box or [np.nan] * 4 for track in tracks], np.float64), sequence.boxes)
+    right = _right(np.stack([row_of(track.box) for track in tracks]), sequence.boxes)
     states = np.array([track.checked for track in tracks])
     checked, success = states == "checked", float(right.mean())
     expected = fmean(track.probability or 0.0 for track in tracks)
@@ -169,9 +169,7 @@ def _row(sequence: Sequence, annotation: Annotation) -> KeyframeRow:
 
 
 def _right(boxes: Float64, truth: Float64) -> Bool:
-    both_absent = np.isnan(boxes[:, 0]) & np.isnan(truth[:, 0])
-    right: Bool = both_absent | (overlaps(boxes, truth) > 0.5)
-    return right
+    return iou(boxes, truth) > 0.5
 
 
 def _interpolated(keyframes: dict[int, Box | None], count: int) -> Float64:
@@ -190,17 +188,13 @@ def _forward(annotation: Annotation, name: str) -> Float64:
         if one.is_forward and not one.with_memory:
             boxes[one.start + 1 : one.stop + 1] = one.boxes
     for frame, box in annotation.keyframes[name].items():
-        boxes[frame] = [np.nan] * 4 if box is None else box
+        boxes[frame] = row_of(box)
     return boxes
-
-
-def _box(row: Float64) -> Box | None:
-    return Box(*row.tolist()) if np.isfinite(row).all() else None
 
 
 def _is_usable(row: Float64, size: tuple[int, int]) -> bool:
     """Return True if a person could draw this: a box that tracking can start with, or that the object is absent."""
-    box = _box(row)
+    box = box_of(row)
     try:
         return box is None or bool(box.validated(*size))
     except BoxError:
