@@ -104,6 +104,7 @@ class Job:
     part      the frames of the source that are followed
     settings  all settings
     size      width and height of a frame, None if that is not known yet
+    rate      frames per second, None if that is not known yet
     results   files that `catstream track` writes
     paused    whether the run starts paused, until the command `resume`
     network   digest of the file `features.network`, empty if there is none, or the processes were started by hand
@@ -124,6 +125,7 @@ class Job:
     part: slice = field(default_factory=lambda: _ALL)
     settings: Settings = field(default_factory=Settings)
     size: tuple[int, int] | None = None
+    rate: float | None = None
     results: Results = Results()
     paused: bool = False
     network: str = ""
@@ -205,8 +207,7 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {quote(str(path))}")
-        metadata = storage.read(file)[1]
-        metadata.setdefault("network", "")  # which an older job lacks
+        metadata: dict[str, Any] = {"network": "", "rate": None} | storage.read(file)[1]  # which an older job lacks
         try:
             settings = Settings.from_values(metadata.pop("settings"))
             read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}

@@ -55,4 +55,4 @@ def prepared(job: Job, info: SourceInfo) -> Job:
     network = digest_of(descriptor_of(settings, job.network))
     check_files(job.models, settings, network)
     source = job.source if info.live else str(Path(job.source).absolute())
-    return replace(job, source=source, size=info.size, settings=settings, network=network)
+    return replace(job, source=source, size=info.size, rate=info.rate, settings=settings, network=network)

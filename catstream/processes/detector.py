@@ -134,8 +134,9 @@ class DetectorLoop:
         first = self.detectors.seq if self._live else max(self.detectors.seq - 1, 0)
         watchdog.allow(LONG_SECONDS + ((job.part.start or 0) + first * step) * _SKIP_SECONDS)
         watchdog.limit += (step - 1) * _SKIP_SECONDS
-        part, since = job.part, job.since
-        source = open_source(job.source, first, part=part, since=since, idle=self._idle, settings=settings.run)
+        source = open_source(
+            *(job.source, first), part=job.part, since=job.since, rate=job.rate, idle=self._idle, settings=settings.run
+        )
         self._source = stack.enter_context(source)
         if self._live:
             self._source.size = job.size or self._source.size  # a camera may have another one than when the run began

@@ -66,9 +66,17 @@ class LiveSource(Source):
     live = True
 
     def __init__(
-        self, text: str, start: int, settings: RunSettings, *, since: float | None, idle: Callable[[], bool] | None
+        self,
+        text: str,
+        start: int,
+        settings: RunSettings,
+        *,
+        since: float | None,
+        rate: float | None,
+        idle: Callable[[], bool] | None,
     ) -> None:
-        super().__init__(_name(text), RATE, (0, 0))
+        super().__init__(_name(text), rate or RATE, (0, 0))
+        self._measures_rate = rate is None
         self.skipped = self.reconnects = 0
         protocol, mark, path = text.partition("://")
         self._text = protocol.lower() + mark + path  # FFmpeg's names of protocols are in lower case
@@ -222,6 +230,7 @@ class LiveSource(Source):
         read_timeout = settings.read_timeout_seconds + (".m3u8" in self._text) * _LONGEST_SEGMENT
         timeouts = max(1.0, due - monotonic()), read_timeout
         options = _JPEG_OPTIONS if attempt.demuxer else _OPTIONS if units is None else _UNPARSED_OPTIONS
+        options = options if self._measures_rate else options | {"fpsprobesize": "0"}
         with _open_container(self._text, attempt.demuxer, options, timeouts, settings.hwaccel) as container:
             stream, is_segmented = video_stream(container), container.format.name == "hls"
             stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
@@ -229,7 +238,8 @@ class LiveSource(Source):
                 if stream.codec_context.name != "h264":
                     raise ValueError(f"{stream.codec_context.name} needs the parser")
                 stream.codec_context.flags2 |= Flags2.chunks
-            self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
+            if self._measures_rate:
+                self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
             now, backlog = monotonic(), Backlog()
             for packet in container.demux():
                 before, now = now, monotonic()

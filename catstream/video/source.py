@@ -119,6 +119,7 @@ def open_source(
     *,
     part: slice = ALL_FRAMES,
     since: float | None = None,
+    rate: float | None = None,
     idle: Callable[[], bool] | None = None,
     settings: RunSettings | None = None,
     **single: Any,
@@ -129,6 +130,7 @@ def open_source(
               and dropped; a live source numbers its first frame `start`
     part      the frames of a file or folder that are read, for example `slice(100, 200, 2)` for 100, 102 ... 198
     since     zero of the time stamps of a live source, as `time.monotonic` gives it; None for its first frame
+    rate      frames per second of a live source, None if that is not known: FFmpeg then measures it for half a second
     idle      is called ten times a second while a live source has no frame; if it returns True, iteration ends. With
               it, opening a live source never fails: iteration waits for the first frame without a timeout, and the size
               is unknown until then
@@ -152,7 +154,7 @@ def open_source(
 
         if str(text).startswith(PREFIX):
             return LiveDemo(str(text), start, settings.image_rate, since=since, idle=idle)
-        return LiveSource(str(text), start, settings, since=since, idle=idle)
+        return LiveSource(str(text), start, settings, since=since, rate=rate, idle=idle)
     redacted = without_password(str(text))
     if re.match(r"\w+:/[^/]", str(text)) and not Path(text).exists():
         raise VideoError(f"invalid address {redacted!r} (one slash after the protocol): write //")

@@ -63,6 +63,7 @@ class Sender(ChannelSocket[Message]):
 
         None if no answer arrived in time.
         """
+        self._socket.poll(int(1000 * PATIENCE_SECONDS), zmq.POLLOUT)  # until it is connected
         self._ask(_NEWEST if after is None else b"%d" % after)
         if self._wait(PATIENCE_SECONDS):
             return self._decode(self._socket.recv(), Position)
