@@ -99,6 +99,11 @@ def test_times_are_relative_to_the_given_moment(camera):
         assert 1000 <= next(source).time < 1030
 
 
+def test_a_rate_that_is_known_is_not_measured(camera):
+    with open_source(camera(numbered).url, rate=12.5) as source:
+        assert (source.rate, next(source).image.shape) == (12.5, (96, 128, 3))
+
+
 def test_a_camera_that_disconnects_is_reconnected(camera, until):
     cam = camera(numbered)
     with open_source(cam.url) as source:
