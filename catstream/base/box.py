@@ -62,12 +62,17 @@ class _Rectangle(NamedTuple):
 
     def overlap(self, other: Self) -> float:
         """Return the intersection over union with another rectangle, from 0 to 1."""
+        shared = self._intersection(other)
+        return shared / (self.area + other.area - shared)
+
+    def share_in(self, other: Self) -> float:
+        """Return the share of the area that is inside another rectangle, from 0 to 1."""
+        return self._intersection(other) / self.area
+
+    def _intersection(self, other: Self) -> float:
         w = min(self.x + self.w, other.x + other.w) - max(self.x, other.x)
         h = min(self.y + self.h, other.y + other.h) - max(self.y, other.y)
-        if w <= 0 or h <= 0:
-            return 0.0
-        shared = w * h
-        return shared / (self.area + other.area - shared)
+        return w * h if w > 0 and h > 0 else 0.0
 
 
 class Box(_Rectangle):

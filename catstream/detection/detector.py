@@ -6,7 +6,9 @@ It holds the state and the model between frames. The steps from one frame to the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 from zlib import crc32
 
@@ -64,8 +66,12 @@ class Detector:
         """The last box of the object, in pixels; None before the first frame."""
         return self.state.window.box(self.settings.search.context) if self.state else None
 
-    def init(self, frame: Pyramid, seq: int, time: float, box: Box) -> Result:
+    def init(
+        self, frame: Pyramid, seq: int, time: float, box: Box, together: Mapping[str, int] = MappingProxyType({})
+    ) -> Result:
         """Start with the box of an object in pixels of the frame; a previous object is forgotten.
+
+        `together` is that of the state: the objects whose boxes overlap this one.
 
         BoxError if tracking cannot start with the box in this frame (see `Box.validated`), or if the object is
         indistinguishable from its background. The detector is then unchanged.
@@ -79,7 +85,7 @@ class Detector:
 
             scm = SparseCollaborativeModel(frame.image, box, np.random.default_rng(seed))
         model, training = teacher.first_training(frame, window, np.random.default_rng(seed), self.settings)
-        self.state = DetectorState(seq - 1, "confident", window, window, window)
+        self.state = DetectorState(seq - 1, "confident", window, window, window, together=dict(together))
         self.model, self._scm = model, scm
         return self._result(seq, time, 1.0, training)
 

@@ -1,6 +1,6 @@
 """The detectors of all objects of a stream: one pyramid and one message of features a frame, a track for each object.
 
-No two objects of a frame are at the same position: see `assign`.
+No two objects of a frame are at the same position, unless they are together: see `assign`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks
 
 _SAME_POSITION = 0.5  # IoU above which two boxes are at the same position
-_INITIAL_OVERLAP = 0.2  # IoU of their initial boxes above which two objects may be at the same position
-_UNTRUSTED_OVERLAP = 0.2  # IoU above which the box of an object that is not trusted may be a part of the other
+_PART = 1 / 3  # share of a box that is inside another one, above which the one is at a part of the other
 
 
 class Detectors:
@@ -75,10 +74,22 @@ class Detectors:
         """
         detector = self.detectors.get(name) or self._new_detector(name)
         with errors_about(name):
-            result = detector.init(frame, self.seq + 1, time, box)
+            box = Box(*map(float, box)).validated(*frame.size)
+            result = detector.init(frame, self.seq + 1, time, box, self._together(name, box))
         self.detectors.pop(name, None)
         self.detectors[name] = detector  # the last one, even if another object had the name
         return self._catch_up(detector, result, time, later)
+
+    def _together(self, name: str, box: Box) -> dict[str, int]:
+        """The other objects whose boxes overlap that of an object that begins: see `DetectorState`."""
+        states = {other: one.state for other, one in self.detectors.items() if other != name}
+        return {
+            other: state.first_frame
+            for other, state in states.items()
+            if state is not None
+            and state.level != "lost"
+            and _overlap(box, state.window.box(self.settings.search.context))
+        }
 
     def _catch_up(self, detector: Detector, result: Result, time: float, later: Iterable[Pyramid]) -> Result:
         """Track an object through later frames, and return its result in the last one, with the rows of the box."""
@@ -121,6 +132,9 @@ class Detectors:
         self.seq += 1
         results = dict(results or {})
         detectors = {name: detector for name, detector in self.detectors.items() if name not in results}
+        before = {name: detector.state for name, detector in self.detectors.items() if detector.state is not None}
+        for name in detectors.keys() & before.keys():
+            detectors[name].state = _parted(before[name], before, self.settings.search.context)
         detections = {name: detector.search(frame, self.seq) for name, detector in detectors.items()}
         states = {name: detector.state for name, detector in detectors.items() if detector.state is not None}
         detections = assign(detections, states, self.settings.search.context)
@@ -148,63 +162,100 @@ def assign(
 ) -> dict[str, Detection]:
     """Resolve conflicts: give a position to one object, to the one whose score would fall most without it.
 
-    An object that loses its position gets the best other window near it; its score is 0 if there is none. One that is
-    not trusted, because it was last detected elsewhere, also loses a position of which a smaller part is another
-    object's: most likely it is lost, and a part of the other one looks similar. Objects whose initial boxes overlapped
-    may be at the same position, and an object that is still sought occupies none. Without a conflict, a detection is
-    unchanged. The windows are `context` times as large as the boxes of the objects.
+    An object that loses its position gets the best other window near it; its score is 0 if there is none. Objects that
+    are `together` may be at the same position, and an object that is still sought occupies none. Without a conflict, a
+    detection is unchanged. The windows are `context` times as large as the boxes of the objects.
+
+    An object is uncertain if it was lost in the last frame, or was detected elsewhere and is not trusted since. Most
+    likely it is absent, and a part of another object resembles it. So it also loses a position of which more than a
+    third is in the box of a certain object, or of one with a higher score; and a certain object loses its position to
+    an uncertain one only if that has a higher score.
     """
-    initial = {
-        name: (state.first_frame, state.first_window.box(context))
-        for name, state in states.items()
-        if state.first_window is not None
+    names = [name for name, state in states.items() if not state.is_sought]
+    boxes = {name: detections[name].window.box(context) for name in names}
+    scores = {name: detections[name].score for name in names}
+    uncertain = {
+        name
+        for name in names
+        if not states[name].trusted or states[name].level == "lost" or detections[name].redetected
     }
-    boxes = {name: detections[name].window.box(context) for name in initial}
+    certain = {  # and not outscored at its position
+        name
+        for name in names
+        if name not in uncertain
+        and all(scores[name] >= scores[other] or not _conflict(boxes[name], boxes[other]) for other in uncertain)
+    }
+    exclusive = {
+        name: [other for other in names if other != name and not _are_together(states, name, other)] for name in names
+    }
     rivals = {
-        name: [other for other in initial if other != name and _are_exclusive(initial[name], initial[other])]
-        for name in initial
+        name: [
+            other
+            for other in exclusive[name]
+            if other in certain or (name not in certain and scores[other] >= scores[name])
+        ]
+        for name in names
     }
-
-    limits = {
-        name: _SAME_POSITION if states[name].trusted and not detections[name].redetected else _UNTRUSTED_OVERLAP
-        for name in initial
-    }
-
-    def rival_boxes(name: str, positions: Mapping[str, Box]) -> list[Box]:
-        return [positions[other] for other in rivals[name] if other in positions]
 
     def in_conflict(name: str, positions: Mapping[str, Box]) -> bool:
-        return any(boxes[name].overlap(box) > limits[name] for box in rival_boxes(name, positions))
+        occupied = [positions[other] for other in rivals[name] if other in positions]
+        return any(_conflict(boxes[name], box, name in uncertain) for box in occupied)
 
-    conflicts = [name for name in initial if in_conflict(name, boxes)]
-    alternatives = {
-        name: _best_elsewhere(detections[name], rival_boxes(name, boxes), context, limits[name]) for name in conflicts
-    }
+    def elsewhere(name: str, positions: Mapping[str, Box]) -> Detection:
+        occupied = [positions[other] for other in exclusive[name] if other in positions]
+        return _best_elsewhere(detections[name], occupied, context, name in uncertain)
+
+    conflicts = [name for name in names if in_conflict(name, boxes)]
+    loss = {name: scores[name] - elsewhere(name, boxes).score for name in conflicts}
     assigned = {name: box for name, box in boxes.items() if name not in conflicts}
     result = dict(detections)
-    for name in sorted(conflicts, key=lambda name: detections[name].score - alternatives[name].score, reverse=True):
+    for name in sorted(conflicts, key=lambda name: (name in certain, loss[name]), reverse=True):
         if in_conflict(name, assigned):
             # Neither at an assigned position, nor at one that a later object may be assigned.
-            result[name] = _best_elsewhere(detections[name], rival_boxes(name, boxes | assigned), context, limits[name])
+            result[name] = elsewhere(name, boxes | assigned)
         if result[name].score > 0:
             assigned[name] = result[name].window.box(context)
         boxes.pop(name)
     return result
 
 
-def _are_exclusive(one: tuple[int, Box], other: tuple[int, Box]) -> bool:
-    """Return True if two objects cannot be at the same position, by their first frames and initial boxes."""
-    (frame, box), (other_frame, other_box) = one, other
-    return frame != other_frame or box.overlap(other_box) <= _INITIAL_OVERLAP
+def _are_together(states: Mapping[str, DetectorState], name: str, other: str) -> bool:
+    """Return True if the boxes of two objects overlap since the first frame of one of them."""
+    first, second = states[name], states[other]
+    return first.together.get(other) == second.first_frame or second.together.get(name) == first.first_frame
 
 
-def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, limit: float) -> Detection:
+def _parted(state: DetectorState, states: Mapping[str, DetectorState], context: float) -> DetectorState:
+    """The state of an object without the objects that it was together with, and that are confidently apart by now."""
+    if not state.together:
+        return state
+    box = state.window.box(context)
+    together = {
+        name: first
+        for name, first in state.together.items()
+        if name in states
+        and (not state.level == states[name].level == "confident" or box.overlap(states[name].window.box(context)))
+    }
+    return replace(state, together=together)
+
+
+def _overlap(box: Box, other: Box) -> bool:
+    """Return True if a box is at a part of the other one, or the other way round."""
+    return max(box.share_in(other), other.share_in(box)) > _PART
+
+
+def _conflict(box: Box, other: Box, uncertain: bool = False) -> bool:
+    """Return True if a box is at the position of another one, or, if its object is uncertain, at a part of it."""
+    return box.overlap(other) > _SAME_POSITION or (uncertain and box.share_in(other) > _PART)
+
+
+def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, uncertain: bool) -> Detection:
     """The best window near a detection that is at none of the occupied positions."""
     if detection.around is not None:
         scores = detection.around.scores.copy()
         for row, column in np.ndindex(scores.shape):
             box = detection.around.window(row, column).box(context)
-            if any(box.overlap(other) > limit for other in occupied):
+            if any(_conflict(box, other, uncertain) for other in occupied):
                 scores[row, column] = -np.inf
         row, column = map(int, np.unravel_index(scores.argmax(), scores.shape))
         if scores[row, column] > 0:

@@ -91,6 +91,7 @@ class DetectorState:
     sightings         frames in a row in which a saved model's object was seen in one place
     motion            of the Kalman filter of the centre, None before a model had any
     centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
+    together          earlier objects, each with its first frame, whose boxes overlap the object's since its first frame
     """
 
     first_frame: Integer
@@ -102,6 +103,7 @@ class DetectorState:
     sightings: Integer = 0
     motion: Motion | None = None
     centre: Annotated[np.ndarray, Array("float64", (5, 4))] | None = None
+    together: ByObject[Integer] = field(default_factory=dict)
 
     @property
     def is_sought(self) -> bool:

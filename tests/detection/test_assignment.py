@@ -1,4 +1,4 @@
-"""Two objects do not claim the same place of a frame, unless they were given there."""
+"""Two objects do not claim the same place of a frame, unless they were together from the start."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -58,37 +58,57 @@ def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
         assert {name for name, each in result.items() if each.score > 0} == kept
 
 
-@given(st.lists(st.tuples(st.floats(0.1, 1), st.integers(80, 140)), min_size=2, max_size=5), st.randoms())
+@given(
+    st.lists(st.tuples(st.floats(0.1, 1), st.integers(80, 140), st.booleans()), min_size=2, max_size=5), st.randoms()
+)
 def test_no_two_objects_ever_have_one_place(objects, random):
     def around(x):
         scores = np.array([[random.random() for _ in range(9)] for _ in range(3)], np.float32)
         return ScoreMap(None, scores, (x - 20.0, 40.0), (5.0, 5.0))
 
-    found = {str(i): detection(score, x, around(x)) for i, (score, x) in enumerate(objects)}
-    states = {name: state(100 * i) for i, name in enumerate(found)}
+    found = {str(i): detection(score, x, around(x)) for i, (score, x, _) in enumerate(objects)}
+    states = {str(i): replace(state(100 * i), trusted=trusted) for i, (_, _, trusted) in enumerate(objects)}
     result = assign(found, states, CONTEXT)
     boxes = [each.window.box(CONTEXT) for each in result.values() if each.score > 0]
     assert boxes
     assert all(one.overlap(other) <= 0.5 for one, other in combinations(boxes, 2))
 
 
-def test_objects_whose_first_boxes_overlap_may_stay_at_one_place():
+def test_objects_that_are_together_may_stay_at_one_place():
     found = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
-    together = {"anna": state(100), "ben": state(110)}
-    assert assign(found, together, CONTEXT) == found
-    one_later = {"anna": state(100), "ben": state(110, first_frame=7)}
-    assert assign(found, one_later, CONTEXT)["ben"].score == 0
+    later = state(110, first_frame=7)
+    assert assign(found, APART | {"ben": replace(later, together={"anna": 0})}, CONTEXT) == found
+    assert assign(found, APART | {"ben": later}, CONTEXT)["ben"].score == 0
+    of_another_anna = replace(later, together={"anna": 3})
+    assert assign(found, APART | {"ben": of_another_anna}, CONTEXT)["ben"].score == 0
 
 
+@pytest.mark.parametrize(("side", "score"), [(40, 0.7), (40, 0.9), (15, 0.9)])
 @pytest.mark.parametrize(
-    ("trusted", "redetected", "kept"), [(True, False, True), (False, False, False), (True, True, False)]
+    ("change", "redetected", "kept"),
+    [({}, False, True), ({"trusted": False}, False, False), ({}, True, False), ({"level": "lost"}, False, False)],
 )
-def test_an_object_that_is_not_trusted_gets_no_part_of_the_place_of_another(trusted, redetected, kept):
-    found = {"anna": detection(0.7, 100), "ben": replace(detection(0.9, 122), redetected=redetected)}
-    states = APART | {"ben": replace(APART["ben"], trusted=trusted)}
-    result = assign(found, states, CONTEXT)
+def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, change, redetected, kept):
+    part = Window.around(Box(122, 60, side, side), CONTEXT)
+    found = {"anna": detection(0.8, 100), "ben": Detection(score, part, redetected=redetected)}
+    result = assign(found, APART | {"ben": replace(APART["ben"], **change)}, CONTEXT)
     assert result["anna"] is found["anna"]
     assert (result["ben"].score > 0) is kept
+
+
+@pytest.mark.parametrize(("score", "winner"), [(0.6, "anna"), (0.8, "ben")])
+def test_an_uncertain_object_displaces_a_certain_one_only_with_a_higher_score(score, winner):
+    """The certain one has nearly as good a window beside it, so its score would fall less."""
+
+    def around(x, beside):
+        scores = np.full((3, 9), 0.1, np.float32)
+        scores[:, 0] = beside
+        return ScoreMap(None, scores, (x - 25.0, 45.0), (5.0, 5.0))
+
+    found = {"anna": detection(0.7, 100, around(100, 0.65)), "ben": detection(score, 104, around(104, 0.1))}
+    result = assign(found, APART | {"ben": replace(APART["ben"], trusted=False)}, CONTEXT)
+    assert result[winner] is found[winner]
+    assert [name for name in found if result[name] is found[name]] == [winner]
 
 
 def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng):
