@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BufferedIOBase
+from itertools import cycle
 from multiprocessing.connection import Connection
 from time import monotonic
 from typing import Any, Self, cast
@@ -72,9 +73,16 @@ class Camera:
     urls : URL of each stream
     """
 
-    def __init__(self, files: Sequence[bytes], size: tuple[int, int], streams: int, source: str = "mjpeg") -> None:
+    def __init__(
+        self,
+        files: Sequence[bytes],
+        size: tuple[int, int],
+        streams: int,
+        source: str = "mjpeg",
+        still: Sequence[bytes] = (),
+    ) -> None:
         self._pipe, self._other = SPAWN.Pipe()
-        arguments = self._other, files, size, streams, source, os.getpid()
+        arguments = self._other, os.getpid(), files, size, streams, source, still
         self._process = SPAWN.Process(target=_broadcast, args=arguments, daemon=True)
 
     @property
@@ -119,11 +127,9 @@ class Camera:
             raise ServiceError("the camera of the load test has exited: its error is printed above") from None
 
 
-def _broadcast(
-    pipe: Connection, files: Sequence[bytes], size: tuple[int, int], streams: int, source: str, parent: int
-) -> None:
+def _broadcast(pipe: Connection, parent: int, *images: Any) -> None:
     die_with(parent)
-    with Broadcast(files, size, streams, source) as broadcast:
+    with Broadcast(*images) as broadcast:
         pipe.send(broadcast.urls)
         while True:
             question = pipe.recv()
@@ -133,7 +139,8 @@ def _broadcast(
 class Broadcast(ThreadingHTTPServer):
     """Serves streams of the same images on the loopback interface; a context manager.
 
-    `files` are JPEG files for the source mjpeg, and access units of `rtsp.encode` for h264.
+    `files` are JPEG files for the source mjpeg, and access units of `rtsp.encode` for h264. `still` is the first image,
+    sent over and over: a keyframe takes several times as long to decode as the frames after it that show no change.
 
     The schedules of n streams are shifted by 1/n of a frame each, so that frames are not due at the same time.
 
@@ -143,10 +150,17 @@ class Broadcast(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, files: Sequence[bytes], size: tuple[int, int], streams: int = 1, source: str = "mjpeg") -> None:
+    def __init__(
+        self,
+        files: Sequence[bytes],
+        size: tuple[int, int],
+        streams: int = 1,
+        source: str = "mjpeg",
+        still: Sequence[bytes] = (),
+    ) -> None:
         self._is_h264 = source == "h264"
         super().__init__(("127.0.0.1", 0), RtspConnection if self._is_h264 else _Connection)
-        self._files, self._size, self._closed = files, size, threading.Event()
+        self._files, self._still, self._size, self._closed = files, still or files[:1], size, threading.Event()
         self._schedules = [Schedule(monotonic(), _STILL_RATE, frames=1)] * streams
         self.late = 0.0
         protocol = "rtsp" if self._is_h264 else "http"
@@ -188,7 +202,7 @@ class Broadcast(ThreadingHTTPServer):
         """Yield due time and file of each frame when it is due; switch to a new schedule as soon as it is set."""
         while not self._closed.is_set():
             schedule = self._schedules[stream]
-            number = schedule.following(monotonic())
+            number, still = schedule.following(monotonic()), cycle(self._still)
             while schedule is self._schedules[stream]:
                 due = schedule.due(number)
                 if (seconds := due - monotonic()) > 0:
@@ -197,14 +211,13 @@ class Broadcast(ThreadingHTTPServer):
                     if seconds > 1 / _STILL_RATE:
                         continue
                     self.late = max(self.late, monotonic() - due)
-                yield due, self._file(schedule, number)
+                yield due, next(still) if number < 0 or schedule.frames == 1 else self._file(schedule, number)
                 number += 1
 
     def _file(self, schedule: Schedule, number: int) -> bytes:
         if not self._is_h264:
             return self._files[schedule.picture(number, len(self._files))]
-        # All but keyframes refer to the one before. So the still is a keyframe, and the video goes on after its end.
-        return self._files[number % len(self._files) if number > 0 and schedule.frames > 1 else 0]
+        return self._files[number % len(self._files)]  # most refer to the one before: the video goes on after its end
 
 
 class _Connection(BaseHTTPRequestHandler):

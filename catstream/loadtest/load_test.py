@@ -38,6 +38,7 @@ _START_TIMEOUT_SECONDS = 120.0  # for each phase of the start
 _LEAD_SECONDS = 0.5  # from the end of the start to the first frame, and half a frame: a still is no nearer to it
 _GRACE_SECONDS = 3.0  # to wait for the track of the last frame
 _READING_SECONDS = 0.5  # between two readings of processor and memory use
+_STILL = 13  # images of the still that are encoded as H.264: 24 frames, of which the first is a keyframe
 _LOOP_SECONDS = 0.05
 
 
@@ -440,7 +441,7 @@ def run_load_test(
 
     def holds(streams: int) -> bool:
         try:
-            with Camera(files, plan.size, streams, plan.source) as camera:
+            with Camera(files, plan.size, streams, plan.source, still) as camera:
                 result = run(replace(plan, streams=streams), video, camera, report)
         except ServiceError as error:
             if not find or not load_test.results:
@@ -455,8 +456,9 @@ def run_load_test(
 
     try:
         video = render(plan.objects, images, plan.size, lambda count: report_frames("rendering", count, images))
-        files = video.files
+        files, still = video.files, video.files[:1]
         if plan.source == "h264":
+            still = encode(still * _STILL, plan.size, lambda _: None)
             files = encode(files, plan.size, lambda count: report_frames("encoding", count, 2 * images))
         if find:
             load_test.highest = find_highest(plan.streams, holds, MOST_STREAMS)
