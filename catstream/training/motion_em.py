@@ -6,15 +6,8 @@ measured with observation noise. EM estimates the covariances of both from the m
 
 from __future__ import annotations
 
-import builtins
-from functools import cache
-from importlib.machinery import SourceFileLoader
-from importlib.util import find_spec
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
-
 import numpy as np
+from filterpy.kalman import KalmanFilter
 
 from catstream.base.arrays import Bool, Float64
 from catstream.messages.kinds import Motion
@@ -23,31 +16,6 @@ from catstream.numerics.kalman import OBSERVATION, TRANSITION
 FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
-
-
-@cache
-def _filter_class() -> Any:
-    """The class `KalmanFilter` of filterpy, executed from its own file, without what that imports from its packages.
-
-    They import scipy.stats: most of a second and 40 MB in each process, for functions that are not called here.
-    """
-    unused = {
-        "filterpy.stats": SimpleNamespace(logpdf=None),
-        "filterpy.common": SimpleNamespace(pretty_str=None, reshape_z=None),
-    }
-    package = find_spec("filterpy")
-    try:
-        file = Path(package.origin).with_name("kalman") / "kalman_filter.py"  # type: ignore[union-attr, arg-type]
-        module = ModuleType("kalman_filter")
-        module.__dict__["__builtins__"] = vars(builtins) | {
-            "__import__": lambda name, *rest: unused.get(name) or __import__(name, *rest)
-        }
-        SourceFileLoader(module.__name__, str(file)).exec_module(module)
-        return module.KalmanFilter
-    except (AttributeError, ImportError, OSError):  # another version
-        from filterpy.kalman import KalmanFilter
-
-        return KalmanFilter
 
 
 def learn_motion(centres: np.ndarray, iterations: int = 5) -> Motion | None:
@@ -101,7 +69,7 @@ def _smooth(
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
-    kalman = _filter_class()(dim_x=4, dim_z=2)
+    kalman = KalmanFilter(dim_x=4, dim_z=2)
     kalman.F, kalman.H, kalman.Q, kalman.R = TRANSITION, OBSERVATION, motion.process, motion.observation
     kalman.x, kalman.P, kalman.inv = mean, covariance, _inverse
     measured = [centre if present else None for centre, present in zip(centres, _present(centres), strict=True)]

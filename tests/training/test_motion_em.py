@@ -1,12 +1,8 @@
 """Expectation maximisation of the motion, against pykalman and its own laws."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pykalman
 import pytest
-from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose, assert_array_equal
 
 from catstream.training import motion_em
@@ -43,22 +39,6 @@ def test_the_motion_model_agrees_with_pykalman_also_if_centres_are_missing(rng, 
     assert_allclose(learned.observation, expected.observation_covariance, rtol=1e-6, atol=1e-6)
     for covariance in (learned.process, learned.observation):
         assert_array_equal(covariance, covariance.T, "symmetric to the bit")
-
-
-def test_the_filter_without_the_packages_of_filterpy_returns_the_same_bits(rng, monkeypatch):
-    centres = walk(rng)
-    learned = learn_motion(centres)
-    monkeypatch.setattr(motion_em, "_filter_class", lambda: KalmanFilter)
-    expected = learn_motion(centres)
-    assert_array_equal(learned.process, expected.process)
-    assert_array_equal(learned.observation, expected.observation)
-
-
-def test_a_motion_is_learned_without_the_slow_imports_of_filterpy():
-    learn = "import sys, numpy, catstream.training.motion_em as em; em.learn_motion(numpy.ones((20, 2)))"
-    check = f"{learn}; sys.exit({{'filterpy', 'scipy.stats'}} & sys.modules.keys() or 0)"
-    found = subprocess.run([sys.executable, "-P", "-c", check], capture_output=True, text=True, check=False)
-    assert (found.returncode, found.stderr) == (0, "")
 
 
 def test_frames_before_the_first_and_after_the_last_centre_change_nothing(rng):
