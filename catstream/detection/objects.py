@@ -25,6 +25,7 @@ from catstream.messages.kinds import DetectorState, Features, Model, Track, Trac
 
 _SAME_POSITION = 0.5  # IoU above which two boxes are at the same position
 _PART = 1 / 3  # share of a box that is inside another one, above which the one is at a part of the other
+_LEAD = 0.4  # difference of score with which an uncertain object displaces a certain one
 
 
 class Detectors:
@@ -169,7 +170,7 @@ def assign(
     An object is uncertain if it was lost in the last frame, or was detected elsewhere and is not trusted since. Most
     likely it is absent, and a part of another object resembles it. So it also loses a position of which more than a
     third is in the box of a certain object, or of one with a higher score; and a certain object loses its position to
-    an uncertain one only if that has a higher score.
+    an uncertain one only if the score of that is clearly higher.
     """
     names = [name for name, state in states.items() if not state.is_sought]
     boxes = {name: detections[name].window.box(context) for name in names}
@@ -179,11 +180,13 @@ def assign(
         for name in names
         if not states[name].trusted or states[name].level == "lost" or detections[name].redetected
     }
-    certain = {  # and not outscored at its position
+    certain = {  # and not clearly outscored at its position
         name
         for name in names
         if name not in uncertain
-        and all(scores[name] >= scores[other] or not _conflict(boxes[name], boxes[other]) for other in uncertain)
+        and all(
+            scores[name] >= scores[other] - _LEAD or not _conflict(boxes[name], boxes[other]) for other in uncertain
+        )
     }
     exclusive = {
         name: [other for other in names if other != name and not _are_together(states, name, other)] for name in names

@@ -96,8 +96,8 @@ def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, c
     assert (result["ben"].score > 0) is kept
 
 
-@pytest.mark.parametrize(("score", "winner"), [(0.6, "anna"), (0.8, "ben")])
-def test_an_uncertain_object_displaces_a_certain_one_only_with_a_higher_score(score, winner):
+@pytest.mark.parametrize(("score", "winner"), [(0.6, "anna"), (1.0, "anna"), (1.2, "ben")])
+def test_an_uncertain_object_displaces_a_certain_one_only_with_a_clearly_higher_score(score, winner):
     """The certain one has nearly as good a window beside it, so its score would fall less."""
 
     def around(x, beside):
