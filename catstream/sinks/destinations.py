@@ -242,6 +242,8 @@ EXPORTS = {
         "annotations.write_yolo", "a folder: labels of each frame, and data.yaml", "", True, True, appends=True
     ),
     "via": Row("annotations.write_via", "VIA tracks, which movement and napari open", ".via.csv", images=True),
+    "dlc": Row("exports.write_dlc", "DeepLabCut: the centre of each object by its name, for movement", ".dlc.csv"),
+    "sleap": Row("exports.write_sleap", "SLEAP's analysis: the same centres, for sleap-io", ".sleap.csv"),
     "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB", appends=True),
     "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k", appends=True),
     "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment", appends=True),

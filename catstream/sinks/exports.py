@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from functools import partial
 from itertools import islice
@@ -12,6 +12,7 @@ import numpy as np
 
 from catstream.base.arrays import Float64
 from catstream.errors import VideoError
+from catstream.messages.kinds import Track
 from catstream.sinks.database import COLUMNS, rows
 from catstream.sinks.destinations import About, Origin, TrackedFrame
 from catstream.sinks.track_log import CsvSink
@@ -60,6 +61,35 @@ def write_mot(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
                 file.write(f"{track.source_frame + 1},{number},{box},{track.score:.4f},-1,-1,-1\n")
 
 
+def write_dlc(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
+    """Write the centres of the boxes in the layout of DeepLabCut, with a row for each frame of the source.
+
+    Objects are its individuals, and the score is its likelihood. A single object without a name is written as of a
+    project with a single animal, which has no line of individuals.
+    """
+    tables = _tables(frames, lambda name: name or "object")
+    heads = {"scorer": ["catstream"] * len(tables), "individuals": [*tables], "bodyparts": ["centre"] * len(tables)}
+    if [*tables] == ["object"]:
+        del heads["individuals"]
+    lines = [",".join([head, *np.repeat(words, 3)]) for head, words in heads.items()]
+    lines.append("coords" + ",x,y,likelihood" * len(tables))
+    columns = [np.column_stack([table[:, :2] + table[:, 2:4] / 2, table[:, 4]]) for table in tables.values()]
+    rows = np.column_stack([np.arange(len(columns[0])), *columns])
+    form = ["%d"] + ["%.6f"] * (rows.shape[1] - 1)
+    np.savetxt(path, rows, form, ",", header="\n".join(lines), comments="", encoding="utf-8")
+
+
+def write_sleap(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
+    """Write the centres of the boxes as SLEAP's analysis CSV, a row for each box, which sleap-io converts to `.slp`."""
+    with path.open("w", encoding="utf-8") as file:
+        file.write("track,frame_idx,instance.score,centre.x,centre.y,centre.score\n")
+        for name, track, _seconds in _named(frames, lambda name: name or "object"):
+            if track.box is not None:
+                x, y = track.box.centre
+                score = f"{track.score:.6f}"
+                file.write(f"{name},{track.source_frame},{score},{x:.6f},{y:.6f},{score}\n")
+
+
 def write_csv(frames: Iterable[TrackedFrame], path: Path, _: About) -> None:
     """Write the CSV file of a run, which tables and pandas read."""
     with closing(CsvSink(str(path), Origin())) as sink:
@@ -87,26 +117,47 @@ def _write_objects(layout: str, frames: Iterable[TrackedFrame], folder: Path, ab
     Those of times are written only if the log has them, as a CSV file has. Another object that was given the same name
     has files of its own. If `about.append`, VideoError if a file exists.
     """
-    rows: dict[tuple[str, int], dict[int, tuple[float, ...]]] = {}
-    times: dict[int, float] = {}
-    for frame in frames:
-        for track in frame.tracks:
-            row = (*(track.box or [np.nan] * 4), track.score)
-            rows.setdefault((track.object, track.began), {})[track.source_frame] = row
-            times[track.source_frame] = frame.seconds
-    names: dict[str, tuple[str, int]] = {}
-    for name, began in rows:
-        whole = f"{about.name}-{name}" if name else about.name
-        names[f"{whole}@{min(rows[name, began])}" if whole in names else whole] = (name, began)
-    files = [folder / pattern.format(name) for name in names for pattern in LAYOUTS[layout]]
+    tables = _tables(frames, lambda name: f"{about.name}-{name}" if name else about.name)
+    files = [folder / pattern.format(name) for name in tables for pattern in LAYOUTS[layout]]
     if about.append and (existing := [file for file in files if file.exists()]):
         raise VideoError(f"{existing[0]} exists already: replace it with --overwrite, or use another folder")
-    for name, key in names.items():
-        table = np.full((max(times) + 1, 6), np.nan)
-        table[list(rows[key]), :5] = list(rows[key].values())
-        table[list(times), 5] = list(times.values())
+    for name, table in tables.items():
         seconds = None if np.isnan(table[:, 5]).all() else table[:, 5]
         write_layout(layout, folder, name, table[:, :4], table[:, 4], seconds)
+
+
+def _tables(frames: Iterable[TrackedFrame], name_of: Callable[[str], str]) -> dict[str, Float64]:
+    """The table of each object by its name, as of `_named`.
+
+    A table is float64 (frames, 6), x, y, w, h, score and processing time, with a row for each frame of the source up to
+    the last one of the log; NaN if there is none.
+    """
+    rows: dict[str, dict[int, tuple[float, ...]]] = {}
+    times: dict[int, float] = {}
+    for name, track, seconds in _named(frames, name_of):
+        rows.setdefault(name, {})[track.source_frame] = (*(track.box or [np.nan] * 4), track.score)
+        times[track.source_frame] = seconds
+    tables: dict[str, Float64] = {}
+    for name, of_object in rows.items():
+        tables[name] = np.full((max(times) + 1, 6), np.nan)
+        tables[name][list(of_object), :5] = list(of_object.values())
+        tables[name][list(times), 5] = list(times.values())
+    return tables
+
+
+def _named(frames: Iterable[TrackedFrame], name_of: Callable[[str], str]) -> Iterator[tuple[str, Track, float]]:
+    """Yield the name of each object, its track, and the processing time of the frame.
+
+    The name is `name_of` that of the object, with @FRAME if another object had the same before.
+    """
+    names: dict[tuple[str, int], str] = {}
+    for frame in frames:
+        for track in frame.tracks:
+            key = track.object, track.began
+            if key not in names:
+                name = name_of(track.object)
+                names[key] = f"{name}@{track.source_frame}" if name in names.values() else name
+            yield names[key], track, frame.seconds
 
 
 write_otb = partial(_write_objects, "otb")

@@ -74,6 +74,23 @@ def test_each_object_has_three_files_with_a_row_for_every_frame(tmp_path, layout
     assert not (tmp_path / "ndjson" / files[2].format("walk")).exists(), "an NDJSON log has no processing times"
 
 
+def test_deeplabcut_and_sleap_have_the_centre_of_each_object_by_its_name(tmp_path):
+    lines = made(tmp_path / "t.dlc.csv", log=ANNOTATED).read_text().splitlines()
+    assert lines[1] == "individuals" + ",object" * 3 + ",anna" * 3 + ",anna@2" * 3
+    assert lines[2:5] == [
+        *("bodyparts" + ",centre" * 9, "coords" + ",x,y,likelihood" * 3),
+        "0,25.250000,40.000000,0.750000,5.000000,40.000000,0.750000,nan,nan,nan",
+    ]
+    assert lines[6] == "2,nan,nan,0.750000,nan,nan,nan,25.250000,40.000000,0.750000"
+    alone = made(tmp_path / "alone.dlc.csv", log=[TrackedFrame([present(2, "")])]).read_text().splitlines()
+    assert [line.split(",")[0] for line in alone] == ["scorer", "bodyparts", "coords", "0", "1", "2"]
+
+    rows = made(tmp_path / "t.sleap.csv", log=ANNOTATED).read_text().splitlines()
+    assert rows[0] == "track,frame_idx,instance.score,centre.x,centre.y,centre.score"
+    assert rows[2] == "anna,0,0.750000,5.000000,40.000000,0.750000"
+    assert [row.split(",")[:2] for row in rows[5:]] == [["anna@2", "2"], ["object", "3"]]
+
+
 def test_a_database_and_a_parquet_file_have_a_row_for_each_track(tmp_path):
     with closing(sqlite3.connect(made(tmp_path / "t.sqlite"))) as database:
         columns = "frame, seconds, state, x, w, score, model_version, pts, object"
