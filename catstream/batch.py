@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from catstream.annotation.annotation import Annotation
-from catstream.annotation.keyframes import Keyframe, by_object, format_keyframe, parse_row
+from catstream.annotation.keyframes import Keyframe, by_object, cells, format_keyframe, parse_row
 from catstream.base.box import Box
 from catstream.base.files import write_atomically, writing
 from catstream.base.settings import Settings
@@ -95,16 +95,17 @@ class Summary:
 
 
 def read_videos(table: Path) -> list[Video]:
-    """Read the videos of a table with the columns file, object, x, y, w, h, and optionally frame, by default 0.
+    """Read the videos of a table, at least one; errors as of `read_boxes` and `videos_of`."""
+    if not (boxes := read_boxes(table)):
+        raise VideoError(f"{str(table)!r} has no row: pass a CSV file file,object,x,y,w,h with a row for each box")
+    return videos_of(table, boxes)
 
-    Paths are relative to the folder of the table. An empty object has no name; `absent` in x is no box.
 
-    Raises
-    ------
-    VideoError
-        If the table cannot be read, a column is missing, a value is invalid, or two videos have the same name.
-    BoxError
-        If an object has two boxes in one frame.
+def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
+    """Read the boxes of each video from a table with the columns file, object, x, y, w, h, and optionally frame.
+
+    The frame is 0 by default. An empty object has no name; `absent` in x is no box. Raises VideoError if the table
+    cannot be read, a column is missing, or a value is invalid.
     """
     try:
         rows = list(csv.DictReader(table.read_text(encoding="utf-8-sig").splitlines(), restval=""))
@@ -112,13 +113,25 @@ def read_videos(table: Path) -> list[Video]:
         raise VideoError(
             f"cannot read the boxes in {str(table)!r} ({error}): pass a CSV file file,object,x,y,w,h"
         ) from None
-    if not rows:
-        raise VideoError(f"{str(table)!r} has no row: pass a CSV file file,object,x,y,w,h with a row for each box")
     boxes: dict[str, list[Keyframe]] = {}
     for line, row in enumerate(rows, start=2):
         if not row.get("file"):
             raise VideoError(f"{str(table)!r}, line {line}: expected the path of a video in the column file")
         boxes.setdefault(row["file"], []).append(parse_row(table, line, row | {"frame": row.get("frame") or "0"}))
+    return boxes
+
+
+def write_boxes(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> None:
+    """Write a table that `read_boxes` reads, atomically."""
+    rows = ((file, name, *cells(box), frame) for file, drawn in boxes.items() for name, frame, box in drawn)
+    _write_table(table, ("file", "object", "x", "y", "w", "h", "frame"), rows)
+
+
+def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Video]:
+    """The videos with these boxes, whose paths are relative to the folder of the table.
+
+    Raises VideoError if two have the same name, and BoxError if an object has two boxes in one frame.
+    """
     videos = []
     for file, keyframes in boxes.items():
         name = "_".join(part for part in Path(file).with_suffix("").parts if part not in ("/", "..", "."))
@@ -204,10 +217,13 @@ def read_summaries(path: Path) -> list[Summary]:
 
 def write_summaries(path: Path, summaries: Iterable[Summary]) -> None:
     """Write the rows of batch.csv, atomically."""
+    _write_table(path, [field.name for field in fields(Summary)], map(astuple, summaries))
+
+
+def _write_table(path: Path, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
     text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow([field.name for field in fields(Summary)])
-    rows.writerows(map(astuple, summaries))
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([head, *rows])
     with writing(path, VideoError):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, text.getvalue().encode(errors="surrogateescape"))
@@ -230,7 +246,7 @@ def _tracked(
             if box is None:
                 raise BoxError(f"{name or 'the object'} has no box: pass its box in at least one frame")
             begins.setdefault(frame, {})[name] = box
-    first = min(begins)
+    first = min(begins, default=0)
     source = stack.enter_context(open_source(str(video.path), part=slice(first, None), settings=settings.run))
     settings = settings.for_length(source.frames)
     head = Head(
@@ -240,7 +256,7 @@ def _tracked(
         frames=source.frames,
         start=first,
         settings=tuple(settings.changed()),
-        boxes=begins[first],
+        boxes=begins.get(first, {}),
     )
 
     def frames() -> Iterator[TrackedFrame]:

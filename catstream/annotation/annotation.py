@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -99,6 +99,7 @@ class Annotation:
     keyframes : dict of the boxes of each object, by name and frame
     counters : dict of the counters of the video by name, see `catstream.video.frames.describe_counters`
     progress : as of the parameters
+    videos : paths of the videos if each frame is of another one, see `FirstFrames`
 
     Raises
     ------
@@ -109,6 +110,8 @@ class Annotation:
     ObjectError
         For a name that is not valid, an object without a box, or too many.
     """
+
+    videos: Sequence[str] = ()
 
     def __init__(
         self,
@@ -131,9 +134,8 @@ class Annotation:
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
             self._video: Source | None
-            self._video = opened = open_source(os.fspath(video), part=part, settings=self.settings.run)
-            file = Path(self._folder.name, "frames")
-            self.frames = DecodedFrames(file, opened.size, [], opened.rate, opened.name)
+            self.frames: DecodedFrames
+            self._video, self.frames = self._open(os.fspath(video), part)
             self.set_boxes(boxes)
         except BaseException:
             self._folder.cleanup()
@@ -272,6 +274,11 @@ class Annotation:
         unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
         return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
 
+    def _open(self, video: str, part: slice) -> tuple[Source | None, DecodedFrames]:
+        """Open the video; its frames, and where they come from if they are not decoded yet."""
+        opened = open_source(video, part=part, settings=self.settings.run)
+        return opened, DecodedFrames(Path(self._folder.name, "frames"), opened.size, [], opened.rate, opened.name)
+
     def _check(self, keyframes: Mapping[str, Mapping[int, Box | None]]) -> None:
         """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as it is decoded."""
         for name, drawn in keyframes.items():
@@ -282,7 +289,7 @@ class Annotation:
                             f"frame {frame} is outside the video: pass a frame from 0 to {len(self.frames) - 1}"
                         )
                     if box is not None:
-                        box.validated(*self.frames.size)
+                        box.validated(*self.frames.size_of(frame))
 
     def _stretches(self) -> Iterator[_Stretch]:
         """Yield the stretches of all objects that have a frame."""

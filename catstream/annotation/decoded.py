@@ -40,6 +40,10 @@ class DecodedFrames:
     def __len__(self) -> int:
         return len(self.times)
 
+    def size_of(self, number: int) -> tuple[int, int]:  # noqa: ARG002  # of first frames, each has its own
+        """Width and height of a frame in pixels."""
+        return self.size
+
     def __getitem__(self, number: int) -> UInt8:
         if self.count is not None:
             file = os.open(self.count, os.O_WRONLY | os.O_APPEND)

@@ -76,10 +76,14 @@ def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, Box | None]
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(_HEADER)
     for frame, name in sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn):
-        box = keyframes[name][frame]
-        rows.writerow([frame, name, *((ABSENT, "", "", "") if box is None else (f"{side:.10g}" for side in box))])
+        rows.writerow([frame, name, *cells(keyframes[name][frame])])
     with writing(path, VideoError):
         write_atomically(path, text.getvalue().encode())
+
+
+def cells(box: Box | None) -> tuple[str, ...]:
+    """The columns x, y, w, h of a box."""
+    return (ABSENT, "", "", "") if box is None else tuple(f"{side:.10g}" for side in box)
 
 
 def by_object(keyframes: Iterable[Keyframe]) -> dict[str, dict[int, Box | None]]:

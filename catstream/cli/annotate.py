@@ -21,7 +21,9 @@ from catstream.jobs.job import Results
 
 if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation
+    from catstream.annotation.session import Session
     from catstream.sinks.track_log import RunFiles
+    from catstream.web.server import Server
 
 
 @click.command()
@@ -138,19 +140,24 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
     with Session(annotation, jobs, results.save, results.write) as session:
         server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
         results.begin()
-        with server.in_background():
-            for url in server.urls:
-                click.echo(url)
-            with suppress(KeyboardInterrupt):
-                while not session.finished.wait(0.5):
-                    pass  # without a limit, a signal that arrives just before it waits is handled after it only
-    interrupted = not session.finished.is_set()
+        interrupted = wait_for(session, server)
     if interrupted and session.decoded:
         with INTERRUPTS.deferred():
             results.write()
     if session.problem is not None:
         raise session.problem
     return interrupted
+
+
+def wait_for(session: Session, server: Server) -> bool:
+    """Serve the page of a session until it is done or interrupted; return whether it was interrupted."""
+    with server.in_background():
+        for url in server.urls:
+            click.echo(url)
+        with suppress(KeyboardInterrupt):
+            while not session.finished.wait(0.5):
+                pass  # without a limit, a signal that arrives just before it waits is handled after it only
+    return not session.finished.is_set()
 
 
 def _show(bar: Progress, work: str, done: int, total: int | None) -> None:

@@ -3,7 +3,7 @@
 /                the page
 /events          the state of the session as server-sent events, at most ten per second
 /frames/N.jpg    the picture of a frame
-/frames/N        what the passes say about the objects in it
+/frames/N        its size, and what the passes say about the objects in it
 /edit            POST a change: the fields of `Edit`
 """
 
@@ -62,7 +62,7 @@ class AnnotationSite:
         )
 
     def _frame(self, request: Request) -> Response:
-        """The box of each object in a frame, and the proposals if it is unchecked."""
+        """The size of a frame, the box of each object in it, and the proposals if it is unchecked."""
         number, session = self._number(request), self._session
         objects = {}
         with session.lock:
@@ -76,7 +76,7 @@ class AnnotationSite:
                     "checked": "keyframe" if number in drawn else check,
                     "proposals": [[_rounded(proposals[way])] if way in proposals else None for way in (True, False)],
                 }
-        return JSONResponse(objects)
+        return JSONResponse({"size": session.annotation.frames.size_of(number), "objects": objects})
 
     def _number(self, request: Request) -> int:
         number: int = request.path_params["number"]
@@ -129,7 +129,7 @@ class AnnotationSite:
         return {
             "server": self._id,
             "video": frames.name,
-            "size": frames.size,
+            "videos": session.annotation.videos,
             "frames": len(frames),
             "decoded": session.decoded,
             "objects": objects,

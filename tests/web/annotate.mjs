@@ -1,10 +1,10 @@
 // What a person does on the page of catstream annotate, by mouse and keys; says what was seen, a line each.
 //   node annotate.mjs URL CHROMIUM PROFILE BOXES WIDTH HEIGHT, with the boxes in the first and the last frame as JSON
 
-import { axe, errorsOf, patience, placeOf, violationsOf, withBrowser } from "./browser.mjs";
+import { axe, drawOn, errorsOf, patience, violationsOf, withBrowser } from "./browser.mjs";
 
 const [url, executablePath, profile, boxes, ...size] = process.argv.slice(2);
-const [first, last] = JSON.parse(boxes), [width, height] = size.map(Number);
+const [first, last] = JSON.parse(boxes);
 
 await withBrowser(executablePath, profile, async (browser) => {
   const page = await browser.newPage();
@@ -13,16 +13,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await page.goto(url);
   const text = (selector) => page.locator(selector).innerText();
   const says = (selector, words) => page.waitForFunction(([each, wanted]) => document.querySelector(each).textContent.includes(wanted), [selector, words], patience);
-  const draw = async ([x, y, w, h]) => {
-    const view = await placeOf(page, "#picture");
-    const scale = Math.min(view.width / width, view.height / height);
-    const [left, top] = [view.x + (view.width - width * scale) / 2, view.y + (view.height - height * scale) / 2];
-    await page.mouse.move(left + x * scale, top + y * scale);
-    await page.mouse.down();
-    await page.mouse.move(left + (x + w / 2) * scale, top + (y + h / 2) * scale);
-    await page.mouse.move(left + (x + w) * scale, top + (y + h) * scale);
-    await page.mouse.up();
-  };
+  const draw = (box) => drawOn(page, size.map(Number), box);
   const name = async (words) => {
     await page.fill("#name", words);
     await page.press("#name", "Enter");
@@ -80,6 +71,8 @@ await withBrowser(executablePath, profile, async (browser) => {
   await name("carl");
   await says("#timelines", "carl");
   await says("#check", "carl in frame 23: your box");
+  await keys("Control+z"); // the new name
+  await says("#check", "ben in frame 23: your box");
   await keys("Control+z");
   await undone();
   await page.locator("#timelines svg").first().click();

@@ -33,6 +33,18 @@ export function placeOf(page, selector) {
   return page.evaluate((each) => document.querySelector(each).getBoundingClientRect().toJSON(), selector);
 }
 
+/** Draw a box, in pixels of a frame of this size, by mouse in the picture of the page. */
+export async function drawOn(page, [width, height], [x, y, w, h]) {
+  const view = await placeOf(page, "#picture");
+  const scale = Math.min(view.width / width, view.height / height);
+  const [left, top] = [view.x + (view.width - width * scale) / 2, view.y + (view.height - height * scale) / 2];
+  await page.mouse.move(left + x * scale, top + y * scale);
+  await page.mouse.down();
+  await page.mouse.move(left + (x + w / 2) * scale, top + (y + h / 2) * scale);
+  await page.mouse.move(left + (x + w) * scale, top + (y + h) * scale);
+  await page.mouse.up();
+}
+
 /** What axe, which the page has evaluated, finds wrong with it. */
 export async function violationsOf(page) {
   const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));

@@ -64,7 +64,8 @@ def test_boxes_are_drawn_marked_absent_renamed_and_undone(page, edit, demo):
     assert edit("rename", object="anna", name="ben") == (200, {"done": True})
     (ben,) = state(page)["objects"]
     assert (ben["name"], ben["keyframes"]) == ("ben", [0, 11])
-    assert page.get("/frames/11").json()["ben"] == {"box": None, "checked": "keyframe", "proposals": [None, None]}
+    frame = page.get("/frames/11").json()
+    assert frame["objects"]["ben"] == {"box": None, "checked": "keyframe", "proposals": [None, None]}
     assert edit("undo") == (200, {"done": True, "object": "anna", "frame": None})
     assert edit("undo") == (200, {"done": True, "object": "anna", "frame": 11})
 
@@ -75,7 +76,7 @@ def test_an_unchecked_frame_has_the_proposals_of_both_directions(page, edit, dem
     until(lambda: session.revision > 2 and not session.remaining())
     (anna,) = state(page)["objects"]
     assert anna["unchecked"]
-    forward, backward = page.get("/frames/6").json()["anna"]["proposals"]
+    forward, backward = page.get("/frames/6").json()["objects"]["anna"]["proposals"]
     assert forward != backward
     assert [frame for frame, name, _ in state(page)["next"]] != []
 

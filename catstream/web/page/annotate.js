@@ -1,4 +1,5 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
+// That of `catstream batch --ask` is the same, with the first frame of each video, and nothing to check.
 
 import { $, add, duration, Items, make, many, post, write } from "./dom.js";
 import { Stage } from "./stage.js";
@@ -83,13 +84,20 @@ class AnnotatePage {
   }
 
   /** Go to a frame, and choose an object. */
-  go(frame, name = this.chosen) {
+  go(frame, name = this.missing(frame)) {
     this.stage.cancel();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
     this.boxes = {}; // those of another frame cannot be taken
     if (name !== this.chosen) this.choose(name);
     this.show();
     this.load();
+  }
+
+  /** The object to draw in the first frame of a video: the first one without a box but one that was drawn now. */
+  missing(frame, drawn = null) {
+    const { state, chosen } = this;
+    const missing = state?.videos.length ? state.objects.find(({ name, keyframes }) => name !== drawn && !keyframes.includes(frame)) : null;
+    return missing?.name ?? chosen;
   }
 
   jump(frame, name) {
@@ -104,10 +112,11 @@ class AnnotatePage {
     this.loading = true;
     while (this.wanted) {
       this.wanted = false;
-      const { frame, state: { size: [width, height] } } = this;
-      const boxes = await fetch(`frames/${frame}`).then((answer) => answer.ok && answer.json(), () => null);
-      if (!boxes) continue;
-      this.boxes = boxes;
+      const { frame } = this;
+      const answer = await fetch(`frames/${frame}`).then((response) => response.ok && response.json(), () => null);
+      if (!answer) continue;
+      const { size: [width, height], objects } = answer;
+      this.boxes = objects;
       if (this.stage.picture?.frame !== frame) await this.stage.show({ frame, width, height, boxes: {} });
       this.showBoxes();
       this.show();
@@ -126,7 +135,7 @@ class AnnotatePage {
   get check() {
     const { box, checked, proposals } = this.boxes[this.chosen] ?? {};
     if (!checked) return "";
-    if (checked === "unchecked" && !proposals.some(Boolean)) return "not tracked yet";
+    if (checked === "unchecked" && !proposals.some(Boolean)) return this.state.videos.length ? "no box" : "not tracked yet";
     return (box ? "" : "absent, ") + CHECKS[checked];
   }
 
@@ -152,6 +161,7 @@ class AnnotatePage {
     const object = this.chosen ?? $("#name").value.trim();
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
     if (answer && this.chosen === null) this.choose(object.normalize("NFC"));
+    if (answer && this.state.videos.length) this.choose(this.missing(frame, this.chosen));
     return answer;
   }
 
@@ -181,7 +191,7 @@ class AnnotatePage {
   }
 
   async done() {
-    if (await this.send("done")) this.end("Done: the results are written, and the command has ended. This tab can be closed.");
+    if (await this.send("done")) this.end(`Done: ${this.state.videos.length ? "the command tracks the videos now" : "the results are written, and the command has ended"}. This tab can be closed.`);
   }
 
   /** Show no other state from now on, but the reason. */
@@ -193,6 +203,8 @@ class AnnotatePage {
 
   /** The frames to look at next, but this one. */
   get following() {
+    const { videos, frames } = this.state ?? { videos: [] }, next = this.frame + 1;
+    if (videos.length) return next < frames ? [[next, this.missing(next), 0]] : [];
     return (this.state?.next ?? []).filter(([frame, name]) => frame !== this.frame || name !== this.chosen);
   }
 
@@ -204,6 +216,7 @@ class AnnotatePage {
   key(event) {
     const { key, target } = event;
     const steps = { ArrowLeft: -1, ArrowRight: 1, PageUp: -JUMP, PageDown: JUMP, Home: -Infinity, End: Infinity };
+    if (key === "Enter" && (event.ctrlKey || event.metaKey)) return $("#done").click();
     if (target.id === "name" || event.altKey || (event.ctrlKey || event.metaKey) !== (key === "z")) return;
     if (this.stage.drawing) return this.stage.key(event);
     if (key in steps) this.go(this.frame + steps[key]);
@@ -227,7 +240,7 @@ class AnnotatePage {
     return { element, choose, line, share: add(element, "span", { className: "share number" }) };
   }
 
-  fillRow({ element, choose, line, share }, { name, colour, keyframes, unchecked, frames, frame, chosen }) {
+  fillRow({ element, choose, line, share }, { name, colour, keyframes, unchecked, frames, frame, chosen, several }) {
     element.style.setProperty("--colour", colour);
     choose.setAttribute("aria-pressed", String(chosen));
     const bar = (kind, first, last) => make("rect", { class: kind, x: first, width: last - first + 1, y: 1, height: 3 });
@@ -238,7 +251,7 @@ class AnnotatePage {
     const wrong = unchecked.reduce((sum, [first, last]) => sum + last - first + 1, 0);
     const percent = Math.floor(100 * (1 - wrong / frames));
     write(share, `${percent}%`);
-    line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the frames checked`);
+    line.setAttribute("aria-label", `${name}: ${many(keyframes.length, "box", "boxes")}, ${percent} % of the ${several ? "videos" : "frames checked"}`);
   }
 
   show() {
@@ -249,29 +262,33 @@ class AnnotatePage {
     write($("#state b"), words);
     write($("#overlay"), this.overlay());
     if (!state) return;
-    write($("#source"), state.video);
-    document.title = `${state.video} – catstream annotate`;
+    const several = state.videos.length > 0, video = several ? state.videos[frame] : state.video, command = `catstream ${several ? "batch" : "annotate"}`;
+    write($("#source"), video);
+    write($("h1"), command);
+    document.title = `${video} – ${command}`;
     write($("#problem"), state.problem);
     Object.assign($("#slider"), { max: state.frames - 1, value: frame });
-    write($("#frame"), `${frame} of ${state.frames}`);
+    write($("#frame"), `${several ? `video ${frame + 1}` : frame} of ${state.frames}`);
     $("#naming").style.setProperty("--colour", known?.colour ?? "transparent");
-    write($("#check"), known ? `${chosen || "The object"} in frame ${frame}: ${this.check}` : "A new object: draw its box");
+    write($("#check"), known ? `${chosen || "The object"}${several ? "" : ` in frame ${frame}`}: ${this.check}` : "A new object: draw its box");
     for (const [id, name] of [["first", "1 forwards"], ["second", "2 backwards"]]) {
       write($(`#${id} span`), `Take ${name.slice(2)}${name in proposals && !proposals[name] ? ": absent" : ""}`);
       $(`#${id}`).disabled = !(name in proposals);
     }
     const [[place, name, errors] = []] = following;
     const all = objects.length && state.decoded && !state.next.length && !state.remaining;
-    write($("#next span"), place !== undefined ? `Look next at frame ${place}, ${name || "the object"}: about ${many(Math.max(1, Math.round(errors)), "frame")} around it may be wrong`
+    write($("#next span"), several ? (place === undefined ? "No other video: Done begins to track" : "Next video")
+      : place !== undefined ? `Look next at frame ${place}, ${name || "the object"}: about ${many(Math.max(1, Math.round(errors)), "frame")} around it may be wrong`
       : all ? "All frames are checked" : state.next.length ? "Draw the box here, or take one" : objects.length ? "Tracking" : "Draw the first box");
     const off = silent || ended;
     $("#next").disabled = off || place === undefined;
-    $("#absent").disabled = off || !known;
+    $("#absent").disabled = off || !known || several;
+    for (const id of ["first", "second", "absent", "legend"]) $(`#${id}`).hidden = several;
     $("#undo").disabled = off || !state.undo;
     $("#back").disabled = !this.visited.length;
     for (const id of ["draw", "new", "done", "name"]) $(`#${id}`).disabled = off;
     $("#objects").hidden = !objects.length;
-    this.rows.show(objects.map((one) => [one.name, { ...one, frames: state.frames, frame, chosen: one.name === chosen }]));
+    this.rows.show(objects.map((one) => [one.name, { ...one, frames: state.frames, frame, chosen: one.name === chosen, several }]));
   }
 
   /** What the server does, as a state for its colour and in words. */

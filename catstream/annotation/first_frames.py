@@ -1,0 +1,93 @@
+"""Boxes in the first frames of several videos: an annotation with one frame for each video, which tracks nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from catstream.annotation.annotation import Annotation, Progress, Task
+from catstream.annotation.decoded import DecodedFrames, decode
+from catstream.annotation.keyframes import Keyframe, by_object
+from catstream.base.arrays import UInt8
+from catstream.base.settings import Settings
+from catstream.errors import VideoError
+from catstream.video.source import open_source
+
+_FIRST = slice(0, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames(DecodedFrames):
+    """The first frame of each of `videos`."""
+
+    videos: list[DecodedFrames] = field(default_factory=list)
+
+    def __getitem__(self, number: int) -> UInt8:
+        return self.videos[number][0]
+
+    def size_of(self, number: int) -> tuple[int, int]:
+        return self.videos[number].size
+
+
+class FirstFrames(Annotation):
+    """The boxes of objects in the first frames of videos, whose numbers are those of the frames.
+
+    Parameters
+    ----------
+    folder : folder to which the paths of videos are relative
+    boxes : mapping of the path of each video to its boxes, of which those in frame 0 are shown and changed
+    settings : for the readers of the videos
+    progress : function that is called after each video
+
+    Attributes
+    ----------
+    videos : paths of the videos that can be read
+    errors : dict of the reason why each other video cannot be read, by its path
+    """
+
+    def __init__(
+        self, folder: Path, boxes: Mapping[str, Sequence[Keyframe]], settings: Settings, progress: Progress
+    ) -> None:
+        self.videos: list[str] = []
+        self.errors: dict[str, VideoError] = {}
+        self._boxes = boxes
+        super().__init__(folder, {}, settings, jobs=1, progress=progress)
+        shown = ((number, key) for number, file in enumerate(self.videos) for key in boxes[file] if _is_shown(key))
+        self.set_boxes(by_object((name, number, box) for number, (name, _, box) in shown))
+
+    @property
+    def boxes(self) -> dict[str, list[Keyframe]]:
+        """The boxes of each video by its path, also those in other frames, and of videos that cannot be read."""
+        boxes = {
+            file: [key for key in keyframes if file in self.errors or not _is_shown(key)]
+            for file, keyframes in self._boxes.items()
+        }
+        for name, drawn in self.keyframes.items():
+            for number, box in drawn.items():
+                boxes[self.videos[number]].append((name, 0, box))
+        return boxes
+
+    def missing(self) -> list[Task]:
+        return []
+
+    def _open(self, video: str, _: slice) -> tuple[None, DecodedFrames]:
+        frames = _Frames(Path(self._folder.name), (0, 0), [], 0.0, "")
+        for number, file in enumerate(self._boxes):
+            try:
+                source = open_source(Path(video) / file, part=_FIRST, settings=self.settings.run)
+                first = DecodedFrames(frames.path / str(number), source.size, [], source.rate, file)
+                decode(source, first, lambda *_: None)
+            except VideoError as error:
+                self.errors[file] = error
+            else:
+                self.videos.append(file)
+                frames.videos.append(first)
+                frames.times.extend(first.times)
+            self.progress("opening", number + 1, len(self._boxes))
+        return None, frames
+
+
+def _is_shown(keyframe: Keyframe) -> bool:
+    _, frame, box = keyframe
+    return frame == 0 and box is not None
