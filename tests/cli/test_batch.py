@@ -108,6 +108,11 @@ def test_a_table_that_cannot_be_used_is_an_error_of_one_line(fail, tmp_path, row
     assert not (tmp_path / "out").exists()
 
 
+def test_videos_without_ask_and_ask_without_videos_are_refused(fail, tmp_path):
+    for words in (["a.mp4", "b.mp4"], ["--ask"], []):
+        assert "expected one file BOXES, or videos after --ask" in fail("batch", *words, "--output", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("row", "message"),
     [
