@@ -167,19 +167,15 @@ def assign(
     are `together` may be at the same position, and an object that is still sought occupies none. Without a conflict, a
     detection is unchanged. The windows are `context` times as large as the boxes of the objects.
 
-    An object is uncertain if it was lost in the last frame, or was detected elsewhere and is not trusted since. Most
-    likely it is absent, and a part of another object resembles it. So it also loses a position of which more than a
-    third is in the box of a certain object, or of one with a higher score; and a certain object loses its position to
-    an uncertain one only if the score of that is clearly higher.
+    An object is uncertain if it was not "confident" in the last frame, or is redetected. Most likely it is absent or
+    occluded, and a part of another object resembles it. So it also loses a position of which more than a third is in
+    the box of a certain object, or of one with a higher score; and a certain object loses its position to an uncertain
+    one only if the score of that is clearly higher.
     """
     names = [name for name, state in states.items() if not state.is_sought]
     boxes = {name: detections[name].window.box(context) for name in names}
     scores = {name: detections[name].score for name in names}
-    uncertain = {
-        name
-        for name in names
-        if not states[name].trusted or states[name].level == "lost" or detections[name].redetected
-    }
+    uncertain = {name for name in names if states[name].level != "confident" or detections[name].redetected}
     certain = {  # and not clearly outscored at its position
         name
         for name in names

@@ -26,6 +26,8 @@ def state(x, first_frame=0):
     return DetectorState(first_frame, "confident", window, window, window)
 
 
+UNCERTAIN = ["lost", "redetected", "weak"]
+LEVELS = ["confident", *UNCERTAIN]
 APART = {"anna": state(20), "ben": state(200)}
 
 
@@ -59,7 +61,8 @@ def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
 
 
 @given(
-    st.lists(st.tuples(st.floats(0.1, 1), st.integers(80, 140), st.booleans()), min_size=2, max_size=5), st.randoms()
+    st.lists(st.tuples(st.floats(0.1, 1), st.integers(80, 140), st.sampled_from(LEVELS)), min_size=2, max_size=5),
+    st.randoms(),
 )
 def test_no_two_objects_ever_have_one_place(objects, random):
     def around(x):
@@ -67,7 +70,7 @@ def test_no_two_objects_ever_have_one_place(objects, random):
         return ScoreMap(None, scores, (x - 20.0, 40.0), (5.0, 5.0))
 
     found = {str(i): detection(score, x, around(x)) for i, (score, x, _) in enumerate(objects)}
-    states = {str(i): replace(state(100 * i), trusted=trusted) for i, (_, _, trusted) in enumerate(objects)}
+    states = {str(i): replace(state(100 * i), level=level) for i, (_, _, level) in enumerate(objects)}
     result = assign(found, states, CONTEXT)
     boxes = [each.window.box(CONTEXT) for each in result.values() if each.score > 0]
     assert boxes
@@ -85,13 +88,13 @@ def test_objects_that_are_together_may_stay_at_one_place():
 
 @pytest.mark.parametrize(("side", "score"), [(40, 0.7), (40, 0.9), (15, 0.9)])
 @pytest.mark.parametrize(
-    ("change", "redetected", "kept"),
-    [({}, False, True), ({"trusted": False}, False, False), ({}, True, False), ({"level": "lost"}, False, False)],
+    ("level", "redetected", "kept"),
+    [("confident", False, True), ("confident", True, False), *[(level, False, False) for level in UNCERTAIN]],
 )
-def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, change, redetected, kept):
+def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, level, redetected, kept):
     part = Window.around(Box(122, 60, side, side), CONTEXT)
     found = {"anna": detection(0.8, 100), "ben": Detection(score, part, redetected=redetected)}
-    result = assign(found, APART | {"ben": replace(APART["ben"], **change)}, CONTEXT)
+    result = assign(found, APART | {"ben": replace(APART["ben"], level=level)}, CONTEXT)
     assert result["anna"] is found["anna"]
     assert (result["ben"].score > 0) is kept
 
@@ -106,7 +109,7 @@ def test_an_uncertain_object_displaces_a_certain_one_only_with_a_clearly_higher_
         return ScoreMap(None, scores, (x - 25.0, 45.0), (5.0, 5.0))
 
     found = {"anna": detection(0.7, 100, around(100, 0.65)), "ben": detection(score, 104, around(104, 0.1))}
-    result = assign(found, APART | {"ben": replace(APART["ben"], trusted=False)}, CONTEXT)
+    result = assign(found, APART | {"ben": replace(APART["ben"], level="redetected")}, CONTEXT)
     assert result[winner] is found[winner]
     assert [name for name in found if result[name] is found[name]] == [winner]
 
