@@ -238,7 +238,7 @@ class LiveSource(Source):
                 if stream.codec_context.name != "h264":
                     raise ValueError(f"{stream.codec_context.name} needs the parser")
                 stream.codec_context.flags2 |= Flags2.chunks
-            if self._measures_rate:
+            if self._measures_rate and units is None:  # without the parser, FFmpeg states the clock of RTP, 90 kHz
                 self.rate = float(stream.average_rate or stream.guessed_rate or RATE)
             now, backlog = monotonic(), Backlog()
             for packet in container.demux():
