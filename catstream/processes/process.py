@@ -40,9 +40,9 @@ TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look 
 MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
 HEALTH_SECONDS = 1.0  #: between two health reports of a process
 
-#: Of the compressor and the trainer of a live source: the next frame does not wait for either of them. A file is
-#: tracked as fast as all three processes allow.
-_LIVE_NICENESS = 10
+#: Of the compressor and the trainer of a live source: the next frame does not wait for either of them. With 10, a busy
+#: machine starves the compressor, until frames wait for it. A file is tracked as fast as all three processes allow.
+_LIVE_NICENESS = 5
 
 _log = logging.getLogger(__name__)
 
