@@ -202,7 +202,7 @@ def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(sta
     assert "secret" not in Path(f"/proc/{process.pid}/cmdline").read_text()
 
 
-@pytest.mark.parametrize(("source", "more"), [("rtsp://10.0.0.7/gate", 10), ("a.mp4", 0)])
+@pytest.mark.parametrize(("source", "more"), [("rtsp://10.0.0.7/gate", 5), ("a.mp4", 0)])
 def test_training_has_a_lower_priority_than_detection_if_the_source_is_live(start, folder, until, source, more):
     process, _, _ = start(Job(source, endpoint=str(folder)).save(folder))
     trainer = psutil.Process(process.pid)
