@@ -250,14 +250,13 @@ def _conflict(box: Box, other: Box, uncertain: bool = False) -> bool:
 
 def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, uncertain: bool) -> Detection:
     """The best window near a detection that is at none of the occupied positions."""
-    if detection.around is not None:
-        scores = detection.around.scores.copy()
-        for row, column in np.ndindex(scores.shape):
-            box = detection.around.window(row, column).box(context)
-            if any(_conflict(box, other, uncertain) for other in occupied):
-                scores[row, column] = -np.inf
-        row, column = map(int, np.unravel_index(scores.argmax(), scores.shape))
-        if scores[row, column] > 0:
-            # Elsewhere in the frame, it is redetected there too: its object is not trusted.
-            return replace(detection, score=float(scores[row, column]), window=detection.around.window(row, column))
+    if (around := detection.around) is not None:
+        for index in np.argsort(-around.scores, axis=None, kind="stable"):
+            row, column = map(int, np.unravel_index(index, around.scores.shape))
+            if (score := float(around.scores[row, column])) <= 0:
+                break
+            window = around.window(row, column)
+            if not any(_conflict(window.box(context), other, uncertain) for other in occupied):
+                # Elsewhere in the frame, it is redetected there too: its object is not trusted.
+                return replace(detection, score=score, window=window)
     return replace(detection, score=0.0, redetected=False)
