@@ -26,6 +26,7 @@ from catstream.errors import BoxError, FrameError, ObjectError
 from catstream.features.descriptor import descriptor_of
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Features, Track, Tracks
+from catstream.training import motion_em
 from catstream.training.trainer import Trainer
 from catstream.video.frames import as_bgr
 
@@ -58,6 +59,7 @@ class MultiTracker:
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
         descriptor_of(self.settings)  # loads the network, if there is one, so that an error is raised here
+        motion_em.prepare()  # before the first frame: a later one would wait for it
         self._tracks: dict[str, Track] | None = None
 
     def __repr__(self) -> str:

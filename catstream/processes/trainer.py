@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from threading import Thread
+
 from catstream.messages.kinds import End
 from catstream.processes.process import MESSAGE_SECONDS, Process
+from catstream.training import motion_em
 from catstream.training.trainer import Trainer
 from catstream.wire.channels import MODELS, SAMPLES
 from catstream.wire.newest import Publisher, Subscriber
@@ -13,6 +16,7 @@ _NONE = {"version": 0.0, "trained": 0.0}
 
 def main(process: Process) -> None:
     """Train a model from each sample that arrives, until the stream ends; the objects take turns."""
+    Thread(target=motion_em.prepare).start()  # the first models need no motion, and do not wait for it
     trainer = Trainer(process.settings)
     trained: dict[str, dict[str, float]] = {}
     with Subscriber(SAMPLES, process.endpoint) as samples, Publisher(MODELS, process.endpoint) as models:

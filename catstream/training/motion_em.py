@@ -7,7 +7,6 @@ measured with observation noise. EM estimates the covariances of both from the m
 from __future__ import annotations
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from catstream.base.arrays import Bool, Float64
 from catstream.messages.kinds import Motion
@@ -16,6 +15,11 @@ from catstream.numerics.kalman import OBSERVATION, TRANSITION
 FEWEST = 8  #: centres that 13 free parameters can be estimated from
 PROCESS_FLOOR = 1e-4  #: smallest variance of the process, pixels squared: 0.01 pixels a frame
 OBSERVATION_FLOOR = 1e-2  #: smallest variance of a measured centre, pixels squared: 0.1 pixels
+
+
+def prepare() -> None:
+    """Import filterpy: most of a second, with scipy.stats. Otherwise the first estimate does."""
+    import filterpy.kalman  # noqa: F401
 
 
 def learn_motion(centres: np.ndarray, iterations: int = 5) -> Motion | None:
@@ -69,6 +73,8 @@ def _smooth(
 
     A Kalman filter forwards, then the smoother of Rauch, Tung and Striebel backwards.
     """
+    from filterpy.kalman import KalmanFilter
+
     kalman = KalmanFilter(dim_x=4, dim_z=2)
     kalman.F, kalman.H, kalman.Q, kalman.R = TRANSITION, OBSERVATION, motion.process, motion.observation
     kalman.x, kalman.P, kalman.inv = mean, covariance, _inverse
