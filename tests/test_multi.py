@@ -218,7 +218,7 @@ def test_an_object_that_left_is_absent_where_a_part_of_another_one_resembles_it(
 
 
 def test_objects_are_together_from_their_first_frame_until_they_are_apart(frames):
-    """Whether they begin in one frame or one after the other."""
+    """They are so if they begin in one frame, and if one begins after the other."""
     for later in (0, 2):
         tracker = MultiTracker()
         tracker.init(frames[0], {"anna": box_of("anna", 0)} | ({} if later else {"face": (50, 35, 20, 20)}))

@@ -256,8 +256,8 @@ class Annotation:
         boxes: dict[bool, Box | None] = {}
         for stretch in self._stretches():
             if stretch.object == name and stretch.start <= frame < stretch.stop:
-                here = [(part, abs(frame - part.start) - 1) for part in self._parts(stretch)]
-                for part, place in sorted(here, key=lambda one: one[0].scores[one[1]]):  # the best one last
+                candidates = [(part, abs(frame - part.start) - 1) for part in self._parts(stretch)]
+                for part, place in sorted(candidates, key=lambda one: one[0].scores[one[1]]):  # the best one last
                     boxes[part.is_forward] = box_of(part.boxes[place])
         return boxes
 

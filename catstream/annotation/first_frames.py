@@ -31,12 +31,12 @@ class _Frames(DecodedFrames):
 
 
 class FirstFrames(Annotation):
-    """The boxes of objects in the first frames of videos, whose numbers are those of the frames.
+    """An annotation whose frame N is the first frame of video N.
 
     Parameters
     ----------
     folder : folder to which the paths of videos are relative
-    boxes : mapping of the path of each video to its boxes, of which those in frame 0 are shown and changed
+    boxes : mapping of the path of each video to its boxes, of which those in frame 0 can be edited
     settings : for the readers of the videos
     progress : function that is called after each video
 
@@ -53,14 +53,16 @@ class FirstFrames(Annotation):
         self.errors: dict[str, VideoError] = {}
         self._boxes = boxes
         super().__init__(folder, {}, settings, jobs=1, progress=progress)
-        shown = ((number, key) for number, file in enumerate(self.videos) for key in boxes[file] if _is_shown(key))
-        self.set_boxes(by_object((name, number, box) for number, (name, _, box) in shown))
+        editable = (
+            (number, key) for number, file in enumerate(self.videos) for key in boxes[file] if _is_editable(key)
+        )
+        self.set_boxes(by_object((name, number, box) for number, (name, _, box) in editable))
 
     @property
     def boxes(self) -> dict[str, list[Keyframe]]:
         """The boxes of each video by its path, also those in other frames, and of videos that cannot be read."""
         boxes = {
-            file: [key for key in keyframes if file in self.errors or not _is_shown(key)]
+            file: [key for key in keyframes if file in self.errors or not _is_editable(key)]
             for file, keyframes in self._boxes.items()
         }
         for name, drawn in self.keyframes.items():
@@ -88,6 +90,6 @@ class FirstFrames(Annotation):
         return None, frames
 
 
-def _is_shown(keyframe: Keyframe) -> bool:
+def _is_editable(keyframe: Keyframe) -> bool:
     _, frame, box = keyframe
     return frame == 0 and box is not None

@@ -104,7 +104,7 @@ def batch(
     if not (overwrite or path.exists()):  # if it exists, all files there are of this batch
         check_results(videos, output)
     if ask:
-        videos = _drawn(drawn, boxes, settings, listen, token)
+        videos = _ask_for_boxes(drawn, boxes, settings, listen, token)
     complete = {} if overwrite else {row.video: row for row in read_summaries(path) if not row.error}
     rows = {video.name: complete.get(video.file) for video in videos}
     missing = [video for video in videos if (row := rows[video.name]) is None or row.boxes != video.boxes]
@@ -135,7 +135,7 @@ def _relative(file: Path, folder: Path) -> str:
     return os.path.relpath(file.parent.resolve() / file.name, folder.resolve())
 
 
-def _drawn(
+def _ask_for_boxes(
     path: Path, boxes: dict[str, list[Keyframe]], settings: Settings, listen: HostPort, token: str | None
 ) -> list[Video]:
     """Serve the page on which boxes are drawn until it is done; return the videos with boxes, and unreadable ones."""

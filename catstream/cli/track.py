@@ -493,7 +493,7 @@ class RunProgress:
 
     @property
     def _counters(self) -> dict[str, float]:
-        """The counters of the detector: the final ones, or before the end those of its last report."""
+        """The counters of the detector: the totals at the end of the run, before it those of the last health report."""
         return self._pipeline.health.get("detector", {}) | self._pipeline.totals
 
     def _rate(self) -> float:

@@ -135,7 +135,7 @@ class Detectors:
         detectors = {name: detector for name, detector in self.detectors.items() if name not in results}
         before = {name: detector.state for name, detector in self.detectors.items() if detector.state is not None}
         for name in detectors.keys() & before.keys():
-            detectors[name].state = _parted(before[name], before, self.settings.search.context)
+            detectors[name].state = _without_separated(before[name], before, self.settings.search.context)
         detections = {name: detector.search(frame, self.seq) for name, detector in detectors.items()}
         states = {name: detector.state for name, detector in detectors.items() if detector.state is not None}
         detections = assign(detections, states, self.settings.search.context)
@@ -224,7 +224,7 @@ def _are_together(states: Mapping[str, DetectorState], name: str, other: str) ->
     return first.together.get(other) == second.first_frame or second.together.get(name) == first.first_frame
 
 
-def _parted(state: DetectorState, states: Mapping[str, DetectorState], context: float) -> DetectorState:
+def _without_separated(state: DetectorState, states: Mapping[str, DetectorState], context: float) -> DetectorState:
     """The state of an object without the objects that it was together with, and that are confidently apart by now."""
     if not state.together:
         return state

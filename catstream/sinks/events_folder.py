@@ -32,16 +32,16 @@ from catstream.video.writer import ANNOTATED, VideoWriter
 
 _OURS = re.compile(r"\d{8}T\d{6}\.\d{3}Z-.*\.(jpg|mp4)")
 _UNSAFE = re.compile(r"[^\w.]+")
-_TRACKS = 1024  # frames whose tracks are kept for the pictures
+_TRACKS = 1024  # frames whose tracks are stored for the pictures
 _CLIP_SECONDS = 5.0  # before and after an event; also without a picture, after which a clip ends
-_PICTURES = 256  # that are kept for clips, of ten a second at most: about 15 MB
+_PICTURES = 256  # capacity of the buffer for clips, which gets ten a second at most: about 15 MB
 _RATE = 10.0  # average of pictures per second in a clip
 
 
 class EventsFolder:
     """Writes the pictures; a folder that cannot be written to is a warning, and the run continues.
 
-    A thread encodes the clips, one after another, from the pictures that are kept. If it is late by more than 15 s, the
+    A thread encodes the clips, one after another, from the buffered pictures. If it is late by more than 15 s, the
     first pictures of the next clip are missing.
     """
 
@@ -113,12 +113,12 @@ class EventsFolder:
                 self._add(file)
         if self._clips and self._encoded is None:
             (file, middle), pictures = self._clips[0], self._events.pictures
-            is_silent = time.monotonic() - self._events.arrived >= _CLIP_SECONDS
+            is_silent = time.monotonic() - self._events.last_arrival >= _CLIP_SECONDS
             if is_last or is_silent or abs(pictures[-1].time - middle) >= _CLIP_SECONDS:
                 self._clips.popleft()
                 near = (picture for picture in pictures if abs(picture.time - middle) <= _CLIP_SECONDS)
-                shown = [(picture, self._tracks.get(picture.frame, [])) for picture in near]
-                self._encoded = file, self._encoder.submit(_write_clip, file, shown, deepcopy(self._colours))
+                pictured = [(picture, self._tracks.get(picture.frame, [])) for picture in near]
+                self._encoded = file, self._encoder.submit(_write_clip, file, pictured, deepcopy(self._colours))
 
     def _failed(self, what: str, error: Exception) -> None:
         self._warnings.failed(f"a {what} is missing ({getattr(error, 'strerror', None) or error})")
@@ -133,9 +133,9 @@ class EventsFolder:
                 self._files.popleft()[0].unlink()
 
 
-def _write_clip(file: Path, shown: Iterable[tuple[Preview, Sequence[Track]]], colours: Colours) -> None:
+def _write_clip(file: Path, pictured: Iterable[tuple[Preview, Sequence[Track]]], colours: Colours) -> None:
     """Write pictures, each with the tracks of its frame; VideoError if there is none, or it cannot be written."""
-    drawn = ((preview_image(picture, tracks, colours), picture.time) for picture, tracks in shown)
+    drawn = ((preview_image(picture, tracks, colours), picture.time) for picture, tracks in pictured)
     images = ((image, moment) for image, moment in drawn if image is not None)
     if (first := next(images, None)) is None:
         raise VideoError("no picture is so near to the event")

@@ -68,28 +68,28 @@ class PicturedEvents:
 
     If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none.
 
-    pictures  the newest ones, at most `kept`, oldest first
-    arrived   moment at which the last one arrived, on a monotonic clock
+    pictures      the newest pictures, at most `capacity`, oldest first
+    last_arrival  time at which the last one arrived, on a monotonic clock
     """
 
-    def __init__(self, origin: Origin, kept: int = 1) -> None:
+    def __init__(self, origin: Origin, capacity: int = 1) -> None:
         self.events = Events(origin.options)
-        self.pictures: deque[Preview] = deque(maxlen=kept)
-        self.arrived = time.monotonic()
+        self.pictures: deque[Preview] = deque(maxlen=capacity)
+        self.last_arrival = time.monotonic()
         self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
         self._previews: Subscription[Preview] = subscribe(origin.address, "previews", timeout=0)
 
     def update(self, tracks: Sequence[Track]) -> list[tuple[Event, Preview | None]]:
         """Return the events of further tracks, and those that have waited, with their pictures.
 
-        Call it without tracks while no frame arrives: events wait no longer then.
+        Call it without tracks while no frame arrives, so that their wait ends in time.
         """
         now = time.monotonic()
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in self.events.update(tracks)]
         with suppress(SilenceError):  # no further picture has arrived
             for preview in self._previews:
                 self.pictures.append(preview)
-                self.arrived = now
+                self.last_arrival = now
         newest, ready = self._newest(), []
         while self._waiting:
             event, due = self._waiting[0]

@@ -23,8 +23,8 @@ def test_boxes_in_other_frames_and_of_videos_that_cannot_be_read_are_kept(frames
     assert frames.keyframes == {"anna": {0: BOX}}
     moved = Box(1.0, 2.0, 30.0, 40.0)
     frames.set_boxes({"anna": {0: moved}})
-    kept = [("anna", 2, BOX), ("ben", 0, None)]
-    assert frames.boxes == {"broken.mp4": [("ben", 0, BOX)], "cam.mp4": [*kept, ("anna", 0, moved)]}
+    others = [("anna", 2, BOX), ("ben", 0, None)]
+    assert frames.boxes == {"broken.mp4": [("ben", 0, BOX)], "cam.mp4": [*others, ("anna", 0, moved)]}
     frames.set_boxes({})
-    assert frames.boxes["cam.mp4"] == kept
+    assert frames.boxes["cam.mp4"] == others
     assert frames.missing() == []
