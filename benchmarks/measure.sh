@@ -15,7 +15,6 @@ measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
 }
 
 measure startup "$python" benchmarks/startup.py --runs 3
-measure subscribers "$python" benchmarks/subscribers.py --frames 1500 --runs 1
 measure resume "$python" benchmarks/resume.py --moments 8
 measure loadtest "$catstream" loadtest --streams 2 --duration 20
 measure speed "$python" benchmarks/speed.py --frames 600 \
