@@ -13,6 +13,7 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
 import click
 import pytest
@@ -150,6 +151,11 @@ def broken_links(path: Path) -> Iterator[str]:
 
 def test_the_targets_of_links_exist():
     assert not errors_on(broken_links)
+
+
+@pytest.mark.parametrize("picture", sorted(DOCS.glob("images/*.svg")), ids=lambda path: path.name)
+def test_a_browser_can_show_the_pictures(picture):
+    ElementTree.parse(picture)
 
 
 def wrong_commands(path: Path) -> Iterator[str]:
