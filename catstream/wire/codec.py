@@ -121,7 +121,7 @@ def opening(kind: type, about: str | None = None) -> bytes:
     return packed[: -(4 - len(names))]  # nil is one byte
 
 
-def topic_of(data: bytes | memoryview) -> Topic:
+def topic_of(data: bytes) -> Topic:
     """The topic of a message, by its first bytes; of no kind if they do not begin a message.
 
     >>> from catstream.messages.kinds import End

@@ -134,7 +134,7 @@ class Subscriber(ChannelSocket[Message]):
         self._passes_over = (newest or self._newest) and len(channel.senders) == 1
         super().__init__(zmq.SUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.LINGER, 0)  # while a publisher is away, its subscriptions wait to be sent again
-        self._arrived: dict[Topic, zmq.Frame] = {}  # newest message of each topic, the topic that waits longest first
+        self._arrived: dict[Topic, bytes] = {}  # newest message of each topic, the topic that waits longest first
         self._last: dict[tuple[Topic, str], object] = {}  # identity of the last message of each object or process
         self._socket.subscribe(b"" if only is None else opening(only, about))
         self._connect()
@@ -146,9 +146,9 @@ class Subscriber(ChannelSocket[Message]):
     def receive(self, seconds: float) -> Message | None:
         """The next message, None if none arrived in time; repeats and what is rejected are passed over."""
         deadline = monotonic() + seconds
-        while (frame := self._next_frame(deadline)) is not None:
-            message = self._decode(frame.buffer, *self.channel.messages)
-            if message is not None and not self._is_repeat(message, frame.buffer):
+        while (data := self._next_data(deadline)) is not None:
+            message = self._decode(data, *self.channel.messages)
+            if message is not None and not self._is_repeat(message, data):
                 return message
         return None
 
@@ -157,16 +157,19 @@ class Subscriber(ChannelSocket[Message]):
         first = self.receive(seconds)
         return [] if first is None else [first, *iter(lambda: self.receive(0), None)]
 
-    def _next_frame(self, deadline: float) -> zmq.Frame | None:
-        """The next message as it arrived, None if none arrives before the deadline."""
+    def _next_data(self, deadline: float) -> bytes | None:
+        """The next message as it arrived, None if none arrives before the deadline.
+
+        It is a copy: a zmq.Frame handles signals when it is deleted, where the KeyboardInterrupt of Ctrl-C gets lost.
+        """
         if not self._passes_over:
-            return self._socket.recv(copy=False) if self._wait(deadline - monotonic()) else None
+            return self._socket.recv() if self._wait(deadline - monotonic()) else None
         while len(self._arrived) < _MOST_KEPT and self._wait(0 if self._arrived else deadline - monotonic()):
-            frame = self._socket.recv(copy=False)
-            self._arrived[topic_of(frame.buffer)] = frame  # in the place of an older one
+            data = self._socket.recv()
+            self._arrived[topic_of(data)] = data  # in the place of an older one
         return self._arrived.pop(next(iter(self._arrived))) if self._arrived else None
 
-    def _is_repeat(self, message: Message, data: memoryview) -> bool:
+    def _is_repeat(self, message: Message, data: bytes) -> bool:
         """Return True if a message is the last one of its object or process, which is sent again now and then.
 
         It is identified by its version. One that has none is small, and identified by all of its bytes.
@@ -176,7 +179,7 @@ class Subscriber(ChannelSocket[Message]):
         about = message.process if isinstance(message, Health) else getattr(message, "object", "")
         source = Topic(type(message).__name__, about), self.run
         version = getattr(message, "version", None)
-        identity = hash(bytes(data)) if version is None else (version, getattr(message, "began", 0))
+        identity = hash(data) if version is None else (version, getattr(message, "began", 0))
         before = self._last.pop(source, None)
         self._last[source] = identity
         if len(self._last) > _MOST_TOPICS:

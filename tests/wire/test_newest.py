@@ -1,5 +1,7 @@
 """Published messages about several objects: each subscriber gets those of its object, and each object's newest."""
 
+import signal
+import threading
 from collections import deque
 
 import numpy as np
@@ -54,9 +56,8 @@ class Turns(RuleBasedStateMachine):
     def get(self, _):
         return zmq.POLLIN if self.queue else 0
 
-    def recv(self, copy):
-        assert not copy
-        return zmq.Frame(self.queue.popleft())
+    def recv(self):
+        return self.queue.popleft()
 
     def arrive(self, name):
         self.queue.append(encode(model(self.newest[name], name)))
@@ -152,6 +153,46 @@ def test_of_a_burst_that_no_queue_holds_the_newest_of_each_object_still_arrives(
             samples.send(sample(version, f"o{version}", width=500))
         heard = heard_by_all(samples, trainer, objects, until)
     assert heard == {f"o{version}": version for version in range(1, objects + 1)}
+
+
+class _InterruptError(Exception):
+    pass
+
+
+def test_an_interrupt_is_not_lost_while_messages_are_received(endpoint, until):
+    """Where it would be, as in the deletion of a zmq.Frame, Python warns of an exception that is ignored."""
+    raises, ended, interrupts = False, threading.Event(), 0
+
+    def handle(*_):
+        nonlocal raises
+        if raises:
+            raises = False
+            raise _InterruptError
+
+    def send(publisher):
+        frame = 0
+        while not ended.is_set():
+            publisher.send(track(frame := frame + 1))
+            if frame % 20 == 0:
+                signal.raise_signal(signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, handle)
+    with Publisher(TRACKS, endpoint) as publisher, Subscriber(TRACKS, endpoint) as subscriber:
+        joined(publisher, 1, until)
+        sender = threading.Thread(target=send, args=[publisher])
+        sender.start()
+        try:
+            while interrupts < 30:
+                try:
+                    raises = True
+                    subscriber.receive(1.0)
+                except _InterruptError:
+                    interrupts += 1
+        finally:
+            raises = False
+            ended.set()
+            sender.join()
+            signal.signal(signal.SIGUSR1, before)
 
 
 def test_a_publisher_remembers_the_last_messages_of_a_limited_number_of_names(endpoint, monkeypatch):
