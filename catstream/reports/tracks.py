@@ -153,7 +153,7 @@ class Section:
         self.lanes = {name: item.lane(self.duration) for name, item in self._objects.items()}
         self.paths = {name: item.polylines() for name, item in self._objects.items()}
         self.size = self._head.size or self._extent()
-        self.speeds, self.fastest = self._speeds()
+        self.speeds, self.top_speed = self._speeds()
         self.background, self.pictures, self.problem = b"", list[_Picture](), ""
 
     def add_pictures(self) -> None:
@@ -195,17 +195,19 @@ class Section:
         return {frame: f"{name or 'the object'}, {counted(count, 'doubtful frame')}" for count, frame, name in longest}
 
     def _speeds(self) -> tuple[dict[str, list[str]], float]:
-        """The polylines of the speed of each object in a plot of 1000 x 460, and the highest speed."""
+        """The polylines of the speed of each object in a plot of 1000 x 460, and the speed at its upper end."""
         edges = np.linspace(0, self.duration, min(_BINS, max(2, int(self.duration * 4))) + 1)
         speeds = {name: item.speeds(edges) for name, item in self._objects.items()}
         fastest = max(1.0, *(float(np.nanmax(item, initial=0)) for item in speeds.values()))
+        step = 10 ** np.floor(np.log10(fastest)) / 2
+        top = step * np.ceil(fastest / step)  # a round number
         xs = 1000 * (edges[1:] + edges[:-1]) / 2 / self.duration
         lines = {}
         for name, values in speeds.items():
-            points = np.column_stack([xs, 460 - 440 * values / fastest])
+            points = np.column_stack([xs, 460 - 440 * values / top])
             parts = np.split(points, np.flatnonzero(np.diff(np.isnan(values))) + 1)
             lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in part) for part in parts if not np.isnan(part[0, 1])]
-        return lines, fastest
+        return lines, float(top)
 
 
 def write_report(path: Path, sections: Iterable[Section]) -> Path:
