@@ -49,7 +49,7 @@ test: $(READY) $(TOOLS)  ## all tests but those of test-system and test-slow, wi
 	@$(BIN)/pytest -n auto --dist worksteal
 
 test-system: $(READY) $(TOOLS)  ## those with Ray, a browser, Node.js, an RTSP server, or a whole benchmark
-	@$(BIN)/pytest -n 2 --dist worksteal -m 'system and not slow'
+	@$(BIN)/pytest -n 3 --dist worksteal -m 'system and not slow'
 
 test-slow: $(READY) $(TOOLS)  ## the slow ones: many faults, a load test (4 minutes)
 	@$(BIN)/pytest -m slow --timeout 3600 -o faulthandler_timeout=0

@@ -132,7 +132,11 @@ def batch(
 
 def _relative(file: Path, folder: Path) -> str:
     """The path of a file relative to a folder, either of which may be in a symbolic link."""
-    return os.path.relpath(file.parent.resolve() / file.name, folder.resolve())
+    path = file.parent.resolve() / file.name
+    try:
+        return os.path.relpath(path, folder.resolve())
+    except ValueError:  # on another drive of Windows
+        return str(path)
 
 
 def _ask_for_boxes(
