@@ -4,7 +4,8 @@ Each pass votes with a weight: it falls linearly from 1 at its own keyframe to 0
 high if the pass arrives at the box of the other keyframe, which is evidence that it did not lose the object before. The
 box with the highest weighted sum of IoU wins, and is averaged with those that overlap it. The probability is a logistic
 regression of two features: the share of votes for the winner, and its lowest IoU with the passes of the other direction
-in the frames around. Where only one direction was tracked, the second one is 0.
+in the frames around. The second one is 0 where only one direction was tracked, and where both miss the object although
+it is at both keyframes: mostly, both have lost it.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) ->
     agreement = shared[best, :, frames].T  # of the winner with each pass, (passes, frames)
     merged = _averaged(boxes, np.where(agreement > _SAME, weights, 0.0), best)
     opposite = np.where(forward[:, None] != forward[best], agreement, 0.0).max(axis=0)
+    if not any(end in keyframes and keyframes[end] is None for end in (start - 1, stop)):
+        opposite[np.isnan(merged[:, 0])] = 0.0
     around = np.lib.stride_tricks.sliding_window_view(np.pad(opposite, _AROUND, "edge"), 2 * _AROUND + 1).min(axis=1)
     features = np.column_stack([votes.max(axis=0) / weights.sum(axis=0), around])
     probabilities = 1 / (1 + np.exp(-_LOGISTIC[0] - features @ _LOGISTIC[1:]))

@@ -56,7 +56,13 @@ def test_frames_beside_a_disagreement_are_less_probable():
 def test_passes_agree_that_an_object_is_absent():
     boxes, probabilities, _ = fused(forward(ABSENT), backward(ABSENT), drawn={0: None, 10: None})
     assert np.isnan(boxes).all()
-    assert (probabilities > 0.9).all()
+    assert (probabilities > 0.97).all()
+
+
+def test_passes_that_both_miss_an_object_at_both_keyframes_have_lost_it():
+    boxes, probabilities, _ = fused(forward(ABSENT), backward(ABSENT), drawn={0: LEFT, 10: LEFT})
+    assert np.isnan(boxes).all()
+    assert (probabilities < 0.97).all()
 
 
 def test_the_boxes_of_passes_that_agree_are_averaged_by_their_distance():
