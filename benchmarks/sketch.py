@@ -126,12 +126,13 @@ def alone(method: str, features: int, count: int, *, limit: bool) -> dict[str, f
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:
-    rounds, streams = (1, ((64, 8_000),)) if options.quick else (options.rounds, STREAMS)
+    rounds, streams = (1, ((64, 2_000),)) if options.quick else (options.rounds, STREAMS)
+    methods = METHODS[::5] if options.quick else METHODS
     rows = []
     for features, count in streams:
-        runs = [{method: alone(method, features, count, limit=True) for method in METHODS} for _ in range(rounds)]
+        runs = [{method: alone(method, features, count, limit=True) for method in methods} for _ in range(rounds)]
         least = runs[0][METHODS[0]]["error"]
-        for method in METHODS:
+        for method in methods:
             cpu = min(run[method]["cpu"] for run in runs)
             memory = max(run[method]["memory"] for run in runs)
             rows.append((method, features, count, f"{runs[0][method]['error'] / least - 1:.1e}", cpu, memory))
@@ -141,7 +142,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
 
     features, count = streams[0][0], streams[0][1] // 2
     rows = []
-    for method in (METHODS[1], *METHODS[4:]):
+    for method in methods[-1:] if options.quick else (METHODS[1], *METHODS[4:]):
         pairs = [[alone(method, features, count, limit=limit) for limit in (True, False)] for _ in range(rounds)]
         cpus, walls = ([min(pair[k][kind] for pair in pairs) for k in (0, 1)] for kind in ("cpu", "wall"))
         rows.append((method, *cpus, cpus[1] / cpus[0], walls[1] / walls[0]))
