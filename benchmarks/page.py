@@ -339,12 +339,10 @@ def annotation(records: Records) -> str:
             rows.append((f"{len(names)} of {group}", boxes, success, share, pooled, precision, *others))
     done = {boxes: sum((count or 9) <= boxes for count in complete.values()) for boxes in (2, 4, 8)}
     until = fmean(count for count in complete.values() if count)
-    unmeasured = sorted(frames.keys() - complete.keys(), key=lambda name: frames[name]["frames"])
     return _block(
         records,
         f"""**Two are enough for {done[2]} of {len(complete)} sequences, four for {done[4]}, eight for {done[8]},
-        which need {until:.1f} on average:** then at least 95 % of the frames are right, and expected to be.
-        {f"Not measured, because they take longest: {', '.join(unmeasured)}." if unmeasured else ""}""",
+        which need {until:.1f} on average:** then at least 95 % of the frames are right, and expected to be.""",
         (
             *("sequences", "boxes", "success", "checked", "of these, right", "mean over sequences"),
             *("interpolation", "forwards only"),

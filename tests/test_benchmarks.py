@@ -22,6 +22,7 @@ CASES = [
 
 
 @pytest.mark.system
+@pytest.mark.timeout(600)  # some start many processes, one after the other
 @pytest.mark.parametrize("script", CASES)
 def test_a_benchmark_runs_and_writes_finite_figures(script, tmp_path, monkeypatch):
     figures = tmp_path / "figures.json"
