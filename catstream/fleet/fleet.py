@@ -290,6 +290,8 @@ class Fleet(AbstractContextManager["Fleet"]):
             socket.create_connection((host, int(port)), _REACH_SECONDS).close()
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or "no answer"
+            if not self._address:
+                raise FleetError(f"the fleet {self.name} is ending, its Ray was killed ({why}): try again") from None
             raise FleetError(
                 f"there is no cluster of Ray at {address!r} ({why}): expected HOST:PORT as `ray start --head` prints it"
             ) from None
