@@ -81,7 +81,8 @@ def two_objects(endpoint, turning):
 )
 def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
     code, output, errors = said("watch", "tracks", *options, "--endpoint", two_objects, "--json")
-    assert (code, errors) == (0, f"{len(objects)} tracks, 0 missed: the source has ended\n")
+    *_, last = errors.splitlines()  # before it, a publisher in this process may tell of a connection that ended early
+    assert (code, last) == (0, f"{len(objects)} tracks, 0 missed: the source has ended")
     assert [json.loads(line)["object"] for line in output.splitlines()] == objects
 
 
