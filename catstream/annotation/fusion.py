@@ -4,8 +4,8 @@ Each pass votes with a weight: it falls linearly from 1 at its own keyframe to 0
 high if the pass arrives at the box of the other keyframe, which is evidence that it did not lose the object before. The
 box with the highest weighted sum of IoU wins, and is averaged with those that overlap it. The probability is a logistic
 regression of two features: the share of votes for the winner, and its lowest IoU with the passes of the other direction
-in the frames around. The second one is 0 where only one direction was tracked, and where both miss the object although
-it is at both keyframes: mostly, both have lost it.
+in the frames around. The second feature is 0 where only one direction was tracked, and where both directions miss the
+object although it is absent at neither keyframe: then, both have mostly lost it.
 """
 
 from __future__ import annotations

@@ -493,7 +493,7 @@ class RunProgress:
 
     @property
     def _counters(self) -> dict[str, float]:
-        """The counters of the detector: the totals at the end of the run, before it those of the last health report."""
+        """The counters of the detector: those of its last health report, and after the end of the run the totals."""
         return self._pipeline.health.get("detector", {}) | self._pipeline.totals
 
     def _rate(self) -> float:

@@ -160,7 +160,7 @@ class Subscriber(ChannelSocket[Message]):
     def _next_data(self, deadline: float) -> bytes | None:
         """The next message as it arrived, None if none arrives before the deadline.
 
-        It is a copy: a zmq.Frame handles signals when it is deleted, where the KeyboardInterrupt of Ctrl-C gets lost.
+        It is a copy: the destructor of a zmq.Frame handles signals, and Python ignores an exception raised there.
         """
         if not self._passes_over:
             return self._socket.recv() if self._wait(deadline - monotonic()) else None
