@@ -25,7 +25,7 @@ COMMANDS = {
     "demo": ("measure", "Track an object in a rendered demo video."),
     "find": ("models", "Find the objects of saved models in videos, folders and images."),
     "evaluate": ("measure", "Measure accuracy on annotated sequences, also of other trackers."),
-    "loadtest": ("measure", "Run pipelines under load, and measure latency and losses."),
+    "loadtest": ("loadtest", "Run pipelines under load, and measure latency and losses."),
     "watch": ("attach", "Print the messages of a running pipeline."),
     "view": ("view", "Watch and control a running pipeline in a browser."),
     "sink": ("write", "Write the tracks of a running pipeline to files and elsewhere."),

@@ -1,0 +1,158 @@
+"""`catstream loadtest`: the latency and the losses of pipelines under load."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.progress import BarColumn
+
+from catstream.base.files import writing
+from catstream.base.text import counted
+from catstream.cli.common import complain, line_of, messages, screen, stopped, table, text, with_json_file, write_json
+from catstream.cli.options import FOLDER, NumberRange, with_settings
+
+if TYPE_CHECKING:
+    from catstream.loadtest.load_test import Limit, Result
+
+_QUIET_CORES = 0.25  # load by other processes above which a warning is printed
+#: Limits of a search if none are given.
+_SEARCH_LIMITS = ("p99=0.1", "skipped=0")
+
+
+def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
+    if not match or min(size := (int(match[1]), int(match[2]))) < 64:
+        raise click.BadParameter(f"a size is WIDTHxHEIGHT, 64x64 to 9999x9999, got {text!r}: for example 640x480")
+    return size
+
+
+@click.command()
+@click.option("--streams", type=click.IntRange(1, 64), default=1, show_default=True, help="Number of pipelines.")
+@click.option("--objects", type=click.IntRange(1, 16), default=1, show_default=True, help="Objects of each pipeline.")
+@click.option(
+    "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
+)
+@click.option(
+    "--slow-subscribers", type=click.IntRange(0), default=0, help="Number of slow or frozen subscribers among them."
+)
+@click.option(
+    "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
+)
+@click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Duration in seconds.")
+@click.option(
+    "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
+)
+@click.option(
+    "--source",
+    type=click.Choice(["mjpeg", "h264"]),
+    default="mjpeg",
+    show_default=True,
+    help="MJPEG over HTTP, or H.264 over RTSP.",
+)
+@click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
+@click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
+@with_json_file
+@click.option("--output", type=FOLDER, help="Output folder for report.html.")
+@with_settings
+def loadtest(
+    find_streams: bool,
+    limits: tuple[str, ...],
+    json_file: Path | None,
+    output: Path | None,
+    **plan: Any,
+) -> None:
+    """Measure latency and dropped frames of pipelines under load.
+
+    The load test sends a rendered video with ground truth on the loopback
+    interface; a pipeline of its own tracks each stream. The camera does not
+    wait: frame i is due at start + i / RATE, and latency counts from
+    then. The latency of a skipped frame ends with the track of a newer one.
+    Slow subscribers read two tracks per second; half of them are frozen
+    instead.
+
+    \b
+    LIMITS, of the worst stream
+      p50 p95 p99 p99.9 max     seconds from a frame to its track, at most
+      model-p50 ... model-max   seconds from a frame to the model trained on it, at most
+      skipped                   share of frames that were not tracked, at most
+      missed                    share of frames whose tracks fast subscribers missed, at most
+      success                   share of frames with an IoU above 0.5, at least
+
+    With --find-streams, the load test searches for the number of cameras that
+    this machine can serve: it starts with STREAMS, each step takes DURATION, and
+    the default limits are p99=0.1 and skipped=0. The exit status is 1 if a limit
+    was exceeded or a stream failed.
+
+    \b
+    EXAMPLES
+      catstream loadtest --rate 30 --limit p99=0.1
+      catstream loadtest --objects 8 --limit skipped=0.01
+      catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
+      catstream loadtest --find-streams --rate 25 --size 1920x1080 --source h264
+    """
+    from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
+    from catstream.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
+
+    parsed = [Limit.parse(text) for text in limits or (_SEARCH_LIMITS if find_streams else ())]
+    parameters = Plan(**plan)
+    if output is not None:
+        with writing(output):
+            output.mkdir(parents=True, exist_ok=True)
+    with line_of(
+        messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
+    ) as progress:
+        task = progress.add_task("starting", total=1.0, figures="")
+
+        def report(activity: str, share: float, figures: str) -> None:
+            progress.update(task, description=activity, completed=share, figures=figures)
+
+        def done(result: Result) -> None:
+            if find_streams:
+                (cores, memory), verdict = result.cost, "; ".join(violations(parsed, result)) or "met"
+                click.echo(
+                    f"{counted(result.plan.streams, 'stream')}, {result.plan.rate:g} frames/s due; in the worst stream "
+                    f"{result.followed:.1f} tracked, p99 {milliseconds(KINDS['p99'].measure(result))} ms; each takes "
+                    f"{cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
+                )
+
+        load_test = run_load_test(parameters, parsed, find=find_streams, report=report, done=done)
+    for streams, reason in load_test.refused.items():
+        click.echo(f"{streams} streams did not start: {reason}")
+    if load_test.results:
+        if find_streams:
+            click.echo(f"{answer(load_test)}.")
+        _print_run(load_test.result, parsed)
+        write_json(json_file, to_json(load_test))
+        if output is not None:
+            click.echo(f"report: {write_report(output / 'report.html', load_test)}")
+    if load_test.interrupted:
+        stopped("these are the results so far" if load_test.results else "there are no measurements yet")
+    for line in load_test.violations:
+        complain(f"limit exceeded: {line}")
+    if load_test.violations:
+        sys.exit(1)
+
+
+def _print_run(result: Result, limits: list[Limit]) -> None:
+    from catstream.loadtest.load_report import milliseconds, tables
+
+    click.echo(
+        f"{result.plan}, {result.seconds:.1f} s; latencies in ms; the camera was at most "
+        f"{milliseconds(result.camera_late)} ms late"
+    )
+    for part in tables(result):
+        output = table(*part.heads, right=part.heads[1:])
+        for row in part.cells:
+            output.add_row(*row)
+        screen().print(output)
+    if result.other_load > _QUIET_CORES:
+        click.echo(
+            f"other processes kept {result.other_load:.1f} cores busy: repeat on an idle machine for reliable results"
+        )
+    for limit in limits:
+        if limit.is_met(result):  # the others are an error
+            click.echo(f"{click.style('met', 'green')}: {limit.describe(result)}")
