@@ -80,10 +80,7 @@ class StoreError(FleetError):
 
 #: Extra -> the feature that needs it, and the modules that the feature imports.
 EXTRAS = {
-    "view": ("the web page", ("prometheus_client", "starlette", "uvicorn")),
-    "loadtest": ("the load test", ("psutil",)),
     "mcap": ("an MCAP file", ("mcap",)),
-    "mqtt": ("an MQTT broker", ("paho",)),
     "parquet": ("a Parquet file", ("pyarrow",)),
     "network": ("a network", ("onnxruntime", "onnx")),
     "fleet": ("a fleet", ("ray", "obstore")),

@@ -16,7 +16,7 @@ from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, with_listen, with_token
-from catstream.errors import VideoError, require_extra
+from catstream.errors import VideoError
 from catstream.jobs.job import Results
 
 if TYPE_CHECKING:
@@ -91,8 +91,6 @@ def annotate(
         from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes
 
     drawn = by_object([*([] if csv_file is None else read_keyframes(csv_file)), *map(parse_keyframe, texts)])
-    if not drawn:
-        require_extra("view")
     jobs = jobs or cores()
     bar = line_of(messages())
     settings = Settings.from_values(overrides)

@@ -22,7 +22,7 @@ from catstream.cli.annotate import wait_for
 from catstream.cli.common import INTERRUPTS, line_of, messages, screen, stopped, table, text
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, with_listen, with_token
-from catstream.errors import BoxError, CatstreamError, VideoError, require_extra
+from catstream.errors import BoxError, CatstreamError, VideoError
 
 _NUMBERS = ("objects", "frames", "present", "doubtful", "checked")
 
@@ -93,7 +93,6 @@ def batch(
 
     drawn, path, settings = output / "boxes.csv", output / "batch.csv", Settings.from_values(overrides)
     if ask:
-        require_extra("view")
         boxes = read_boxes(drawn) if drawn.exists() else {}
         boxes |= {file: [] for file in (_relative(file, output) for file in files) if file not in boxes}
         videos = videos_of(drawn, boxes)

@@ -26,7 +26,7 @@ from catstream.cli.options import PATH, with_json, with_overwrite
 from catstream.cli.view import HostPort, fleet_view, with_token, with_view
 from catstream.cli.write import check_options, with_sink_options
 from catstream.client.address import Address
-from catstream.errors import FleetError, require_extra
+from catstream.errors import FleetError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import FleetStatus, StreamStatus
 
@@ -97,8 +97,6 @@ def up(running: Fleet, view: HostPort | None, token: str | None) -> None:
       catstream fleet up examples/fleet.toml --view
       catstream fleet up fleet.toml --address 10.0.0.1:6379
     """
-    if view is not None:
-        require_extra("view")
     with Console(stderr=True).status("starting the fleet"):
         lines = running.up()
     for line in lines:

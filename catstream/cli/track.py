@@ -35,7 +35,6 @@ from catstream.cli.options import (
 from catstream.cli.view import HostPort, with_token, with_view
 from catstream.cli.write import check_options, with_sink_options, with_table
 from catstream.client.address import Address
-from catstream.errors import require_extra
 from catstream.jobs.job import Results, SinkOptions
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
@@ -259,8 +258,6 @@ class _Run:
 
     def _files(self, pipeline: Pipeline) -> RunFiles:
         """Everything that the tracks are written to; raise an error if one of the run's files could not be written."""
-        if self.view is not None:
-            require_extra("view")
         results, settings = pipeline.results, pipeline.settings.run
         if results.video and results.output is None:
             raise click.UsageError("--video requires --output, the folder for the video")

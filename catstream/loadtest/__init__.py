@@ -1,5 +1,1 @@
 """Load tests: real pipelines track a test stream that is sent at a fixed rate, whether or not they keep up."""
-
-from catstream.errors import require_extra
-
-require_extra("loadtest")

@@ -215,10 +215,9 @@ SINKS = {
     "mqtt://": Row(
         "mqtt_sink.MqttSink",
         "HOST/TOPIC: events and states of objects, for a broker",
-        extra="mqtt",
         options=(*_EVENTS, "picture", "rate"),
     ),
-    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", extra="mqtt", options=(*_EVENTS, "picture", "rate")),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", options=(*_EVENTS, "picture", "rate")),
     "folder://": Row(
         "events_folder.EventsFolder",
         "DIR: a picture of each event, as with --events-folder",
