@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: they add commands, settings, and lists of decisions and of pages to the documentation."""
+"""Hook of MkDocs: adds the commands, the settings and the list of pages to the documentation."""
 
 from __future__ import annotations
 
@@ -15,20 +15,11 @@ from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
 
 README = Path(__file__).parents[1] / "README.md"
-RECORDS = sorted((Path(__file__).parent / "decisions").glob("0*.md"))
-
-
-def on_config(config: Any) -> Any:
-    """List the records of decisions in the navigation, below their index."""
-    background = next(part["Background"] for part in config.nav if "Background" in part)
-    records = next(part["Decisions"] for part in background if "Decisions" in part)
-    records += [f"decisions/{path.name}" for path in RECORDS]
-    return config
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Append the help of every command, all settings, or a list of decisions or pages to their page."""
-    pages = {"command-line.md": commands, "settings.md": settings, "decisions/index.md": decisions, "index.md": index}
+    """Append the help of all commands, the settings, or the list of pages to their page."""
+    pages = {"command-line.md": commands, "settings.md": settings, "index.md": index}
     added = pages.get(page.file.src_uri)
     return f"{markdown}\n{added()}" if added else markdown
 
@@ -38,12 +29,6 @@ def index() -> str:
     _, heading, section = README.read_text(encoding="utf-8").partition("## Documentation\n")
     table, _, _ = section.strip().partition("\n\n")
     return re.sub(r"\]\((docs/)?", lambda link: "](" if link[1] else "](../", f"{heading}\n{table}\n")
-
-
-def decisions() -> str:
-    """Return the list of decisions in Markdown."""
-    titles = ((path.name, path.read_text(encoding="utf-8").partition("\n")[0]) for path in RECORDS)
-    return "\n".join(f"- [{title.removeprefix('# ')}]({name})" for name, title in titles) + "\n"
 
 
 def settings() -> str:

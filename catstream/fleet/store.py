@@ -24,7 +24,7 @@ from, and are as good as any. What can fail besides:
 
 A holder removes all states but the newest two, and the older claims that have no state any more. Of a stream that was
 removed, a state that says so stays, and hides what a holder writes that comes back later. See
-docs/decisions/0078-fencing-by-name.md.
+decision 78 in docs/decisions.md.
 
 A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
 bucket has to be private. The credentials of S3 come from the environment, the machine's role, or ~/.aws; the address of

@@ -22,7 +22,7 @@ class ZapHandler:
     one. The list of clients is read for each question, so no process has to be restarted if a client is allowed or
     revoked. A connection that is open stays open. A thread answers while a socket is registered.
 
-    pyzmq's own handler, `zmq.auth`, is not used: see docs/decisions/0023-roles.md.
+    pyzmq's own handler, `zmq.auth`, is not used: see decision 23 in docs/decisions.md.
     """
 
     _address = "inproc://zeromq.zap.01"
