@@ -98,8 +98,8 @@ class Pipeline:
         Those of the run, also if it is resumed; the path of a source is absolute.
     results, earlier_results : Results
         The files that the program writes, with those of the run that is resumed; and those of that run alone.
-    after : int or None
-        The argument; another value counts if it is set before the start.
+    first_frame : int or None
+        With `resume`: number of the next frame that the caller needs, `after` + 1. It may be set before the start.
     saved_models : list of Path
         At the end: the files of `save_model` that were written.
 

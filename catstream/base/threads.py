@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+#: Environment variables that limit the libraries of a new process to one thread.
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 #: Held by a call that changes the filters of warnings: all threads of a program have the same ones.
 FILTERS = threading.Lock()
@@ -32,8 +33,7 @@ def limit_process() -> None:
 
     Call it before numpy is imported: the libraries read the environment when they are loaded.
     """
-    for variable in _VARIABLES:
-        os.environ.setdefault(variable, "1")
+    os.environ.update(ONE_THREAD | os.environ)
 
 
 class _Limit:

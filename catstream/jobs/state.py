@@ -2,7 +2,7 @@
 
     DIR/job.safetensors     the job of the run, readable by its owner only: see `catstream.jobs.job`
     DIR/desired_state.json  what was commanded: see `catstream.processes.decisions`
-    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.processes.outputs`
+    DIR/searched_models/    the saved models that objects are searched for by: see `catstream.processes.model_files`
     DIR/trees/              the compressor's checkpoints: see `catstream.compression.checkpoint_store`
 
 A pipeline locks DIR, and its compressor DIR/trees. The kernel releases a lock when its process ends, however that

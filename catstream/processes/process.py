@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -20,7 +22,6 @@ from catstream.jobs.job import Job
 from catstream.messages.kinds import Health, run_state
 from catstream.processes.ending import Ending
 from catstream.processes.shared import SharedMemory
-from catstream.processes.start_server import reset_process
 from catstream.wire.channels import HEALTH
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
@@ -91,6 +92,14 @@ class Process:
     def close(self) -> None:
         """Close the channel `health`, after its last message was sent."""
         self._stack.close()
+
+
+def reset_process() -> None:
+    """Reset the signal mask, SIGCHLD and the limit of open files, which a process inherits from its parent."""
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def run(

@@ -21,7 +21,6 @@ import fcntl
 import gc
 import json
 import os
-import resource
 import select
 import signal
 import socket
@@ -35,9 +34,10 @@ from importlib import import_module
 from pathlib import Path
 
 from catstream.base.forks import after_fork
-from catstream.base.threads import limit_process
+from catstream.base.threads import ONE_THREAD
 from catstream.base.workers import name_process
 from catstream.errors import ServiceError
+from catstream.processes.process import reset_process, run
 
 #: The processes that a server can start, in the order in which a pipeline starts and ends them.
 NAMES = ("detector", "compressor", "trainer")
@@ -51,16 +51,6 @@ _LONGEST = 1 << 16  # bytes of a request
 _MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_ARENA_MAX": "1"}
 #: Modules that numba imports if they are installed, for kernels that call BLAS or C; they take a sixth of a second.
 _UNUSED = ("scipy.linalg.cython_blas", "cffi")
-
-
-def reset_process() -> None:
-    """Let this process begin in a known state, whatever its parent has set before: signals that are delivered, and as
-    many open files as it may have.
-    """
-    signal.pthread_sigmask(signal.SIG_SETMASK, ())
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 class StartedProcess:
@@ -141,7 +131,7 @@ class StartServer:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "catstream.processes.start_server", str(passed), str(os.getpid())],
-                env=os.environ | _MALLOC,
+                env=ONE_THREAD | os.environ | _MALLOC,
                 cwd="/",  # no entry of PYTHONPATH means the current folder of the program
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # a reader of the program's output would wait for the end of the server
@@ -256,7 +246,6 @@ def main(descriptor: int, program: int) -> None:
         sys.stderr = os.fdopen(2, "w")
     reset_process()
     name_process("catstream:start")
-    limit_process()  # before anything imports numpy
     gc.disable()  # nothing of what is imported is garbage
     requests = socket.socket(fileno=descriptor)
     has_ended, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -298,8 +287,6 @@ def main(descriptor: int, program: int) -> None:
 
 def _run(request: dict[str, str], parent: int, log: int, memory: int) -> None:
     """Run a process that was just forked, and exit with its code."""
-    from catstream.processes.process import run
-
     code = 1
     try:
         signal.set_wakeup_fd(-1)

@@ -12,7 +12,7 @@ import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from catstream.base import threads
-from catstream.base.threads import _VARIABLES, one_thread
+from catstream.base.threads import ONE_THREAD, one_thread
 
 
 def counts():
@@ -40,7 +40,7 @@ with one_thread():
 
 
 def test_a_library_that_is_imported_inside_is_on_one_thread_too():
-    environment = os.environ | dict.fromkeys(_VARIABLES, "2")
+    environment = os.environ | dict.fromkeys(ONE_THREAD, "2")
     program = [sys.executable, "-c", FIRST_USE]
     said = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
     assert said.stdout == "{1}\n"

@@ -4,6 +4,7 @@ import asyncio
 import gc
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -85,6 +86,17 @@ def test_before_its_start_a_pipeline_has_no_processes_and_no_endpoint(pipeline):
     assert (pipeline.pids, pipeline.restarts, pipeline.health) == ({}, 0, {})
     with pytest.raises(ServiceError, match="no endpoint before it has started"):
         _ = pipeline.endpoint
+
+
+def test_every_attribute_in_the_docstring_exists(pipeline):
+    section = Pipeline.__doc__.split("    Attributes\n")[1].split("\n\n")[0]
+    names = [
+        name
+        for line in re.findall(r"^ {4}(\w.*)", section, re.MULTILINE)
+        for name in re.findall(r"\w+", line.partition(" :")[0])
+    ]
+    assert "first_frame" in names
+    assert [name for name in names if not hasattr(pipeline, name)] == []
 
 
 @pytest.mark.timeout(60)
