@@ -69,7 +69,6 @@ IMPORTERS = {
         "catstream/client/subscription.py",
     ],
     "paho": ["catstream/sinks/mqtt_sink.py"],
-    "mcap": ["catstream/sinks/mcap_sink.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": [
         *("catstream/wire/codec.py", "catstream/base/settings.py", "catstream/fleet/spec.py"),
@@ -98,7 +97,7 @@ IMPORTERS = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"mcap", "av", "pyarrow", "ray", "obstore", "onnx", "onnxruntime"}
+SLOW = {"av", "pyarrow", "ray", "obstore", "onnx", "onnxruntime"}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

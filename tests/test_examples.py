@@ -12,7 +12,6 @@ import sys
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,8 +36,6 @@ MODULES = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msg
 
 def missing(example):
     """What this machine has not that the example takes; None if it has all."""
-    if example.startswith("rerun"):
-        return None if find_spec("rerun") else 'rerun is missing: pip install "catstream[rerun]"'
     if example.endswith(".py"):
         return None
     if shutil.which("node") is None:
@@ -66,29 +63,21 @@ class Beside:
     printed: dict[str, tuple[int, str]]
 
 
-@pytest.fixture(scope="module")
-def shown(tmp_path_factory):
-    """What the example for Rerun saves."""
-    return tmp_path_factory.mktemp("shown") / "walk.rrd"
-
-
 @pytest.fixture(scope="module", params=[False, True], ids=["without keys", "with keys"])
-def beside(request, demo_video, shown, tmp_path_factory):
+def beside(request, demo_video, tmp_path_factory):
     """One run without keys and one with them, each with all examples that this machine can start and that take part."""
     source, boxes = demo_video(60)
     keys = str(tmp_path_factory.mktemp("keys") / "keys") if request.param else ""
     if keys:
         create(Path(keys))
-    words = {name: [] for name in ("subscriber.py", "subscriber.mjs") if missing(name) is None}
-    if not keys and missing("rerun_subscriber.py") is None:
-        words["rerun_subscriber.py"] = ["--save", shown]
+    names = [name for name in ("subscriber.py", "subscriber.mjs") if missing(name) is None]
     with ExitStack() as stack:
         settings = {"run.unstored_frames": 1, "run.keys": keys}  # it continues only if its tracks are received
         pipeline = stack.enter_context(Pipeline(str(source), boxes[0], settings))
         models = stack.enter_context(catstream.subscribe(pipeline.endpoint, "models", timeout=0, keys=keys))
         readers = {}
-        for name, more in words.items():
-            start = [*command(name), pipeline.endpoint, *([keys] if keys else []), *more]
+        for name in names:
+            start = [*command(name), pipeline.endpoint, *([keys] if keys else [])]
             readers[name] = stack.enter_context(subprocess.Popen(start, stdout=subprocess.PIPE, text=True))
         found, norms = {}, {}
         for track in pipeline:
@@ -96,30 +85,11 @@ def beside(request, demo_video, shown, tmp_path_factory):
             with suppress(SilenceError):
                 model = next(models)
                 norms[model.version] = float(np.linalg.norm(model.weights))
-            for name, reader in readers.items():
-                if reader.poll() is None and not (name.startswith("rerun") and holds_tracks(shown)):
+            for reader in readers.values():
+                if reader.poll() is None:
                     select.select([reader.stdout], [], [], 0.3)  # while they start, few pass
         told = {name: reader.communicate(timeout=150)[0] for name, reader in readers.items()}
     return Beside(found, norms, {name: (reader.returncode, told[name]) for name, reader in readers.items()})
-
-
-def holds_tracks(shown):
-    """Whether there is more than the beginning in the file that is shown."""
-    return shown.exists() and shown.stat().st_size > 20_000
-
-
-@pytest.mark.parametrize("beside", [False], ids=["without keys"], indirect=True)
-def test_the_rerun_subscriber_writes_a_file_for_the_viewer(beside, shown):
-    if why := missing("rerun_subscriber.py"):
-        pytest.skip(why)
-    code, printed = beside.printed["rerun_subscriber.py"]
-    assert code == 0
-    losses = r"(0 missed|(\d+) missed, \2 of them before this subscriber connected)"
-    assert re.fullmatch(rf"[1-9]\d* tracks, {losses}: the source has ended\n", printed)
-    data = shown.read_bytes()
-    assert data.startswith(b"RRF2")
-    for entity in (b"/camera/object", b"/score", b"/model", b"/state", b"Boxes2D"):
-        assert entity in data, "it was logged"
 
 
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])

@@ -71,12 +71,11 @@ def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, 
 #: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
 with_sink_options = combined(
     "options",
-    lambda zone, margin, when, rate, picture, secret, folder, megabytes, clips: SinkOptions(
+    lambda zone, margin, when, rate, picture, secret, folder, megabytes: SinkOptions(
         *(zone, margin, when[0], when[1], rate, picture),
         secret and secret.absolute(),
         folder and folder.absolute(),
         megabytes,
-        clips,
     ),
     click.option(
         "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A polygon in pixels; repeatable."
@@ -114,7 +113,6 @@ with_sink_options = combined(
         metavar="N",
         help="Size of DIR, above which the oldest files are removed; default: 1000.",
     ),
-    click.option("--events-clips", "clips", is_flag=True, help="Also write a clip of 5 s before and after each event."),
 )
 
 
@@ -129,7 +127,6 @@ _FLAGS = {
     "key": "--secret-file",
     "folder": "--events-folder",
     "folder_megabytes": "--events-megabytes",
-    "clips": "--events-clips",
 }
 
 
@@ -177,7 +174,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
     \b
     EXAMPLES
       catstream sink tracks.csv
-      catstream sink tracks.ndjson walk.mp4 walk.mcap --endpoint run
+      catstream sink tracks.ndjson walk.mp4 --endpoint run
       catstream sink - | jq .box
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
       catstream sink https://example.com/hook --when lost=10,entered --secret-file key

@@ -44,7 +44,6 @@ class SinkOptions:
     key           file of the key that signs what is sent, None to sign nothing
     folder        folder of a picture of each event, None for none
     folder_megabytes  limit of its size
-    clips         whether the folder has clips of the events, too
     """
 
     zones: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
@@ -56,7 +55,6 @@ class SinkOptions:
     key: Path | None = None
     folder: Path | None = None
     folder_megabytes: float = 1000.0
-    clips: bool = False
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -173,7 +173,6 @@ class Row:
     images       whether an export refers to the images of the source
     appends      whether an export can be added to an existing one
     extra        the extra that it needs
-    follows_log  whether a file is a log, or is made again from the log when a run is resumed
     options      fields of `SinkOptions` that a sink uses; any of them is an error if no destination does
     """
 
@@ -184,7 +183,6 @@ class Row:
     images: bool = False
     appends: bool = False
     extra: str = ""
-    follows_log: bool = False
     options: tuple[str, ...] = ()
 
     def load(self) -> Any:
@@ -200,18 +198,11 @@ _EVENTS = ("zones", "margin", "events", "lost_seconds")
 
 #: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
 SINKS = {
-    ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a head", follows_log=True),
+    ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a head"),
     STDOUT: Row("track_log.StdoutSink", "the same, without the head, on standard output"),
-    ".csv": Row(
-        "track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ...", follows_log=True
-    ),
-    ".sqlite": Row(
-        "database.SqliteSink", "the table tracks of a database, which others read meanwhile", follows_log=True
-    ),
-    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in", follows_log=True),
-    "rtsp://": Row("restream.StreamSink", "the pictures with their boxes, live, to an RTSP server, as H.264"),
-    "rtmp://": Row("restream.StreamSink", "the same to an RTMP server"),
-    ".mcap": Row("mcap_sink.McapSink", "tracks, models, health and pictures; for Foxglove", extra="mcap"),
+    ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
+    ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
+    ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
     "mqtt://": Row(
         "mqtt_sink.MqttSink",
         "HOST/TOPIC: events and states of objects, for a broker",
@@ -221,7 +212,7 @@ SINKS = {
     "folder://": Row(
         "events_folder.EventsFolder",
         "DIR: a picture of each event, as with --events-folder",
-        options=(*_EVENTS, "folder", "folder_megabytes", "clips"),
+        options=(*_EVENTS, "folder", "folder_megabytes"),
     ),
     "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "picture", "key")),
     "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "picture", "key")),

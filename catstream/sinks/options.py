@@ -32,7 +32,6 @@ KEYS: dict[str, tuple[Any, str]] = {
     "secret_file": (str, "a text"),
     "events_folder": (str, 'a text, for example "events/{stream}"'),
     "events_megabytes": (Annotated[float, Meta(gt=0)], "a number above 0"),
-    "events_clips": (bool, "true or false"),
 }
 
 #: Field of `SinkOptions` -> the key that sets it.
@@ -46,7 +45,6 @@ _KEY_OF = {
     "key": "secret_file",
     "folder": "events_folder",
     "folder_megabytes": "events_megabytes",
-    "clips": "events_clips",
 }
 
 

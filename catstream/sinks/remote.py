@@ -68,14 +68,11 @@ class PicturedEvents:
 
     If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none.
 
-    pictures      the newest pictures, at most `capacity`, oldest first
-    last_arrival  time at which the last one arrived, on a monotonic clock
     """
 
-    def __init__(self, origin: Origin, capacity: int = 1) -> None:
+    def __init__(self, origin: Origin) -> None:
         self.events = Events(origin.options)
-        self.pictures: deque[Preview] = deque(maxlen=capacity)
-        self.last_arrival = time.monotonic()
+        self._newest: Preview | None = None
         self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
         self._previews: Subscription[Preview] = subscribe(origin.address, "previews", timeout=0)
 
@@ -88,9 +85,8 @@ class PicturedEvents:
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in self.events.update(tracks)]
         with suppress(SilenceError):  # no further picture has arrived
             for preview in self._previews:
-                self.pictures.append(preview)
-                self.last_arrival = now
-        newest, ready = self._newest(), []
+                self._newest = preview
+        newest, ready = self._newest, []
         while self._waiting:
             event, due = self._waiting[0]
             if now < due and (newest is None or newest.frame < event.track.frame):
@@ -102,10 +98,7 @@ class PicturedEvents:
         """Return the last events."""
         self._previews.close()
         events = (*(event for event, _ in self._waiting), *self.events.close())
-        return [(event, self._newest()) for event in events]
-
-    def _newest(self) -> Preview | None:
-        return self.pictures[-1] if self.pictures else None
+        return [(event, self._newest) for event in events]
 
 
 class EventMessages:

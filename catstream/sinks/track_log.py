@@ -43,7 +43,6 @@ from catstream.sinks.destinations import (
     idle,
     is_file,
     open_sink,
-    sink_of,
 )
 from catstream.sinks.remote import Warnings
 from catstream.wire.codec import decode_json
@@ -376,10 +375,9 @@ class RunFiles:
         files = [(f"the destination {place}", Path(place)) for place in self.places if is_file(place)]
         check_distinct([*files, *(others or {}).items()], VideoError)
         for place in self.places:
-            row = sink_of(place)
             check_sink(place, self.origin.options, source)
             if is_file(place):
-                continued = place in earlier and row.follows_log and self._log() is not None
+                continued = place in earlier and self._log() is not None
                 if place in earlier and not continued and Path(place).exists():
                     raise VideoError(f"{place} cannot be continued: pass other destinations to resume (--write DEST)")
                 check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
@@ -426,7 +424,7 @@ class RunFiles:
                 return stack.enter_context(closing(open_sink(place, continued)))
 
             sinks = {place: opened(place) for place in self.places}
-            followers = [sink for place, sink in sinks.items() if sink_of(place).follows_log and Path(place) != path]
+            followers = [sink for place, sink in sinks.items() if is_file(place) and Path(place) != path]
             for frame in log.frames() if log is not None and last is not None and followers else ():
                 for sink in followers:
                     sink.write(frame)
@@ -449,7 +447,7 @@ class RunFiles:
         for place in map(Path, filter(is_file, self.places)):
             with writing(place, VideoError):
                 place.parent.mkdir(parents=True, exist_ok=True)
-                if place.exists() and not (resume and sink_of(str(place)).follows_log and self._log() is not None):
+                if place.exists() and not (resume and self._log() is not None):
                     changed = datetime.fromtimestamp(place.stat().st_mtime)
                     place.rename(place.with_stem(f"{place.stem}-{changed:%Y%m%dT%H%M%S}"))
         self.check(overwrite=True, earlier=[])

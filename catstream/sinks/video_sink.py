@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-import numpy as np
-
 from catstream.client.attach import subscribe
 from catstream.errors import SilenceError, VideoError
 from catstream.messages.kinds import Preview, Track
@@ -51,20 +49,18 @@ class SourceVideo:
         self._video.close()
 
 
-class DrawnPictures:
-    """The small pictures that a running pipeline sends, with their tracks drawn in."""
+class PictureVideo:
+    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
 
-    def __init__(self, origin: Origin) -> None:
+    def __init__(self, place: str, origin: Origin) -> None:
+        self._place, self._colours = place, Colours()
         self._previews = subscribe(origin.address, "previews", timeout=0)
         self._tracks: dict[int, list[Track]] = {}  # of the newest frames, by the number of the frame
         self._picture: Preview | None = None  # not drawn yet: its frame may have further tracks
-        self._colours = Colours()
+        self._video: VideoWriter | None = None
 
-    def update(self, frame: TrackedFrame) -> tuple[np.ndarray, float] | None:
-        """Add tracks; return the next picture whose frame has all its tracks, uint8 (h, w, 3) BGR, and its time.
-
-        None if there is none yet.
-        """
+    def write(self, frame: TrackedFrame) -> None:
+        """Add tracks, and the next picture whose frame has all its tracks."""
         self._tracks.setdefault(frame.number, []).extend(frame.tracks)
         if len(self._tracks) > _BACKLOG:
             del self._tracks[next(iter(self._tracks))]
@@ -72,37 +68,18 @@ class DrawnPictures:
             with suppress(SilenceError):
                 self._picture = next(self._previews, None)
         if self._picture is None or self._picture.frame >= frame.number:
-            return None
+            return
         picture, self._picture = self._picture, None
         tracks = self._tracks.get(picture.frame, [])
         image = preview_image(picture, tracks, self._colours) if tracks else None
-        if image is None:
-            return None
-        self._colours.keep(track.object for track in tracks)
-        return image, tracks[0].time
+        if image is not None:
+            self._colours.keep(track.object for track in tracks)
+            size = (image.shape[1], image.shape[0])
+            self._video = self._video or VideoWriter(self._place, RATE, size, comment=ANNOTATED)
+            self._video.write(image, tracks[0].time)
 
     def close(self) -> None:
-        """Unsubscribe: the pipeline makes no pictures without a subscriber."""
         self._previews.close()
-
-
-class PictureVideo:
-    """An MP4 of the small pictures that a running pipeline sends, with their tracks drawn in, at their true times."""
-
-    def __init__(self, place: str, origin: Origin) -> None:
-        self._place, self._pictures = place, DrawnPictures(origin)
-        self._video: VideoWriter | None = None
-
-    def write(self, frame: TrackedFrame) -> None:
-        if (drawn := self._pictures.update(frame)) is not None:
-            image, time = drawn
-            self._video = self._video or VideoWriter(
-                self._place, RATE, (image.shape[1], image.shape[0]), comment=ANNOTATED
-            )
-            self._video.write(image, time)
-
-    def close(self) -> None:
-        self._pictures.close()
         if self._video is None:
             raise VideoError(
                 f"{self._place} was not written: the pipeline sent no picture of a frame that was received"

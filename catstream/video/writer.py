@@ -1,4 +1,4 @@
-"""Encodes images as H.264, and writes them to an MP4 file or to a streaming server."""
+"""Encodes images as H.264, and writes them to an MP4 file."""
 
 from __future__ import annotations
 
@@ -11,28 +11,20 @@ from typing import Any
 import cv2
 import numpy as np
 
-from catstream.base.addresses import without_password
 from catstream.base.files import open_locked
 from catstream.errors import VideoError
 
 #: Steps of the time base per frame: the precision of time stamps if the frame rate is not constant.
 _TICKS_PER_FRAME = 100
 
-#: Seconds between keyframes, at the average rate: a viewer who joins a live stream waits for one.
+#: Seconds between keyframes, at the average rate.
 _KEYFRAME_SECONDS = 2
 
 #: The largest image, in pixels, that is encoded with the slower preset: 1920x1080 with a line of text below it.
 _LARGE_PIXELS = 1920 * 1200
 
-#: Format and options of a file: fragments of a second, which `close` turns into a regular MP4 with one index.
-_FILE = "mp4", {"movflags": "hybrid_fragmented", "frag_duration": "1000000", "flush_packets": "1"}
-
-#: Those of a server, by protocol. RTSP over TCP passes firewalls and loses nothing; its timeout is in microseconds.
-_SERVERS: dict[str, tuple[str, dict[str, str]]] = {
-    "rtsp": ("rtsp", {"rtsp_transport": "tcp", "timeout": "3000000"}),
-    "rtmp": ("flv", {}),
-}
-
+#: Fragments of a second, which `close` turns into a regular MP4 with one index.
+_OPTIONS = {"movflags": "hybrid_fragmented", "frag_duration": "1000000", "flush_packets": "1"}
 
 #: Comment in a video of drawn tracks, which has a line of text below each frame.
 ANNOTATED = "annotated by catstream"
@@ -109,25 +101,23 @@ class Encoder:
 
 
 class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
-    """Writes images as H.264 to an MP4 file, or to an RTSP or RTMP server.
+    """Writes images as H.264 to an MP4 file.
 
-    A file grows in fragments of a second: if the process is killed or the disk is full, it is readable up to there.
+    It grows in fragments of a second: if the process is killed or the disk is full, it is readable up to there.
     Its folder is made, and it is locked until it is closed. A file without a frame is removed, and so is one whose
     `with` block is left by an error or Ctrl-C.
 
-    FFmpeg blocks all threads of the process while it connects to a server, and `write` blocks while the server is slow.
-
-    target : path of a file, or address of a server
+    path : file, which is replaced
     rate : average of frames per second
     size : width and height of the images in pixels
     comment : stored in the file
 
-    VideoError, also from the constructor, if the target cannot be written to.
+    VideoError, also from the constructor, if the file cannot be written.
     """
 
     def __init__(
         self,
-        target: str | Path,
+        path: str | Path,
         rate: float,
         size: tuple[int, int],
         *,
@@ -136,20 +126,14 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
     ) -> None:
         import av
 
-        self._target, self.frames, self._has_failed = str(target), 0, False
-        server = _SERVERS.get(self._target.partition("://")[0])
-        self._path = None if server else Path(target).absolute()
-        form, options = server or _FILE
+        self._path, self.frames, self._has_failed = Path(path).absolute(), 0, False
         with self._reporting_errors():
-            if self._path is not None:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._container: Any = av.open(str(self._path or target), "w", format=form, container_options=options)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._container: Any = av.open(str(self._path), "w", format="mp4", container_options=_OPTIONS)
             self._container.metadata["comment"] = comment
             self._encoder = Encoder(size, rate, self._container, pixel_aspect=pixel_aspect)
-            if self._path is None:  # a file without a frame has no header: FFmpeg crashes if it completes one
-                self._container.start_encoding()
-            else:  # FFmpeg opens the file once more, for the first image
-                self._lock = open_locked(self._path, VideoError, mode="ab")
+            # FFmpeg opens the file once more, for the first image.
+            self._lock = open_locked(self._path, VideoError, mode="ab")
 
     def write(self, image: np.ndarray, time: float | None = None) -> None:
         """Add a frame, uint8 (h, w, 3), blue green red, of the size given to the constructor; times as in `Encoder`."""
@@ -158,21 +142,17 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         self.frames += 1
 
     def close(self) -> None:
-        """Complete the file, or disconnect."""
+        """Complete the file."""
         try:
             with self._reporting_errors():
                 if self.frames and not self._has_failed:  # a failed container crashes the process
                     self._container.mux(self._encoder.flush())
                 self._container.close()
-        except VideoError:
-            if self._path is not None:
-                raise
         finally:
-            if self._path is not None:
-                self._lock.close()
-                if not self.frames:
-                    with contextlib.suppress(OSError):  # the disk may have become read-only
-                        self._path.unlink(missing_ok=True)
+            self._lock.close()
+            if not self.frames:
+                with contextlib.suppress(OSError):  # the disk may have become read-only
+                    self._path.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def _reporting_errors(self) -> Iterator[None]:
@@ -182,7 +162,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             yield
         except (OSError, av.FFmpegError) as error:
             self._has_failed = True
-            raise VideoError(f"cannot write the video {without_password(self._target)}: {error.strerror}") from error
+            raise VideoError(f"cannot write the video {self._path}: {error.strerror}") from error
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:

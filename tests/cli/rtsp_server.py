@@ -1,14 +1,13 @@
 """A real RTSP server on loopback, GStreamer's: the JPEGs of a folder again and again, as H.264, 30 a second.
 
 For a Python that has `gi`, usually the system's: `python3 rtsp_server.py FOLDER PORT` prints its port, and runs
-until it is killed. With a third word, it takes a stream in RECORD mode, and writes it to FOLDER/WORD. Without
-GStreamer's server or a plugin of it, it says so and exits with 3.
+until it is killed. Without GStreamer's server or a plugin of it, it says so and exits with 3.
 """
 
 import sys
 
 
-def main(folder, port, record=""):
+def main(folder, port):
     try:
         import gi
 
@@ -27,17 +26,12 @@ def main(folder, port, record=""):
         "x264enc tune=zerolatency speed-preset=ultrafast threads=1 key-int-max=30",
         "rtph264pay name=pay0 pt=96",
     )
-    if record:
-        depay = "rtph264depay name=depay0 ! video/x-h264,stream-format=byte-stream,alignment=au"
-        steps = (depay, f"filesink location={folder}/{record}")
     missing = [step.split()[0] for step in steps if not Gst.ElementFactory.find(step.split()[0])]
     if missing:
         print("GStreamer has no", ", ".join(missing), file=sys.stderr)
         sys.exit(3)
     factory = GstRtspServer.RTSPMediaFactory()
     factory.set_launch(f"( {' ! '.join(steps)} )")
-    if record:
-        factory.set_transport_mode(GstRtspServer.RTSPTransportMode.RECORD)
     factory.set_shared(True)
     server = GstRtspServer.RTSPServer()
     server.set_address("127.0.0.1")

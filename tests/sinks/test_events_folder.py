@@ -12,7 +12,7 @@ from catstream.client.address import Address
 from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
-from catstream.sinks import events_folder, remote
+from catstream.sinks import remote
 from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.newest import Publisher
@@ -41,9 +41,9 @@ def writing(folder, endpoint, until, **options):
         yield sink, previews
 
 
-def kinds(folder, suffix=".jpg"):
-    """Events and objects of the pictures, oldest first; or those of the clips."""
-    return [file.stem.split("-", 1)[1] for file in sorted(folder.glob(f"2*{suffix}"))]
+def kinds(folder):
+    """Events and objects of the pictures, oldest first."""
+    return [file.stem.split("-", 1)[1] for file in sorted(folder.glob("2*.jpg"))]
 
 
 def test_each_event_has_a_picture_of_its_frame_or_a_later_one(tmp_path, endpoint, until, image):
@@ -75,34 +75,13 @@ def test_the_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint
     assert sum(file.stat().st_size for file in tmp_path.glob("2*.jpg")) <= 4 * len(image)
 
 
-def test_the_clip_of_an_event_has_the_pictures_of_five_seconds_before_and_after(tmp_path, endpoint, until, image):
-    """Each of the 13 frames, one a second, has an event; the last clips end where the run ends."""
-    with writing(tmp_path, endpoint, until, clips=True, lost_seconds=0) as (sink, previews):
-        for second in range(13):
-            previews.send(Preview(10 * second, float(second), 640, 480, {}, image))
-            again = partial(sink.write, frame(10 * second, None if second % 2 else BOX))
-            until(lambda count=second + 1: len(kinds(tmp_path)) == count, again)
-        until(lambda: len(kinds(tmp_path, ".mp4")) == 8, sink.idle)
-    lengths = [cv2.VideoCapture(str(clip)).get(cv2.CAP_PROP_FRAME_COUNT) for clip in sorted(tmp_path.glob("*.mp4"))]
-    assert lengths == [6, 7, 8, 9, 10, 11, 11, 11, 10, 9, 8, 7, 6]
-
-
-def test_if_frames_stop_an_event_has_the_last_picture_and_its_clip_ends(tmp_path, endpoint, until, image, monkeypatch):
+def test_if_frames_stop_an_event_has_the_last_picture(tmp_path, endpoint, until, image, monkeypatch):
     monkeypatch.setattr(remote, "_PICTURE_SECONDS", 0.1)
-    monkeypatch.setattr(events_folder, "_CLIP_SECONDS", 0.5)
-    with writing(tmp_path, endpoint, until, clips=True) as (sink, previews):
+    with writing(tmp_path, endpoint, until) as (sink, previews):
         previews.send(Preview(0, 0.0, 640, 480, {}, image))
         until(lambda: kinds(tmp_path) == ["found-anna"], partial(sink.write, frame(0)))
         sink.write(frame(30, None))
         until(lambda: kinds(tmp_path) == ["found-anna", "lost-anna"], sink.idle)
-        until(lambda: "found-anna" in kinds(tmp_path, ".mp4"), sink.idle)
-
-
-def test_clips_count_for_the_limit(tmp_path, endpoint, until, image):
-    with writing(tmp_path, endpoint, until, clips=True, events=("found",), folder_megabytes=1e-6) as (sink, previews):
-        previews.send(Preview(0, 0.0, 640, 480, {}, image))
-        until(lambda: kinds(tmp_path) == ["found-anna"], partial(sink.write, frame(0)))
-    assert [file.suffix for file in tmp_path.iterdir()] == [".mp4"], "the newest file stays"
 
 
 def test_a_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):
@@ -112,10 +91,9 @@ def test_a_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):
         check_sink(*options.places, options)
 
 
-def test_a_run_writes_pictures_of_its_events_and_a_clip_of_those_of_one_frame(demo_video, tmp_path, succeed):
+def test_a_run_writes_pictures_of_its_events(demo_video, tmp_path, succeed):
     video, boxes = demo_video(32)
-    options = ("--events-folder", tmp_path, "--events-clips", "--zone", "all=0,0 320,0 320,240 0,240")
+    options = ("--events-folder", tmp_path, "--zone", "all=0,0 320,0 320,240 0,240")
     succeed("track", video, "--box", f"flower={boxes[0]}", *options)
     found, *others = kinds(tmp_path)
     assert (found, others) == ("found-flower", ["entered-flower-all", "left-flower-all", "ended-flower"])
-    assert kinds(tmp_path, ".mp4") == ["found-flower", "left-flower-all"]

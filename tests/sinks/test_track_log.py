@@ -158,17 +158,18 @@ def test_a_frame_counts_only_if_it_is_whole_at_each_byte_at_which_a_file_can_end
 
 
 def test_existing_files_are_replaced_on_request_and_continued_by_their_own_run_only(tmp_path):
-    run = run_in(tmp_path, "t.csv", "t.mcap")
-    add(replace(run, places=run.places[:3]), [[""]] * 2)
+    run = run_in(tmp_path, "t.csv")
+    add(run, [[""]] * 2)
     with pytest.raises(VideoError, match=r"walk\.ndjson exists already: replace it with --overwrite"):
         run.check(overwrite=False, earlier=[])
     run.check(overwrite=True, earlier=[])
     run.check(overwrite=False, earlier=run.places)
     with pytest.raises(VideoError, match=r"t\.csv exists already"):
         run.check(overwrite=False, earlier=run.places[:2])
-    Path(run.places[3]).touch()
-    with pytest.raises(VideoError, match=r"t\.mcap cannot be continued: pass other destinations to resume"):
-        run.check(overwrite=False, earlier=run.places)
+    video = RunFiles(Origin(), None, [str(tmp_path / "t.mp4")])  # which is not a log
+    (tmp_path / "t.mp4").touch()
+    with pytest.raises(VideoError, match=r"t\.mp4 cannot be continued: pass other destinations to resume"):
+        video.check(overwrite=False, earlier=video.places)
 
 
 @pytest.mark.parametrize(
