@@ -18,11 +18,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from catstream.base.files import check_file, write_atomically, writing
-from catstream.base.names import UNNAMED, split_name
+from catstream.base.names import split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
-from catstream.cli.options import PATH, with_json, with_overwrite
+from catstream.cli.options import PATH, with_json
 from catstream.cli.view import HostPort, fleet_view, with_token, with_view
 from catstream.cli.write import check_options, with_sink_options
 from catstream.client.address import Address
@@ -194,7 +193,6 @@ fleet.add_command(fleet_view)
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A setting.")
 @click.option("--cores", type=float, metavar="N", help="Processor cores that Ray reserves for it; default: 1.")
 @click.option("--label", "labels", multiple=True, metavar="NAME=VALUE", help="Label that its node must have.")
-@click.option("--follow", multiple=True, metavar="OBJECT", help="Search for an object by its merged model.")
 @click.option("--write", multiple=True, metavar="DEST", help="Destination of its tracks, as for catstream track.")
 @with_sink_options
 @with_fleet
@@ -207,7 +205,6 @@ def add(
     settings: tuple[str, ...],
     cores: float | None,
     labels: tuple[str, ...],
-    follow: tuple[str, ...],
     write: tuple[str, ...],
     options: SinkOptions,
 ) -> None:
@@ -231,7 +228,6 @@ def add(
         "models": dict(map(split_name, models)),
         "settings": dict(setting.partition("=")[::2] for setting in settings),
         "labels": dict(label.partition("=")[::2] for label in labels),
-        "follow": list(follow),
     }
     spec = StreamSpec.parse(name, table | ({} if cores is None else {"cores": cores}), Path.cwd())
     places, options = resolved(write, options, Path.cwd(), name, source)
@@ -247,54 +243,6 @@ def remove(running: Fleet, names: tuple[str, ...], forget: bool) -> None:
     """Remove streams; their models stay in the store."""
     for line in running.remove(*names, forget=forget):
         click.echo(line)
-
-
-@fleet.command(short_help="Move all streams away from a node.")
-@click.argument("node")
-@click.option("--undo", is_flag=True, help="Allow streams on the node again.")
-@with_fleet
-def drain(running: Fleet, node: str, undo: bool) -> None:
-    """Move all streams away from a NODE, and schedule none there.
-
-    Streams wait if the other nodes have no free cores for them.
-    """
-    click.echo(running.drain(node, undo=undo))
-
-
-@fleet.command(short_help="Merge what several streams have learned of an object.")
-@click.argument("names", nargs=-1)
-@click.option(
-    "--object",
-    "object_name",
-    default=UNNAMED,
-    metavar="NAME",
-    help="Name of the object; default: the only one of NAMES.",
-)
-@click.option("-o", "--output", type=PATH, metavar="FILE", help="Write the model to a file, too.")
-@with_overwrite
-@with_fleet
-def merge(running: Fleet, names: tuple[str, ...], object_name: str, output: Path | None, overwrite: bool) -> None:
-    """Merge what the streams NAMES have learned of an object; default: all.
-
-    The model is kept in the store of the fleet, and each stream that follows
-    the object searches for it by this model. A state in the store is a few
-    seconds old. Frames that several states contain are counted once.
-
-    \b
-    EXAMPLE
-      catstream fleet merge cam-1 cam-2 --object anna -o anna.safetensors
-    """
-    if output is not None:
-        check_file(output, overwrite=overwrite)
-    with Console(stderr=True).status("merging"):
-        merged = running.merge(*names, object=object_name)
-    if output is not None:
-        with writing(output):
-            write_atomically(output, merged.model)
-    line = f"merged: {', '.join(merged.streams)}"
-    if merged.skipped:
-        line += f"; the frames of these are in them already, at least in part: {', '.join(merged.skipped)}"
-    click.echo(line)
 
 
 @fleet.command()

@@ -1,8 +1,8 @@
 """A stream of a fleet: one pipeline on this node, its state in the store, and what the controller asks for.
 
 A `Stream` has nothing of Ray in it; `catstream.fleet.controller` makes an actor of it. Its pipeline runs in a thread of
-its own, and is started again after a failure. Its state is stored by another thread, which also looks for merged models
-in the store, so that a slow store does not stop the tracks.
+its own, and is started again after a failure. Its state is stored by another thread, so that a slow store does not stop
+the tracks.
 """
 
 from __future__ import annotations
@@ -12,10 +12,8 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
 from catstream.base.addresses import is_live, without_password
@@ -31,7 +29,7 @@ from catstream.errors import (
     StoreError,
 )
 from catstream.fleet.spec import StreamSpec
-from catstream.fleet.store import Claim, Snapshot, Store
+from catstream.fleet.store import Claim, Store
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import files, restore
 from catstream.messages.kinds import StreamState, StreamStatus, Track
@@ -51,11 +49,6 @@ _STORING_SHARE = 0.1  # of the time, at most, in which states are stored
 _LATE = 3.0  # a state that is older than so many intervals is a trouble
 
 _log = logging.getLogger(__name__)
-
-
-def initial_model(stream: str, name: str) -> str:
-    """The name in the store of the saved model of an object in the spec of a stream."""
-    return f"initial.{sha256(f'{stream}/{name}'.encode()).hexdigest()[:32]}"
 
 
 class Stream:
@@ -81,26 +74,22 @@ class Stream:
         self._failure = self._store_trouble = self._pipeline_trouble = ""
         self._superseded = self._has_tracked = False
         self._files: set[tuple[str, int]] = set()  # of the state that was stored last, with their times
-        self._follow: tuple[str, ...] = spec.follow
         self._stack = ExitStack()
         self._folder = self._stack.enter_context(private_folder())
         self._keys = self._folder / "keys"
         self._thread = threading.Thread(target=self._run, name=f"stream {spec.name}", daemon=True)
         self._thread.start()
 
-    def report(
-        self, clients: dict[str, Client] | None = None, follow: Iterable[str] | None = None
-    ) -> tuple[StreamStatus, bool]:
+    def report(self, clients: dict[str, Client] | None = None) -> tuple[StreamStatus, bool]:
         """The state of the stream now, and whether it ended because another process has claimed it.
 
-        From now on, only these clients may connect, and it searches for these objects by their newest merged models.
+        From now on, only these clients may connect.
         """
         with self._lock:
             if clients is not None and clients != self._clients:
                 self._clients = clients
                 if self._address and self._keys.exists():
                     synchronise(self._keys, clients)
-            self._follow = self._follow if follow is None else tuple(follow)
             age = time.time() - self._stored_at if self._stored_at else 0.0
             is_late = min(age, time.time() - self._began_at) > _LATE * self._every and not self._store_trouble
             late = f"its state was stored {age:.0f} s ago" if is_late and self._status.state == "running" else ""
@@ -166,7 +155,7 @@ class Stream:
                 )
             self._change_objects(pipeline, facts)
             over = threading.Event()
-            storing = threading.Thread(target=self._keep_storing, args=(claim, pipeline, over), name="store")
+            storing = threading.Thread(target=self._keep_storing, args=(claim, over), name="store")
             storing.daemon = True  # a store that hangs must not keep the process
             storing.start()
             stack.callback(storing.join)
@@ -238,28 +227,15 @@ class Stream:
                     with suppress(CommandRejectedError):  # it was forgotten already
                         controlled.forget(name)
         for name in sorted(self._spec.models.keys() - before):
-            if (model := self._store.model(initial_model(self._spec.name, name)).newest()) is None:
+            if (model := self._store.model(self._spec.name, name).newest()) is None:
                 raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
-            self._search(pipeline, model, name)
-
-    def _search(self, pipeline: Pipeline, model: Snapshot, name: str) -> None:
-        """Search for an object by a saved model in the store."""
-        learned = SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store")
-        with self._control(pipeline) as controlled:
-            controlled.search(learned, name)
+            learned = SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store")
+            with self._control(pipeline) as controlled:
+                controlled.search(learned, name)
 
     @staticmethod
     def _control(pipeline: Pipeline) -> Control:
         return control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
-
-    def _search_merged(self, pipeline: Pipeline, tokens: dict[str, int]) -> None:
-        """Search for each followed object that is not present by a merged model that is newer than the last one."""
-        for name in self._follow:
-            if self._status.present.get(name):
-                continue
-            if (model := self._store.model(name).newest(tokens.get(name, 0))) is not None:
-                tokens[name] = model.token
-                self._search(pipeline, model, name)
 
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
         """Take the tracks of a frame; an empty mapping means that none has arrived for a while."""
@@ -279,18 +255,13 @@ class Stream:
             self._status = replace(status, state=state, skipped=skipped, present=present)
             self._pipeline_trouble = "; ".join(troubles)
 
-    def _keep_storing(self, claim: Claim, pipeline: Pipeline, over: threading.Event) -> None:
+    def _keep_storing(self, claim: Claim, over: threading.Event) -> None:
         """Store the state every few seconds until the pipeline is over, or another process has claimed the stream."""
-        tokens: dict[str, int] = {}  # token of the merged model of each object that was searched for
         pause = self._every
         while not over.wait(pause) and not self._superseded:
             began = time.monotonic()
             self._write(claim)
             pause = max(self._every, (time.monotonic() - began) / _STORING_SHARE)
-            try:
-                self._search_merged(pipeline, tokens)
-            except CatstreamError as error:
-                _log.warning("%s does not search by a merged model: %s", self._spec.name, error)
 
     def _write(self, claim: Claim, *, is_last: bool = False, ended: bool = False) -> None:
         """Store the newest checkpoint, if it has changed. A failure is a trouble; a newer claim ends the stream."""

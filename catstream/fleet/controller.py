@@ -21,7 +21,7 @@ from typing import Literal
 from catstream.base.addresses import is_live, without_password
 from catstream.errors import CatstreamError
 from catstream.fleet import lifecycle
-from catstream.fleet.actor import Stream, initial_model
+from catstream.fleet.actor import Stream
 from catstream.fleet.lifecycle import Actor, Node
 from catstream.fleet.registry import RegistryServer
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
@@ -94,7 +94,7 @@ class Controller:
 
     def apply(self, spec: FleetSpec, models: Models) -> list[str]:
         """Let these streams run, and no others; returns what will be done, a line for each stream."""
-        return self._change(lambda before: replace(spec, draining=before.draining), models)
+        return self._change(lambda _: spec, models)
 
     def add(self, stream: StreamSpec, models: Models) -> list[str]:
         return self._change(lambda before: replace(before, streams=before.streams | {stream.name: stream}), models)
@@ -109,12 +109,6 @@ class Controller:
             return replace(before, streams=streams)
 
         return self._change(changed)
-
-    def drain(self, node: str, *, undo: bool) -> None:
-        """Let all streams leave a node, or let it take streams again."""
-        self._change(
-            lambda before: replace(before, draining=before.draining - {node} if undo else before.draining | {node})
-        )
 
     def status(self) -> FleetStatus:
         with self._lock:
@@ -151,12 +145,11 @@ class Controller:
             spec = change(self._spec)
             spec.check_follows(self._spec)
             for (stream, name), data in (models or {}).items():
-                self._store.model(initial_model(stream, name)).put({"model": data}, {})
+                self._store.model(stream, name).put({"model": data}, {})
             self._store.fleet.put({"fleet": to_json(spec)}, {})
             with self._lock:
                 lines = self._spec.changes(spec, self._ended, are_running=self._phase == "up")
                 self._spec, self._phase = spec, "up"
-                self._nodes = self._marked(self._nodes)
                 for name in self._actors.keys() - spec.streams.keys():  # it would be taken for the next one of its name
                     self._actors[name].status, self._actors[name].ended = None, ""
                 self._recent = self.status()
@@ -207,7 +200,7 @@ class Controller:
 
         cluster, existing = nodes(), actors(self._name)  # without the lock: they ask the head
         with self._lock:
-            self._nodes = self._marked(cluster)
+            self._nodes = cluster
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
                 self._clients = allowed(self._keys)  # the next reports tell the streams
@@ -227,9 +220,6 @@ class Controller:
                 if self._actors[name].state == "absent":
                     del self._actors[name]
             self._recent = self.status()
-
-    def _marked(self, cluster: list[Node]) -> list[Node]:
-        return [replace(node, draining=node.name in self._spec.draining) for node in cluster]
 
     def _desired(self, name: str) -> StreamSpec | None:
         """The spec of a stream; None if it should not run now."""
@@ -256,8 +246,7 @@ class Controller:
             now = time.monotonic()
             actor.state, actor.order, actor.since, actor.answered = "pending", order, now, now
         if actor.call is None:
-            spec = self._spec.streams.get(name)
-            actor.call = actor.handle.report.remote(self._clients, spec.follow if spec is not None else ())
+            actor.call = actor.handle.report.remote(self._clients)
 
     def _hear(self, name: str, actor: Actor) -> None:
         """Take the answer of the actor of a stream, if it has arrived."""
@@ -290,7 +279,7 @@ class Controller:
         import ray
 
         spec, now, before = self._desired(name), time.monotonic(), actor.state
-        happened = lifecycle.event(spec, actor, self._nodes, now)
+        happened = lifecycle.event(spec, actor, now)
         if happened is None or (step := lifecycle.TABLE.get((before, happened))) is None:
             return
         after, action = step
@@ -315,23 +304,22 @@ class Controller:
     def _start(self, spec: StreamSpec, actor: Actor, now: float) -> None:
         import ray
 
-        order = lifecycle.order(spec, self._nodes)
         with suppress(ValueError):  # the name is taken: the actor before it is not quite gone
             actor.handle = (
                 ray.remote(StreamActor)
                 .options(
-                    name=actor_name(self._name, "stream", spec.name, order),
+                    name=actor_name(self._name, "stream", spec.name, spec.order),
                     namespace=NAMESPACE,
                     lifetime="detached",
                     num_cpus=spec.cores,
                     max_restarts=-1,
                     max_concurrency=4,
-                    label_selector=lifecycle.selector(spec, self._nodes) or None,
+                    label_selector=dict(spec.labels) or None,
                     scheduling_strategy="SPREAD",
                 )
                 .remote(spec, self._clients, self._spec.store, self._spec.every)
             )
-            actor.state, actor.order, actor.ended = "pending", order, ""
+            actor.state, actor.order, actor.ended = "pending", spec.order, ""
             actor.since = actor.started = actor.answered = now
 
     def _stream_status(self, name: str) -> StreamStatus:
@@ -342,7 +330,7 @@ class Controller:
             node = next((node.name for node in self._nodes if node.id == actor.node), "")
             quiet = now - actor.answered
             trouble = f"it has not answered for {quiet:.0f} s" if quiet > QUIET_SECONDS else last.trouble
-            leaves = self._phase == "up" and lifecycle.event(self._desired(name), actor, self._nodes, now) == "unwanted"
+            leaves = self._phase == "up" and lifecycle.event(self._desired(name), actor, now) == "unwanted"
             return replace(last, node=node, state="moving" if leaves else last.state, trouble=trouble)
         age = None if last.stored_seconds is None else last.stored_seconds + now - actor.answered
         last = replace(last, state="starting", node="", endpoint="", server="", stored_seconds=age)
@@ -359,9 +347,10 @@ class Controller:
         return last
 
     def _node_status(self, node: Node) -> NodeStatus:
-        state: NodeState = "dead" if not node.alive else "draining" if node.draining else "alive"
-        here = [actor for actor in self._actors.values() if actor.node == node.id and actor.state == "working"]
-        used = sum(float(actor.order.split("/")[1]) for actor in here)
+        state: NodeState = "alive" if node.alive else "dead"
+        working = (name for name, actor in self._actors.items() if actor.node == node.id and actor.state == "working")
+        here = [name for name in working if name in self._spec.streams]
+        used = sum(self._spec.streams[name].cores for name in here)
         return NodeStatus(node.name, state, node.address, node.cores, used, dict(node.labels), len(here))
 
 

@@ -27,27 +27,22 @@ import secrets
 import signal
 import socket
 import sys
-import tempfile
 import threading
 import time
 import warnings
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from catstream.base.files import is_locked, lock, state_home, write_atomically
-from catstream.base.names import UNNAMED, check_name
-from catstream.base.text import counted
 from catstream.client.registry import REGISTRY_PORT
-from catstream.errors import CatstreamError, FleetError, ObjectError, ServiceError, StoreError, require_extra
-from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors, nodes
+from catstream.errors import CatstreamError, FleetError, require_extra
+from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
-from catstream.jobs import state
-from catstream.jobs.job import Job
-from catstream.jobs.saved_model import SavedModel, disjoint, merge
+from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import FleetStatus
 from catstream.wire.discovery import private_folder
 
@@ -57,7 +52,7 @@ _START_SECONDS = 150.0  # limit for another process to start Ray on this machine
 _LEAVE_SECONDS = 10.0  # limit for the process whose node it is to notice that the fleet has ended
 _REACH_SECONDS = 3.0  # limit to connect to the head
 _LOOK_SECONDS = 0.2  # between two looks at any of these
-_STORE_BYTES = 80 << 20  # of Ray's object store: only models that are merged go through it
+_STORE_BYTES = 80 << 20  # of Ray's object store: only saved models go through it
 
 #: Of a node that `up` starts. Ray listens on 127.0.0.1 alone only if it takes the machine for one without a cluster,
 #: and lowers the priority of its workers by default, so that streams starve beside other work.
@@ -67,20 +62,6 @@ _VARIABLES = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_worker_niceness": "0",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Merged:
-    """A merged model, which is in the store.
-
-    model    the content of its file
-    streams  that it was merged from
-    skipped  streams that share frames with one of those
-    """
-
-    model: bytes
-    streams: tuple[str, ...]
-    skipped: tuple[str, ...]
 
 
 class Fleet(AbstractContextManager["Fleet"]):
@@ -166,45 +147,10 @@ class Fleet(AbstractContextManager["Fleet"]):
                 store.stream(name).clear()  # its actor is superseded, if it still runs
         return _about(lines, names)
 
-    def drain(self, node: str, *, undo: bool = False) -> str:
-        """Move all streams from a node and place none there, for example before it is switched off.
-
-        Streams wait if the other nodes have no room for them.
-        """
-        self._connect()
-        live = [other.name for other in nodes() if other.alive]
-        if node not in live:
-            raise FleetError(f"no live node named {node!r} (live nodes: {', '.join(live) or 'none'})")
-        count = sum(stream.node == node for stream in self.status().streams.values())
-        self._ask("drain", node, undo=undo)
-        return f"{node} takes streams again" if undo else f"{node} is draining: {counted(count, 'stream')} to move"
-
     def status(self) -> FleetStatus:
         """The state of all streams and nodes."""
         answer: FleetStatus = self._ask("status")
         return answer
-
-    def merge(self, *names: str, object: str = UNNAMED) -> Merged:
-        """Merge what streams have learned of an object; the streams that follow it then search for it by the result.
-
-        Without names, all streams that have learned of it are merged. "" is also the only object of each stream.
-        """
-        import ray
-        from ray.exceptions import RayTaskError
-
-        spec: FleetSpec = self._ask("spec")
-        for name in names:
-            spec.check_stream(name)
-        # A node has the credentials of the store. A task reserves a core by default, and the streams may have them all.
-        remote: Any = ray.remote
-        task = remote(num_cpus=0)(merge_streams)
-        try:
-            merged: Merged = ray.get(
-                task.remote(spec.store, names or tuple(spec.streams), check_name(object), named=bool(names))
-            )
-        except RayTaskError as error:
-            raise (error.cause if isinstance(error.cause, CatstreamError) else error) from None
-        return merged
 
     def down(self) -> list[str]:
         """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too.
@@ -388,46 +334,6 @@ class Fleet(AbstractContextManager["Fleet"]):
             self._controller = None
             what = str(error).partition("\n")[0] or type(error).__name__
         raise FleetError(f"the controller of fleet {self.name} failed ({what}): see its log in Ray's log folder")
-
-
-def merge_streams(url: str, streams: Sequence[str], name: str, *, named: bool) -> Merged:
-    """Merge what the newest states of streams in a store have learned of an object, and store the model if it is new.
-
-    Frames are counted once: of streams that share frames, as they continue from one model, one is merged. If the
-    streams are `named`, each has to know the object; otherwise the others are skipped.
-    """
-    if not name and not named:
-        raise FleetError("ambiguous unnamed object: pass --object NAME, or the names of the streams that show it")
-    store = Store(url)
-    models = {stream: _learned(store, stream, name, named=named) for stream in streams}
-    learned = {stream: model for stream, model in models.items() if model is not None}
-    if not learned:
-        raise FleetError(f"no stream has learned of {name or 'the object'!r} yet: see catstream fleet status")
-    rows = {stream: sum(tree.rows_seen for tree in model.trees.values()) for stream, model in learned.items()}
-    chosen = disjoint({stream: (set(model.origins), rows[stream]) for stream, model in learned.items()})
-    first, *others = (learned[stream] for stream in chosen)
-    # The name says that the object is the same, so its appearances are not compared.
-    content = (merge([first, *others], force=True) if others else first).to_bytes()
-    stored = store.model(name)
-    if (before := stored.newest()) is None or before.files["model"] != content:  # followers get each new model
-        stored.put({"model": content}, {"streams": chosen})
-    return Merged(content, tuple(chosen), tuple(stream for stream in learned if stream not in chosen))
-
-
-def _learned(store: Store, stream: str, name: str, *, named: bool) -> SavedModel | None:
-    """The saved model of an object in the newest state of a stream in the store; None if there is none."""
-    try:
-        if (newest := store.stream(stream).newest()) is None:
-            raise FleetError("no state in the store yet")
-        with tempfile.TemporaryDirectory(prefix="catstream-merge-") as folder:
-            state.restore(Path(folder), newest.files)
-            return state.learned(Path(folder), Job.load(Path(folder)).settings, name)
-    except StoreError:
-        raise
-    except (ObjectError, ServiceError) as error:
-        if named:
-            raise FleetError(f"stream {stream}: {error}") from None
-        return None
 
 
 def _gcs_address() -> str:

@@ -6,9 +6,7 @@ here are those of the actor, as the controller sees it; what its pipeline does, 
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -21,7 +19,7 @@ _PAUSE_SECONDS = 5.0  # between two starts of one actor, at least: one may die e
 
 #: There is no actor; Ray places it, or it starts; it reports; it stores its last state and ends, or was killed.
 State = Literal["absent", "pending", "working", "stopping"]
-#: "unwanted" if it was removed or changed, or has to leave its node; "interrupted" if its process died, and Ray starts
+#: "unwanted" if it was removed or changed; "interrupted" if its process died, and Ray starts
 #: it again; "gone" once the actor has ended.
 Event = Literal["wanted", "reports", "interrupted", "silent", "unwanted", "superseded", "ended", "gone"]
 Action = Literal["", "start", "stop", "restart", "kill"]
@@ -49,13 +47,12 @@ TABLE: dict[tuple[State, Event], tuple[State, Action]] = {
 class Node:
     """A node of the cluster.
 
-    name      as given to `ray start --node-name`, by default its address
-    id        of Ray; a node that was started again has another one
-    address   its IP address
-    cores     for actors
-    labels    as given to `ray start --labels`
-    alive     whether it answers Ray's health checks
-    draining  whether its streams leave it, by `catstream fleet drain`
+    name     as given to `ray start --node-name`, by default its address
+    id       of Ray; a node that was started again has another one
+    address  its IP address
+    cores    for actors
+    labels   as given to `ray start --labels`
+    alive    whether it answers Ray's health checks
     """
 
     name: str
@@ -64,11 +61,6 @@ class Node:
     cores: float = 1.0
     labels: Mapping[str, str] = field(default_factory=dict)
     alive: bool = True
-    draining: bool = False
-
-    def suits(self, spec: StreamSpec) -> bool:
-        """Return True if a stream may run here."""
-        return not self.draining and spec.labels.items() <= self.labels.items()
 
 
 @dataclass(slots=True)
@@ -79,7 +71,7 @@ class Actor:
     since     moment at which the state began
     started   moment of its last start
     answered  moment of its last answer
-    order     what it was started for, as `order` says it: a part of its name
+    order     `StreamSpec.order` with which it was started: a part of its name
     node      id of the node that it reported from; "" if it has not reported since it was placed
     happened  what has happened to it since the last look; "" for nothing
     status    its last report; None before the first one
@@ -101,25 +93,13 @@ class Actor:
     call: Any = None
 
 
-def selector(spec: StreamSpec, nodes: Collection[Node]) -> dict[str, str]:
-    """The labels of the nodes on which a stream may run, as Ray's `label_selector` takes them."""
-    leaving = ",".join(sorted(node.id for node in nodes if node.draining))
-    return dict(spec.labels) | ({"ray.io/node-id": f"!in({leaving})"} if leaving else {})
-
-
-def order(spec: StreamSpec, nodes: Collection[Node]) -> str:
-    """The key of an actor: the digest of its stream, its cores, and a digest of the labels of its node."""
-    labels = json.dumps(selector(spec, nodes), sort_keys=True).encode()
-    return f"{spec.digest}/{spec.cores:g}/{hashlib.sha256(labels).hexdigest()[:8]}"
-
-
-def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: float) -> Event | None:
-    """The next action for a stream, None for none; it should not run if there is no spec of it.
+def event(spec: StreamSpec | None, actor: Actor, now: float) -> Event | None:
+    """The next event of a stream, None for none; it should not run if there is no spec of it.
 
     >>> gate = StreamSpec("gate", "demo:1")
-    >>> event(gate, Actor(), [], 0.0)
+    >>> event(gate, Actor(), 0.0)
     'wanted'
-    >>> event(gate, Actor("working", node="1", order=order(gate, [])), [Node("n1", "1", draining=True)], 0.0)
+    >>> event(gate, Actor("working", order="another"), 0.0)
     'unwanted'
     """
     if actor.state == "absent":
@@ -128,18 +108,9 @@ def event(spec: StreamSpec | None, actor: Actor, nodes: Collection[Node], now: f
         return "gone"
     if (actor.state, actor.happened) == ("working", "interrupted"):
         return "interrupted"  # it cannot be asked to stop
-    if actor.state != "stopping" and not (spec is not None and matches_spec(spec, actor, nodes)):
+    if actor.state != "stopping" and (spec is None or spec.order != actor.order):
         return "unwanted"
     if actor.happened:
         return actor.happened
     last, limit = (actor.since, STOPPING_SECONDS) if actor.state == "stopping" else (actor.answered, SILENT_SECONDS)
     return "silent" if actor.state != "pending" and now - last > limit else None
-
-
-def matches_spec(spec: StreamSpec, actor: Actor, nodes: Collection[Node]) -> bool:
-    """Return True if an actor was started for this spec, and runs, or will be placed, on a node that suits it."""
-    expected = order(spec, nodes)
-    node = next((node for node in nodes if node.id == actor.node and node.alive), None)
-    if node is None:
-        return actor.order == expected
-    return actor.order.rpartition("/")[0] == expected.rpartition("/")[0] and node.suits(spec)

@@ -1,4 +1,4 @@
-"""The desired state of a fleet: its streams, as a file in TOML describes them, and the nodes that they leave.
+"""The desired state of a fleet: its streams, as a file in TOML describes them.
 
 docs/how-to/fleet.md shows such a file. Relative paths count from its folder. Every error is a `FleetError` that names
 the stream, or the line of a file that is not TOML.
@@ -23,7 +23,7 @@ from msgspec import Meta
 
 from catstream.base.addresses import is_live
 from catstream.base.box import Box
-from catstream.base.names import UNNAMED, boxes_by_name, by_name, check_name
+from catstream.base.names import UNNAMED, boxes_by_name, by_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
 from catstream.errors import CatstreamError, FleetError
@@ -58,7 +58,6 @@ _STREAM: dict[str, tuple[Any, str]] = {
     "settings": (dict[str, Any], 'a table, for example { "coreset.size" = 128 }'),
     "cores": (Annotated[float, Meta(gt=0, le=4096)], "a number above 0"),
     "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
-    "follow": (str | list[Annotated[str, Meta(min_length=1)]], 'names of objects, for example ["anna"]'),
 } | KEYS
 
 #: Settings that the fleet sets for each stream.
@@ -76,7 +75,6 @@ class StreamSpec:
     settings  values of settings by full name
     cores     cores that Ray reserves for it
     labels    labels that its node must have
-    follow    objects whose merged model it searches for
     write     destinations of its tracks
     options   of these destinations
 
@@ -90,7 +88,6 @@ class StreamSpec:
     settings: dict[str, Any] = field(default_factory=dict)
     cores: float = 1.0
     labels: dict[str, str] = field(default_factory=dict)
-    follow: tuple[str, ...] = ()
     write: tuple[str, ...] = field(default=(), repr=False)  # an address may contain a password
     options: SinkOptions = field(default_factory=SinkOptions)
 
@@ -125,32 +122,34 @@ class StreamSpec:
                 if one in values and several in values:
                     raise FleetError(f"{one} and {several} are mutually exclusive: write all objects in {several}")
                 values.setdefault(several, {UNNAMED: values.pop(one)} if one in values else {})
-            source, follow = values["source"], values.get("follow", ())
+            source = values["source"]
             if source.strip() and not is_live(source) and "://" not in source:
                 values["source"] = str(folder / source)  # its node has another working folder
             values["boxes"] = boxes_by_name(values["boxes"])
             values["models"] = {object: folder / file for object, file in by_name(values["models"]).items()}
             values["settings"] = flat(values.get("settings", {}))
-            names = [follow] if isinstance(follow, str) else follow
-            values["follow"] = tuple(dict.fromkeys(map(check_name, names)))
             outputs = {key: values.pop(key) for key in KEYS if key in values}
             values["write"], values["options"] = destinations(outputs, folder, name, source)
         return cls(name, **values)
 
     @cached_property  # the controller asks for that of each stream twice a second
     def digest(self) -> str:
-        """Text that changes exactly if the stream has to start again: with its source, objects, settings or `write`.
+        """Text that changes exactly with the source, objects, settings or destinations: what the stream does.
 
-        A change of `cores`, `labels` or `follow` does not change it: the stream then continues from its state, on a
-        node with the labels, and learns of other objects to search for while it runs. Settings count by their values,
-        so that writing down a default changes nothing. Of a model, its path counts and not its content.
+        Settings count by their values, so that writing down a default changes nothing. Of a model, its path counts and
+        not its content.
         """
         models = {name: str(file) for name, file in self.models.items()}
         boxes = {name: list(map(float, box)) for name, box in self.boxes.items()}
         parts = [self.source, boxes, models, Settings.from_values(self.settings).changed()]
         if self.write:
             parts += [self.write, msgspec.to_builtins(self.options, enc_hook=str)]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+        return _hash(parts)
+
+    @cached_property
+    def order(self) -> str:
+        """The digest, and where it runs: the actor of the stream has to start again if it changes."""
+        return f"{self.digest}/{_hash([self.cores, self.labels])}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +162,6 @@ class FleetSpec:
     registry HOST:PORT where clients ask for the streams; "" for the head of the cluster, and the default port
     keys     folder of the clients' keys on that machine; "" for the one of the fleet's name
     streams  the streams by name
-    draining names of the nodes that streams leave; not in the file
     """
 
     name: str
@@ -172,7 +170,6 @@ class FleetSpec:
     registry: str = ""
     keys: str = ""
     streams: dict[str, StreamSpec] = field(default_factory=dict)
-    draining: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         check_fleet_name(self.name, "fleet")
@@ -232,14 +229,18 @@ class FleetSpec:
             before, after = self.streams.get(name), new.streams.get(name)
             if before is None or after is None:
                 lines.append(f"{name}: is {'added' if before is None else 'removed'}")
-            elif before.digest != after.digest:
+            elif before.order != after.order:
                 lines.append(f"{name}: starts again with its changes")
             elif name in ended:
                 lines.append(f"{name}: has ended")
             else:
-                lines.append(f"{name}: {same if before == after else 'continues with its changes'}")
+                lines.append(f"{name}: {same}")
         later = [key for key in _AT_START if getattr(self, key) != getattr(new, key)]
         return lines + [f"{key} changes at the next start, after catstream fleet down" for key in later if are_running]
+
+
+def _hash(parts: object) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def to_json(spec: FleetSpec) -> bytes:

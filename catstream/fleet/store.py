@@ -1,8 +1,8 @@
-"""The store of a fleet, a folder or an S3 bucket: states of streams, the fleet's spec, and merged models.
+"""The store of a fleet, a folder or an S3 bucket: states of streams, the fleet's spec, and saved models.
 
-    streams/NAME/    states of a stream
-    models/OBJECT/   merged models of an object
-    fleet/           desired streams of the fleet
+    streams/NAME/          states of a stream
+    models/NAME/OBJECT/    saved model with which an object of a stream begins
+    fleet/                 desired streams of the fleet
 
 Below each of these folders, only the newest holder decides what comes next:
 
@@ -97,9 +97,9 @@ class Store:
         check_fleet_name(name, "stream")
         return StateStore(self, f"streams/{name}")
 
-    def model(self, name: str) -> StateStore:
-        """The merged models of an object, each as the file `model`."""
-        return StateStore(self, f"models/{_NO_NAME if name == UNNAMED else check_name(name)}")
+    def model(self, stream: str, name: str) -> StateStore:
+        """The saved models of an object of a stream, each as the file `model`."""
+        return StateStore(self, f"models/{stream}/{_NO_NAME if name == UNNAMED else check_name(name)}")
 
     def check(self) -> None:
         """Create the folder of the store, and raise StoreError if it cannot be used. A bucket has to exist."""
@@ -301,12 +301,11 @@ class StateStore:
         self._objects = objects
         self.folder = folder
 
-    def newest(self, after: int = 0) -> Snapshot | None:
-        """Return the newest state of a holder with a token above `after`. If there is none, no state is read."""
+    def newest(self) -> Snapshot | None:
+        """Return the newest undamaged state of the highest token that has one."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FileNotFoundError):  # removed by the holder since the folder was listed
-                versions = sorted((version for version in self.listed().states if version.token > after), reverse=True)
-                state = next(filter(None, map(self._read, versions)), None)
+                state = next(filter(None, map(self._read, sorted(self.listed().states, reverse=True))), None)
                 return None if state is None or state.facts.get("removed") else state
         raise self._busy("read")
 

@@ -301,21 +301,6 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     )
 
 
-def disjoint(parts: dict[str, tuple[set[str], int]]) -> list[str]:
-    """Select models that share no frames, by name. Models of more streams are preferred, then models of more rows.
-
-    A part is the origins of the trees of a model, one for each stream of frames, and its rows.
-
-    >>> disjoint({"door": ({"a"}, 90), "yard": ({"b"}, 20), "both": ({"a", "c"}, 70)})
-    ['both', 'yard']
-    """
-    chosen: list[str] = []
-    for name in sorted(parts, key=lambda name: (-len(parts[name][0]), -parts[name][1], sorted(parts[name][0]))):
-        if all(parts[name][0].isdisjoint(parts[other][0]) for other in chosen):
-            chosen.append(name)
-    return chosen
-
-
 def _check_merge(one: SavedModel, other: SavedModel, origins: set[str]) -> None:
     """Raise SettingsError if a saved model cannot be merged; `origins` are those of all before it."""
     if one.object and other.object and one.object != other.object:

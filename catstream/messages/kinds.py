@@ -58,7 +58,7 @@ RunState = Literal["running", "lost", "waiting", "paused", "ended"]
 #: The state of a stream of a fleet: that of its run, or why it has none.
 StreamState = Literal["starting", "running", "lost", "waiting", "paused", "moving", "stopping", "failed", "ended"]
 
-NodeState = Literal["alive", "draining", "dead"]
+NodeState = Literal["alive", "dead"]
 
 _COLUMNS = {name: tree.more_columns for name, tree in TREES.items()}
 _REQUIRED = frozenset(name for name, tree in TREES.items() if tree.required)
@@ -569,7 +569,7 @@ class NodeStatus:
     """The state of one node of a fleet.
 
     name     name of the node, unique in its fleet
-    state    "draining" if its streams are moved away and none is placed on it
+    state    "dead" if it does not answer Ray
     address  name or address of the machine
     cores    processor cores that streams may use
     used     cores that are reserved for the streams on it

@@ -1,7 +1,6 @@
 """A stream of a fleet without Ray: its pipeline, its state in the store, and its end."""
 
 import json
-import threading
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
@@ -161,25 +160,6 @@ def test_a_store_that_the_node_cannot_use_is_named(spec, until):
     with started(spec, "s3://Not_a_bucket") as stream:
         until(lambda: stream.report()[0].state == "failed")
         assert "the URL of the store is not valid" in stream.report()[0].trouble
-
-
-def test_absent_objects_are_searched_for_by_the_newest_merged_model(long_spec, store, until, monkeypatch):
-    """However many models are merged meanwhile, each is searched for once, and without a thread of its own."""
-    searched = []
-    monkeypatch.setattr(Stream, "_search", lambda _, __, model, name: searched.append((name, model.files["model"])))
-    threads = threading.active_count()
-    with started(replace(long_spec, follow=("anna",)), store, every=0.05) as stream:
-        until(lambda: stream.report()[0].frame >= 3)
-        for number in range(20):
-            Store(store).model("anna").put({"model": b"model %d" % number}, {})
-        until(lambda: searched and searched[-1] == ("anna", b"model 19"))
-        assert threading.active_count() < threads + 20
-        found = len(searched)
-        stream.report(follow=())
-        until(lambda: not stream._follow)
-        Store(store).model("anna").put({"model": b"not followed"}, {})
-    assert [name for name, _ in searched] == ["anna"] * len(searched)
-    assert searched[found:] == []
 
 
 def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until, monkeypatch):

@@ -189,20 +189,15 @@ def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec,
             site.end()
 
 
-def test_a_drained_node_loses_its_streams_until_it_is_uncordoned(site, ray):
+def test_a_stream_with_other_labels_starts_again_where_they_are(site, ray):
     running(site, ray, "gate")
-    site.drain("n1", undo=False)
+    site.add(replace(GATE, labels={"site": "south"}), {})
     assert states(site)["gate"] == "moving", "from the answer on, so that `up` waits for it"
     site._turn()
     assert ray.of("gate").asked[-1] == ("stop",)
     for _ in range(3):
         site._turn()
-    assert ray.of("gate").options["label_selector"] == {"ray.io/node-id": "!in(1)"}
-    assert site.status().nodes["n1"].state == "draining"
-    running(site, ray, "gate", "2")
-    site.drain("n1", undo=True)
-    site._turn()
-    assert states(site)["gate"] == "running", "it stays where it is"
+    assert ray.of("gate").options["label_selector"] == {"site": "south"}
 
 
 def test_a_stream_whose_node_died_is_left_to_ray(site, ray):
@@ -277,13 +272,11 @@ def test_a_change_that_cannot_be_stored_is_refused_and_not_done(site, monkeypatc
         patch.setattr(StateStore, "put", fails)
         for change in (
             lambda: site.add(replace(GATE, name="new"), {}),
-            lambda: site.drain("n1", undo=False),
             lambda: site.remove(("gate",)),
         ):
             with pytest.raises(StoreError, match="cannot be reached"):
                 change()
     assert sorted(site.status().streams) == ["gate", "roof"]
-    assert site.status().nodes["n1"].state == "alive"
 
 
 def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site, ray, monkeypatch, until):
@@ -294,7 +287,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
         goes_on.wait(150)
 
     monkeypatch.setattr(StateStore, "put", put)
-    change = threading.Thread(target=site.drain, args=("n1",), kwargs={"undo": False})
+    change = threading.Thread(target=site.remove, args=(("roof",),))
     change.start()
     try:
         assert hangs.wait(150)
@@ -305,8 +298,7 @@ def test_while_the_store_hangs_the_registry_answers_and_streams_are_watched(site
     finally:
         goes_on.set()
         change.join()
-    site._turn()
-    assert site.status().nodes["n1"].state == "draining"
+    assert sorted(site.status().streams) == ["gate"]
 
 
 def test_a_restarted_controller_waits_for_its_store(made, ray, spec, monkeypatch):
@@ -339,12 +331,6 @@ def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_resta
     assert (gate.state, gate.node, gate.trouble) == ("running", "n1", "it has not answered for 50 s")
     unplaced = "Ray has not started it for 50 s: `ray status` says what it needs"
     assert (roof.state, roof.trouble) == ("starting", unplaced)
-
-
-def test_followed_objects_and_clients_reach_a_stream_with_each_question(site, ray):
-    site.add(replace(GATE, follow=("anna",)), {})
-    running(site, ray, "gate")
-    assert ray.of("gate").asked[-1] == ("report", None, ("anna",))
 
 
 def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):
