@@ -13,7 +13,7 @@ from catstream.client.attach import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
-from catstream.processes.supervisor import Child
+from catstream.processes.supervisor import APART_SECONDS, Child
 
 
 def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_error(endless, video):
@@ -32,14 +32,14 @@ def test_a_source_that_fails_while_frames_are_repeated_ends_the_run_with_its_err
         assert pipeline.totals["sent"] == pipeline.totals["stored"] == 5
 
 
-@pytest.mark.parametrize(("pause", "pace"), [(5.0, 0.0), (0.0, 0.15)])
-def test_no_process_is_started_again_because_the_owner_is_slow(video, monkeypatch, pause, pace):
+def test_no_process_is_started_again_because_the_owner_is_slow(video, monkeypatch):
     """The compressor and the trainer end as soon as all is stored, the detector once its owner has all tracks."""
     start, started = Child.start, []
     monkeypatch.setattr(Child, "start", lambda child, after: started.append(child.name) or start(child, after))
     with Pipeline(video[0], video[1][0]) as pipeline:
-        for track in pipeline:
-            time.sleep(pace if track.frame else pause)
+        next(iter(pipeline))
+        time.sleep(APART_SECONDS + 2)
+        assert len(list(pipeline)) == len(video[1]) - 1
     assert tuple(started) == NAMES
 
 
@@ -51,17 +51,6 @@ def test_a_process_that_a_signal_ends_before_the_run_is_started_again(video):
         assert pipeline.restarts == 1
     assert [track.frame for track in tracks] == list(range(len(video[1])))
     assert pipeline.totals["stored"] == len(video[1])
-
-
-def test_a_detector_that_ends_with_two_slow_subscribers_does_not_count_as_stuck(endless):
-    with (
-        Pipeline(endless, (20, 20, 60, 60), part=slice(0, 200)) as pipeline,
-        subscribe(pipeline.endpoint, "features"),
-        subscribe(pipeline.endpoint, "previews"),
-    ):
-        for _ in pipeline:
-            time.sleep(0.025)  # so that there are more pictures than fit between the two
-    assert pipeline.restarts == 0
 
 
 def test_received_tracks_are_returned_after_a_signal_has_ended_the_detector(video, until):

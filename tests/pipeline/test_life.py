@@ -1,17 +1,11 @@
 """A pipeline in a program: with `with` and without, more than once, in threads, and in an event loop."""
 
-import asyncio
 import gc
 import json
-import os
 import re
-import signal
 import sys
-import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
-from pathlib import Path
 
 import pytest
 
@@ -62,11 +56,6 @@ def test_in_a_with_it_is_iterated_piece_by_piece_and_afterwards_no_more(pipeline
             again()
 
 
-def test_a_file_address_is_stored_as_a_path_from_which_a_run_can_resume(video):
-    path, boxes = video
-    assert Pipeline(Path(path).as_uri(), str(boxes[0])).source == str(path)
-
-
 def test_a_program_may_change_its_folder_during_a_run(video, tmp_path, monkeypatch):
     path, boxes = video
     begin, later = tmp_path / "begin", tmp_path / "later"
@@ -106,19 +95,9 @@ def test_a_run_of_a_live_source_is_resumed_with_its_first_frame(tmp_path):
     with Pipeline(source, first_box(source), {"run.image_rate": 0.01}, state=tmp_path / "kept") as pipeline:
         before = next(iter(pipeline))
     with Pipeline(resume=tmp_path / "kept") as pipeline:
-        assert next(iter(pipeline)).frame == before.frame + 1
-
-
-@pytest.mark.parametrize("change", [-3600, 3600])
-def test_the_times_of_a_live_run_go_on_if_the_clock_was_set_before_it_is_resumed(tmp_path, monkeypatch, change):
-    source, now = "demo:1", time.time()
-    with Pipeline(source, first_box(source), state=tmp_path / "kept") as pipeline:
-        before = [track.time for track in islice(pipeline, 30)]
-    monkeypatch.setattr(time, "time", lambda: now + change)
-    with Pipeline(resume=tmp_path / "kept") as pipeline:
-        times = [*before, next(iter(pipeline)).time]
-    assert times == sorted(times)
-    assert times[-1] < times[-2] + 600
+        resumed = next(iter(pipeline))
+    assert resumed.frame == before.frame + 1
+    assert resumed.time > before.time
 
 
 @pytest.mark.parametrize("action", ["always", "error"])
@@ -136,20 +115,6 @@ def test_a_pipeline_that_is_never_closed_causes_a_warning_and_ends(video, alive,
     assert not any(map(alive, pids))
 
 
-def test_an_event_loop_continues_while_a_thread_waits_for_tracks(pipeline):
-    async def run():
-        ticks, tracks = 0, asyncio.create_task(asyncio.to_thread(list, pipeline))
-        while not tracks.done():
-            await asyncio.sleep(0.001)
-            ticks += 1
-        return ticks, [track.frame for track in await tracks]
-
-    ticks, frames = asyncio.run(run())
-    assert frames == list(range(20))
-    assert ticks > 20
-    assert not pipeline.pids
-
-
 def test_a_loop_ends_with_an_error_if_another_thread_closes_the_pipeline(video, until):
     with ThreadPoolExecutor() as pool, Pipeline(video[0], settings=SETTINGS) as waiting:  # without a box no track comes
         loop = pool.submit(list, waiting)
@@ -157,16 +122,6 @@ def test_a_loop_ends_with_an_error_if_another_thread_closes_the_pipeline(video, 
         waiting.close()
         with pytest.raises(ServiceError, match="the pipeline is closed"):
             loop.result()
-
-
-def test_a_process_that_dies_is_restarted_however_long_the_loop_takes(pipeline, until):
-    with pipeline:
-        first = next(iter(pipeline))
-        killed = pipeline.pids["detector"]
-        os.kill(killed, signal.SIGKILL)
-        until(lambda: pipeline.pids.get("detector", killed) != killed)  # the loop asks for no track
-        assert [first.frame, *(track.frame for track in pipeline)] == list(range(20))
-        assert pipeline.restarts == 1
 
 
 def test_a_run_that_starts_paused_waits_with_its_first_frame(video, until):

@@ -13,9 +13,6 @@ from catstream.base.settings import Settings
 from catstream.errors import BoxError, ServiceError, VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
-from catstream.wire.channels import HEALTH
-from catstream.wire.endpoint import Endpoint
-from catstream.wire.newest import Subscriber
 from tests.pipeline.conftest import share_found
 
 #: A small window keeps the detector near the frame that a test has reached.
@@ -24,17 +21,14 @@ SETTINGS = Settings(run={"unstored_frames": 16})
 
 @pytest.fixture(scope="module")
 def run(video):
-    """Tracks of a whole run, its pipeline afterwards, and the processes that it had."""
+    """Tracks of a whole run, and its pipeline afterwards."""
     path, boxes = video
-    with Pipeline(path, boxes[0], SETTINGS) as pipeline:
-        tracks = iter(pipeline)
-        first = [next(tracks) for _ in range(10)]
-        processes = pipeline.pids
-        return [*first, *tracks], pipeline, processes
+    pipeline = Pipeline(path, boxes[0], SETTINGS)
+    return list(pipeline), pipeline
 
 
 def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
-    tracks, pipeline, _ = run
+    tracks, pipeline = run
     n = pipeline.frames
     assert [track.frame for track in tracks] == list(range(n))
     assert pipeline.totals == {"sent": n, "stored": n, "rows": n, "restarts": 0}
@@ -42,44 +36,12 @@ def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
 
 
 def test_the_object_is_followed_with_ever_newer_models(run, video):
-    tracks, *_ = run
+    tracks, _ = run
     assert share_found(tracks, video[1]) > 0.8
     versions = [track.model_version for track in tracks]
     assert versions == sorted(versions)
     assert versions[0] == 0
     assert versions[-1] > 2
-
-
-def test_all_processes_tell_how_they_are(endless, video):
-    counted = {"detector": "sent", "compressor": "leaves", "trainer": "trained"}
-    with Pipeline(endless, video[1][0], SETTINGS) as pipeline:
-        reports = (pipeline.health for _ in pipeline)
-        assert any(all(told.get(name, {}).get(counted[name]) for name in NAMES) for told in reports)
-
-
-def test_a_health_report_after_the_last_track_counts_too(video, until):
-    path, boxes = video
-
-    def told():
-        report = health.receive(0.1)
-        return report and report.process == "detector" and report.counters["sent"] > heard and report.counters["sent"]
-
-    with (
-        Pipeline(path, boxes[0], SETTINGS) as pipeline,
-        Subscriber(HEALTH, Endpoint.parse(pipeline.endpoint)) as health,
-    ):
-        next(iter(pipeline))
-        heard = pipeline.health.get("detector", {}).get("sent", 0)
-        sent = until(told)
-        until(told)  # the one after it: by then the pipeline's own socket has the first
-    assert pipeline.health["detector"]["sent"] >= sent
-
-
-def test_three_processes_run_while_it_is_open_and_none_afterwards(run, alive):
-    _, pipeline, processes = run
-    assert set(processes) == set(NAMES)
-    assert not any(map(alive, processes.values()))
-    assert not pipeline.pids
 
 
 def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
@@ -99,19 +61,6 @@ def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
     assert len(killed) == pipeline.restarts == len(NAMES)
     assert tracks[-1].model_version > versions[0], "the trainer, which died first, has learned on"
     assert not any(map(alive, [*killed, *pids.values()]))
-
-
-def test_if_the_start_server_is_killed_the_run_continues_without_a_lost_frame(video):
-    path, boxes = video
-    tracks = []
-    with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 4, "lag_frames": 2})) as pipeline:
-        for track in pipeline:
-            tracks.append(track)
-            if track.frame == 5:
-                psutil.Process(pipeline.pids["detector"]).parent().kill()
-        assert pipeline.restarts == len(NAMES)
-    assert [track.frame for track in tracks] == list(range(pipeline.frames))
-    assert pipeline.totals["stored"] == pipeline.totals["sent"] == pipeline.frames
 
 
 def test_a_part_is_followed_whole_though_the_detector_dies(long_video):
@@ -196,9 +145,3 @@ def test_frames_in_memory_are_rejected_with_the_way_to_go(frames):
     said = r"the number of a camera, got \w+: pass frames in memory to catstream.Tracker"
     with pytest.raises(VideoError, match=said):
         Pipeline(frames, (0, 0, 10, 10))
-
-
-def test_a_run_starts_with_more_objects_than_by_default_if_the_setting_allows_them(video):
-    boxes = {f"n{number}": video[1][0] for number in range(33)}
-    with Pipeline(video[0], boxes, {"run.max_objects": 33}, part=slice(0, 1)) as pipeline:
-        assert {track.object for track in pipeline} == boxes.keys()

@@ -49,14 +49,6 @@ def test_none_is_made_while_nobody_looks(previews, monkeypatch):
         previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
 
 
-def test_a_new_viewer_receives_the_newest_frame_if_none_arrives(previews, looks):
-    for frame in range(5):
-        previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
-    with looks() as reader:
-        previews.turn()
-        assert next(reader).frame == 4
-
-
 def test_frames_are_shown_while_no_object_is_tracked_although_their_number_stays(previews, looks, until):
     seen = []
     with looks() as reader:
@@ -65,22 +57,6 @@ def test_frames_are_shown_while_no_object_is_tracked_although_their_number_stays
             previews.show(3, Frame(grey, 0.4, np.full((48, 64, 3), grey, np.uint8)), {})
             until(lambda: seen.extend(_here(reader)) or any(_grey(preview) == grey for preview in seen), previews.turn)  # noqa: B023
     assert [_grey(preview) for preview in seen] == [0, 255]
-
-
-def test_of_a_burst_the_newest_is_seen_in_the_end(previews, looks, until):
-    seen = []
-    with looks() as reader:
-        reader.timeout = 0
-        for frame in range(200):
-            previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
-
-        def look():
-            previews.turn()
-            seen.extend(preview.frame for preview in _here(reader))
-
-        until(lambda: 199 in seen, look)
-    assert seen == sorted(set(seen))
-    assert len(seen) < 200
 
 
 def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_looks(endpoint, until, monkeypatch):

@@ -1,12 +1,10 @@
 """The processes by themselves: started by hand, in any order, and ended in any way."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from itertools import islice
 
 import cv2
@@ -106,23 +104,6 @@ def test_processes_that_are_stopped_together_end_in_order_and_all_is_stored(vide
     assert end.totals["stored"] == end.totals["sent"]
 
 
-def test_a_compressor_that_ends_alone_stores_its_features_and_exits(video, folder, by_hand, until):
-    path, boxes = video
-    run = {"box": boxes[0], "settings": ["run.checkpoint_seconds=3600", "run.unstored_frames=2000"]}
-    with Subscriber(HEALTH, Endpoint.parse(str(folder))) as health:
-        compressor, detector = by_hand(path, order=("compressor", "detector"), **run)
-        # Without a trainer the detector stands still, with features that were processed and not stored.
-        told = (report.counters for report in iter(lambda: health.receive(60), None) if report.process == "detector")
-        processed = next(counters["processed"] for counters in told if counters["processed"])
-        compressor.send_signal(signal.SIGTERM)
-        assert compressor.wait(150) == 0
-        stored = CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq
-        assert stored >= processed
-        by_hand(path, order=("compressor",), **run)  # tells it, if the last answer was lost
-        until(lambda: next(told)["stored"] >= stored)
-    assert detector.poll() is None
-
-
 def failed(job, folder):
     """The error with which a run fails."""
     supervisor = Supervisor(job, folder)
@@ -171,32 +152,6 @@ def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder, monkeyp
     assert restarts == 6
 
 
-def test_a_process_that_is_restarted_continues_the_run_and_a_resume_is_another_one(video, folder, until):
-    path, boxes = video
-    job, runs = Job(path, {"": boxes[0]}, endpoint=str(folder)), []
-    for resume in (False, True):
-        supervisor = Supervisor(replace(job, resume=resume), folder)
-        try:
-            before = runs_of_all(folder, until)
-            os.kill(killed := supervisor.pids["detector"], signal.SIGKILL)
-            until(lambda killed=killed, found=supervisor: found.pids.get("detector", killed) != killed)
-            assert runs_of_all(folder, until) == before
-        finally:
-            supervisor.stop()
-        assert len(before) == 1, "the processes agree"
-        runs += before
-    assert len(set(runs)) == 2
-    assert "" not in runs
-
-
-def runs_of_all(folder, until):
-    """The runs that the health reports of all processes are from."""
-    runs = {}
-    with Subscriber(HEALTH, Endpoint.parse(str(folder))) as reports:
-        until(lambda: runs.keys() == set(NAMES), lambda: runs.update({reports.receive(60).process: reports.run}))
-    return set(runs.values())
-
-
 def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_too(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16})) as pipeline:
@@ -215,17 +170,3 @@ def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_t
         assert not any(map(psutil.pid_exists, stopped.values()))
         assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
     assert [track.frame for track in tracks] == list(range(len(boxes)))
-
-
-def test_a_run_whose_folder_was_removed_ends_with_that_reason(endless, folder):
-    """The folder is one that the system cleans, as the folder of a user at the logout."""
-    supervisor = Supervisor(Job(endless, {"": Box(150, 90, 50, 50)}, endpoint=str(folder)), folder)
-    try:
-        assert supervisor.next_frame()
-        shutil.rmtree(folder)
-        psutil.Process(supervisor.pids["trainer"]).kill()
-        with pytest.raises(ServiceError, match=r"the trainer died \(signal SIGKILL, .*\) and .* folder .* was removed"):
-            list(iter(supervisor.next_frame, None))
-    finally:
-        supervisor.stop()
-        folder.mkdir()  # the fixture removes it

@@ -86,15 +86,6 @@ def test_a_run_continues_after_the_last_frame_that_the_program_has_whole(video, 
     assert pipeline.totals["stored"] == pipeline.totals["sent"] == len(truth)
 
 
-def test_without_the_last_frame_of_its_program_a_run_continues_after_the_checkpoint(video, tmp_path):
-    path, truth = video
-    with Pipeline(path, truth[0], state=tmp_path / "state") as pipeline:
-        next(iter(pipeline))
-    first = last_seq(tmp_path / "state")
-    with Pipeline(resume=tmp_path / "state") as pipeline:
-        assert [track.frame for track in pipeline] == list(range(first, len(truth)))
-
-
 def test_a_model_that_could_not_be_saved_is_an_error_before_the_run(video, tmp_path):
     with pytest.raises(ServiceError, match="none/anna: pass a file in an existing folder"):
         Pipeline(video[0], video[1][0], save_model=tmp_path / "none" / "anna")

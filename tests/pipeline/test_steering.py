@@ -4,30 +4,21 @@ import os
 import signal
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from pathlib import Path
 
-import cv2
 import pytest
-import zmq
 
 from catstream.base.settings import Settings
 from catstream.client.attach import control, subscribe
 from catstream.errors import (
-    BoxError,
     CommandRejectedError,
-    ObjectError,
     ProtocolError,
     ServiceError,
     SettingsError,
-    SilenceError,
 )
 from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
-from catstream.processes.decisions import DesiredState
 from catstream.video.source import open_source
-from catstream.wire.channels import CHANNELS
-from catstream.wire.endpoint import Endpoint
 from tests.pipeline.conftest import share_found
 
 #: A small window keeps the detector near the frame that a test has reached.
@@ -106,7 +97,6 @@ def test_the_first_frame_waits_for_a_box_and_in_a_pause_a_box_is_for_the_waiting
     with steered(path) as (pipeline, steering, _):
         assert told(pipeline, lambda counters: counters["waiting"])["sent"] == 0
         steering.pause()
-        refuses_what_cannot_be_done(pipeline, steering)
         assert steering.set_box(boxes[0]).frame == 0
         assert steering.set_box(boxes[1]).frame == 1
         told(pipeline, lambda counters: counters["paused"] and counters["sent"] == 2)
@@ -117,24 +107,6 @@ def test_the_first_frame_waits_for_a_box_and_in_a_pause_a_box_is_for_the_waiting
     assert [track.box for track in tracks[:2]] == [pytest.approx(box) for box in boxes[:2]]
     assert share_found(tracks, boxes) > 0.8
     assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
-
-
-def refuses_what_cannot_be_done(pipeline, steering):
-    """A pipeline that has no box yet says why, and counts what is no command."""
-    with pytest.raises(CommandRejectedError, match="outside the frame"):
-        steering.set_box((400, 10, 20, 20))
-    with pytest.raises(BoxError, match="at least 2 pixels"):
-        steering.set_box((10, 10, 1, 9))
-    for command in (steering.forget, lambda: steering.save("never.safetensors")):
-        with pytest.raises(CommandRejectedError, match="no object is tracked yet"):
-            command()
-    with pytest.raises(ObjectError, match="is not a name"):
-        steering.set_box((10, 10, 20, 20), "an na")
-    with zmq.Context.instance().socket(zmq.DEALER) as stranger:
-        stranger.connect(Endpoint.parse(pipeline.endpoint).address(CHANNELS["control"]))
-        for data in (b"", b"\xc1", b"\x93\x01\xa4", bytes(9000)):
-            stranger.send(data)
-        told(pipeline, lambda counters: counters["rejected"] >= 4)
 
 
 def test_another_object_replaces_the_first_from_its_frame_on_whichever_process_dies(long_video):
@@ -159,45 +131,6 @@ def test_another_object_replaces_the_first_from_its_frame_on_whichever_process_d
     assert all(track.model_version == 0 or track.model_version > newest for track in after)
 
 
-def test_a_moved_object_keeps_its_model_and_a_stop_command_stores_all(long_video):
-    path, boxes = long_video
-    with steered(path, boxes[0]) as (pipeline, steering, pool):
-        tracks = with_model(pipeline)
-        answer = taken(pipeline, tracks, pool.submit(steering.set_box, boxes[len(tracks)], keep=True))
-        taken(pipeline, tracks, pool.submit(steering.stop))
-        tracks += pipeline
-    assert answer.frame < len(tracks) < len(boxes)
-    assert [track.frame for track in tracks] == list(range(len(tracks)))
-    assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(tracks), len(tracks))
-    corrected = tracks[answer.frame]
-    assert corrected.state == "present"
-    assert corrected.box == pytest.approx(boxes[corrected.frame - 1], abs=60)
-    assert corrected.model_version >= 4
-    versions = [track.model_version for track in tracks]
-    assert versions == sorted(versions)
-
-
-def test_a_detector_that_dies_while_paused_is_restarted_paused(video):
-    path, boxes = video
-    with steered(path) as (pipeline, steering, pool):
-        steering.pause()
-        steering.set_box(boxes[0])
-        killed = pipeline.pids["detector"]
-        os.kill(killed, signal.SIGKILL)
-        resumed = pool.submit(lambda: (told(pipeline, lambda counters: counters["paused"]), steering.resume()))
-        tracks = list(pipeline)
-        assert resumed.result()[0]["sent"] <= 1
-    assert pipeline.restarts == 1
-    assert [track.frame for track in tracks] == list(range(len(boxes)))
-
-
-@pytest.mark.parametrize("torn", ["", "{", "null", '{"objects": {"": [1, 2]}}'], ids=repr)
-def test_commands_that_a_power_cut_tore_are_an_error(tmp_path, torn):
-    (tmp_path / "desired_state.json").write_text(torn)
-    with pytest.raises(ProtocolError, match="cannot read the desired state"):
-        DesiredState.load(tmp_path / "desired_state.json")
-
-
 def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video, tmp_path):
     path, boxes = video
     settings = SETTINGS.replace({"run.lockstep": True})  # the video does not end before the second model
@@ -213,16 +146,6 @@ def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video,
     assert tracks[-1].frame == len(boxes) - 1
 
 
-def test_commands_are_on_disk_before_they_take_the_place_of_older_ones(tmp_path, monkeypatch):
-    done = []
-    for module, name in ((os, "fsync"), (Path, "replace")):
-        call = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda *given, call=call, name=name: (done.append(name), call(*given))[1])
-    DesiredState(paused=True).save(tmp_path / "desired_state.json")
-    assert done == ["fsync", "replace", "fsync"], "the file, and then its name"
-    assert DesiredState.load(tmp_path / "desired_state.json") == DesiredState(paused=True)
-
-
 def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_video, saved):
     path, boxes = long_video
     version = SavedModel.load(saved).model.version
@@ -235,49 +158,6 @@ def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_vide
     versions = [track.model_version for track in tracks]
     assert versions == sorted(versions)
     assert versions[-1] > version
-
-
-def test_a_run_from_a_saved_model_goes_on_if_the_detector_dies(video, saved):
-    tracks = []
-    with Pipeline(video[0], settings={"run.lockstep": True}, model=saved, part=slice(10, 32)) as pipeline:
-        for track in pipeline:
-            tracks.append(track)
-            if track.frame == 8:
-                os.kill(pipeline.pids["detector"], signal.SIGKILL)
-    assert pipeline.restarts == 1
-    assert [track.frame for track in tracks] == list(range(22))
-    assert tracks[-1].box.overlap(video[1][31]) > 0.5
-
-
-def test_the_object_is_absent_until_it_is_found_in_whatever_size(video, saved, rng, tmp_path):
-    path, _ = video
-    with open_source(path) as source:
-        images = [cv2.resize(frame.image, None, fx=1.9, fy=1.9) for frame, _ in zip(source, range(20), strict=False)]
-    empty = [rng.integers(0, 256, images[0].shape, "u1") for _ in range(5)]
-    for number, image in enumerate(empty + images):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
-    with Pipeline(str(tmp_path), settings=SETTINGS, model=saved) as pipeline:
-        tracks = list(pipeline)
-    assert {track.state for track in tracks[:5]} == {"absent"}
-    assert tracks[-1].state == "present"
-    assert tracks[-1].box.overlap(video[1][19].scaled(1.9).centred(*(1.9 * c for c in video[1][19].centre))) > 0.5
-
-
-def test_a_pause_with_a_timeout_ends_and_a_new_subscriber_learns_of_the_pause(endless, video):
-    with steered(endless, video[1][0]) as (pipeline, steering, _):
-        told(pipeline, lambda counters: counters["sent"])
-        steering.pause(seconds=600)
-        silence = pytest.raises(SilenceError, match="the state of the pipeline is: paused")
-        with subscribe(pipeline.endpoint, "tracks", timeout=3) as tracks, silence:
-            next(tracks)
-        with subscribe(pipeline.endpoint, "health", timeout=SECONDS) as health:
-            report = next(each for each in health if each.state == "paused")
-        assert report.objects[""].keys() == {"model_version"}, "where it is is not known"
-        steering.pause(seconds=0.5)
-        told(pipeline, lambda counters: not counters["paused"])
-        with subscribe(pipeline.endpoint, "health", timeout=SECONDS) as health:
-            report = next(each for each in health if each.state == "running")
-        assert report.objects[""].keys() == {"model_version", "score", "present"}
 
 
 def test_an_object_whose_box_is_of_a_past_picture_begins_where_it_has_moved_to(walker):
@@ -319,23 +199,6 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
     assert all(track.box.overlap(boxes[0]) > 0.8 for track in tracks)
     assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(tracks), len(tracks))
     assert pipeline.totals["skipped"] > passed["skipped"]
-
-
-def test_a_picture_of_a_live_source_has_the_frame_number_and_the_boxes_of_its_track(video, camera):
-    path, boxes = video
-    with open_source(path) as source:
-        images = [frame.image for frame, _ in zip(source, range(23), strict=False)]
-    moving = camera(lambda number: images[number % 23])  # a picture that is the same as the last one is not received
-    with (
-        steered(moving.url) as (pipeline, steering, _),
-        subscribe(pipeline.endpoint, "previews", timeout=SECONDS) as pictures,
-    ):
-        told(pipeline, lambda counters: counters["waiting"] and counters["skipped"] >= 3)
-        assert [next(pictures).frame for _ in range(3)] == [0, 0, 0], "that of the frame that is tracked next"
-        steering.set_box(boxes[0])
-        picture = next(picture for picture in pictures if picture.boxes)
-        track = next(track for track in pipeline if track.frame == picture.frame)
-    assert picture.boxes == {"": track.box}
 
 
 def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_path):

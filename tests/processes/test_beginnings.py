@@ -80,6 +80,15 @@ def test_an_invalid_box_is_rejected_and_nothing_begins(stream, box):
     assert list(stream.commands.desired.objects) == ["anna"]
 
 
+def test_a_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("catstream.processes.commands.monotonic", lambda: now[0])
+    assert stream.commands._execute(Command("1", "pause", seconds=30.0)).done
+    assert stream.commands.hold
+    now[0] += 31
+    assert not stream.commands.hold
+
+
 def test_after_a_resume_an_object_without_a_state_begins_again_where_it_was(stream):
     objects = {"anna": DesiredObject(BOX, begins=8), "ben": DesiredObject(OTHER, begins=20)}
     start = Start(7, 7, DesiredState(objects), {})

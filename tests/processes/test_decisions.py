@@ -1,12 +1,16 @@
 """Laws of the decisions, in histories without processes: where a detector continues, its waits, what is stored."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from catstream.base.box import Box, Window
+from catstream.errors import ProtocolError
 from catstream.messages.kinds import DetectorState, Position
 from catstream.processes.decisions import (
     DesiredObject,
@@ -39,6 +43,22 @@ def test_a_desired_state_is_read_as_it_was_written(tmp_path_factory, desired):
     file = tmp_path_factory.mktemp("state") / "desired_state.json"
     desired.save(file)
     assert DesiredState.load(file) == desired
+
+
+@pytest.mark.parametrize("torn", ["", "{", "null", '{"objects": {"": [1, 2]}}'], ids=repr)
+def test_a_torn_desired_state_is_an_error(tmp_path, torn):
+    (tmp_path / "desired_state.json").write_text(torn)
+    with pytest.raises(ProtocolError, match="cannot read the desired state"):
+        DesiredState.load(tmp_path / "desired_state.json")
+
+
+def test_a_desired_state_is_on_disk_before_it_replaces_the_old_one(tmp_path, monkeypatch):
+    done = []
+    for module, name in ((os, "fsync"), (Path, "replace")):
+        call = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *given, call=call, name=name: (done.append(name), call(*given))[1])
+    DesiredState(paused=True).save(tmp_path / "desired_state.json")
+    assert done == ["fsync", "replace", "fsync"], "the file, and then its name"
 
 
 @given(DESIRED, NAMES, st.integers(1, 30))
