@@ -83,7 +83,6 @@ EXTRAS = {
     "parquet": ("a Parquet file", ("pyarrow",)),
     "network": ("a network", ("onnxruntime", "onnx")),
     "fleet": ("a fleet", ("ray", "obstore")),
-    "s3": ("a store on S3", ("boto3",)),
 }
 
 

@@ -60,7 +60,6 @@ IMPORTERS = {
     ],
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/store.py"],
-    "boto3": ["catstream/fleet/store.py"],  # obstore imports it
     "ray": ["catstream/fleet"],
     "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/loadtest/camera.py", "catstream/loadtest/rtsp.py"],

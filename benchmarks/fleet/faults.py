@@ -24,6 +24,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from time import monotonic, sleep
 
+import httpx
 import numpy as np
 import psutil
 
@@ -142,9 +143,6 @@ class Trial:
 
     def _open_store(self, stack: ExitStack) -> subprocess.Popen[bytes]:
         """Start an S3 server."""
-        import boto3
-        from botocore.exceptions import EndpointConnectionError
-
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
@@ -153,10 +151,10 @@ class Trial:
         stack.callback(server.kill)
         os.environ |= {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
         os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{port}"
-        store, deadline = boto3.client("s3"), monotonic() + PATIENCE
+        deadline = monotonic() + PATIENCE
         while monotonic() < deadline:
-            with suppress(EndpointConnectionError):  # it is starting
-                store.create_bucket(Bucket="states")
+            with suppress(httpx.ConnectError):  # it is starting
+                httpx.put(f"http://127.0.0.1:{port}/states")  # creates the bucket
                 return server
         raise ServiceError(f"the S3 server did not start in {PATIENCE:g} s")
 

@@ -27,8 +27,8 @@ removed, a state that says so stays, and hides what a holder writes that comes b
 decision 78 in docs/decisions.md.
 
 A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
-bucket has to be private. The credentials of S3 come from the environment, the machine's role, or ~/.aws; the address of
-another server from AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
+bucket has to be private. obstore takes the credentials of S3 from the environment or the machine's role, and the
+address of another server from AWS_ENDPOINT_URL. They are not part of the URL, which is shown in messages.
 """
 
 from __future__ import annotations
@@ -81,8 +81,6 @@ class Store:
     def __init__(self, url: str) -> None:
         self._url, self._folder = _parse(url)
         require_extra("fleet")
-        if self._folder is None:
-            require_extra("s3")
         self._checked = False
 
     def __repr__(self) -> str:
@@ -147,7 +145,6 @@ class Store:
             self._url,
             client_options=limits | {"allow_http": True},  # at an address that begins with http
             retry_config={"max_retries": 0},
-            credential_provider=_credentials(),
             disable_bulk_delete=True,  # one object each time, and not all servers have it
         )
 
@@ -195,18 +192,6 @@ class Store:
             raise StoreError(f"{subject} {self._url} cannot be {what}: {_trouble(error)}") from None
 
 
-def _credentials() -> Any:
-    """The credentials of ~/.aws: profiles, roles, sessions; None if there is nothing, or the environment has a key."""
-    variables = {"AWS_SHARED_CREDENTIALS_FILE": "~/.aws/credentials", "AWS_CONFIG_FILE": "~/.aws/config"}
-    # `Path.expanduser` would raise for a user without a home directory.
-    files = [Path(os.path.expanduser(os.environ.get(name, usual))) for name, usual in variables.items()]  # noqa: PTH111
-    if "AWS_ACCESS_KEY_ID" in os.environ or not ("AWS_PROFILE" in os.environ or any(file.exists() for file in files)):
-        return None
-    from obstore.auth.boto3 import Boto3CredentialProvider  # half a second of imports
-
-    return Boto3CredentialProvider()
-
-
 def _parse(url: str) -> tuple[str, Path | None]:
     """A URL as it is shown, and its folder. No error shows the URL: it may contain a password."""
     parts = urlsplit(url)
@@ -214,8 +199,8 @@ def _parse(url: str) -> tuple[str, Path | None]:
         return str(Path(url).resolve()), Path(url).resolve()
     if parts.username is not None or parts.password is not None or parts.query or parts.fragment:
         raise FleetError(
-            "the URL of the store contains a user, a password or a query: pass s3://bucket/prefix, and credentials "
-            "in the environment or in ~/.aws/credentials"
+            "the URL of the store contains a user, a password or a query: pass s3://bucket/prefix, and credentials in "
+            "the environment"
         )
     if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
         return _parse(parts.path)
@@ -234,8 +219,8 @@ def _trouble(error: Exception) -> str:
         return "the bucket is in another region: set AWS_REGION"
     if code:
         return f"the server answered {code}: check the bucket and its permissions"
-    if _ROLE in text or type(error).__module__.startswith("botocore") or isinstance(error, ValueError):
-        return "no credentials were found: set AWS_PROFILE, or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+    if _ROLE in text:
+        return "no credentials were found: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
     if "kind: Timeout" in text:
         return f"no answer within {STORE_SECONDS:g} s: check the network and the server"
     number = error.errno if isinstance(error, OSError) else int(match[1]) if (match := _NUMBER.search(text)) else None
