@@ -122,7 +122,7 @@ def grown() -> Forest:
 
 def narrow(path: Path) -> SavedModel:
     """Return a saved model whose rows have `WIDTH` columns."""
-    with patch("catstream.jobs.saved_model.row_length", lambda: WIDTH):
+    with patch("catstream.jobs.saved_model.ROW_LENGTH", WIDTH):
         return SavedModel.load(path)
 
 

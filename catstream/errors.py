@@ -81,7 +81,6 @@ class StoreError(FleetError):
 #: Extra -> the feature that needs it, and the modules that the feature imports.
 EXTRAS = {
     "parquet": ("a Parquet file", ("pyarrow",)),
-    "network": ("a network", ("onnxruntime", "onnx")),
     "fleet": ("a fleet", ("ray", "obstore")),
 }
 

@@ -23,7 +23,7 @@ from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, FrameError, ObjectError
-from catstream.features.descriptor import descriptor_of
+from catstream.features.pyramid import Pyramid
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Features, Track, Tracks
 from catstream.training import motion_em
@@ -58,7 +58,6 @@ class MultiTracker:
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
         self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
-        descriptor_of(self.settings)  # loads the network, if there is one, so that an error is raised here
         motion_em.prepare()  # before the first frame: a later one would wait for it
         self._tracks: dict[str, Track] | None = None
 
@@ -109,7 +108,7 @@ class MultiTracker:
         check_count(len(boxes), self.settings.run.max_objects)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
         with one_thread():
-            pyramid = detectors.pyramid(image)
+            pyramid = Pyramid(image)
             results = detectors.begin_all(boxes, pyramid, time)
             # After an error, the tracker is unchanged.
             self.detectors, self.forest, self.trainer, self._size = detectors, forest, trainer, image.shape[:2]
@@ -168,7 +167,7 @@ class MultiTracker:
             )
         self.detectors.seq = self.forest.seq  # repeats a frame whose update was interrupted, for example by Ctrl-C
         with one_thread():
-            pyramid = self.detectors.pyramid(image)
+            pyramid = Pyramid(image)
             results = self.detectors.begin_all(boxes, pyramid, time)
             for name, saved in models.items():
                 self.detectors.seek(name, saved.model, saved.box, saved.similarity())
@@ -180,8 +179,7 @@ class MultiTracker:
         if both := models.keys() & boxes.keys():
             raise ObjectError(f"{listed(sorted(both))}: a box and a saved model of one object are mutually exclusive")
         check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.max_objects)
-        network = self.detectors.network
-        return {name: saved.compressor(self.settings, network, name) for name, saved in models.items()}
+        return {name: saved.compressor(self.settings, name) for name, saved in models.items()}
 
     def forget(self, name: str) -> None:
         """Stop tracking an object; its trees are dropped with the next frame.

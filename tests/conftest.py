@@ -37,7 +37,6 @@ from catstream.wire.channels import CHANNELS, CONTROL
 from catstream.wire.commands import Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import allow, create
-from tests.networks import write_network
 
 # No time is a pass mark.
 hypothesis.settings.register_profile(
@@ -126,12 +125,6 @@ def walk(tmp_path_factory):
         lines.append("nan,nan,nan,nan" if 5 <= number < 8 else str(box))
     (folder / "groundtruth_rect.txt").write_text("\n".join(lines) + "\n")
     return folder
-
-
-@pytest.fixture(scope="session")
-def network(once, walk):
-    """A folder with `backbone.onnx`, a tiny network of random weights, and `net.onnx` that is prepared from it."""
-    return once("network", lambda folder: write_network(folder, walk))
 
 
 @pytest.fixture(scope="session", autouse=True)

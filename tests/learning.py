@@ -3,7 +3,7 @@
 import numpy as np
 
 from catstream.base.box import Box, Window
-from catstream.features.layout import row_length
+from catstream.features.layout import ROW_LENGTH
 from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import DetectorState, ObjectFeatures, TrainingRows
 from catstream.tracker import Tracker
@@ -15,7 +15,7 @@ BOX, WINDOW = Box(1.0, 2.0, 30.0, 40.0), Window(0.0, 0.0, 40.0, 50.0)
 def features(rng, appearance=1.0):
     """The features of an object in a frame: rows of the object around its appearance, and of a background around -1."""
     labels = np.repeat(np.float32([1, 0]), 4)
-    rows = rng.normal(scale=0.2, size=(8, row_length())).astype(np.float32)
+    rows = rng.normal(scale=0.2, size=(8, ROW_LENGTH)).astype(np.float32)
     rows += np.where(labels[:, None], np.float32(appearance), np.float32(-1))
     training = {APPEARANCE: TrainingRows.labelled(rows, labels), EXTENT: TrainingRows.labelled(rows[:4], 1)}
     return ObjectFeatures(BOX, training, DetectorState(0, "confident", WINDOW, WINDOW, WINDOW))

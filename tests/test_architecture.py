@@ -26,7 +26,7 @@ LEVELS = [
     {"multi", "client", "sketch"},
     {"sinks"},
     {"tracker", "processes"},
-    {"pipeline", "backbone", "annotation"},
+    {"pipeline", "annotation"},
     {"reports", "web"},
     {"evaluation", "batch"},
     {"finding", "loadtest", "fleet"},
@@ -91,12 +91,10 @@ IMPORTERS = {
     "uvicorn": ["catstream/web/server.py"],
     "prometheus_client": ["catstream/web/prometheus.py"],
     "rich": ["catstream/cli"],
-    "onnxruntime": ["catstream/features/network.py"],
-    "onnx": ["catstream/backbone.py"],
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"av", "pyarrow", "ray", "obstore", "onnx", "onnxruntime"}
+SLOW = {"av", "pyarrow", "ray", "obstore"}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

@@ -20,12 +20,12 @@ from catstream.base.box import Window
 from catstream.compression.tree import CoresetTree
 from catstream.detection.teacher import affine_copies
 from catstream.evaluation.datasets import Sequence
-from catstream.features.layout import row_length
+from catstream.features.layout import ROW_LENGTH
 from catstream.features.pyramid import Pyramid
 from catstream.paper.one_class import one_class
 
 SIZES = (32, 64, 128, 256)
-_ORIGIN = np.zeros(row_length(), np.float32)
+_ORIGIN = np.zeros(ROW_LENGTH, np.float32)
 
 
 def figures(options: argparse.Namespace) -> Iterator[Table]:

@@ -20,6 +20,7 @@ from catstream.base.threads import one_thread
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError
+from catstream.features.pyramid import Pyramid
 from catstream.jobs.saved_model import SavedModel, merge
 from catstream.messages.kinds import Track
 from catstream.multi import MultiTracker
@@ -124,10 +125,10 @@ def _tracks(
     """Track from a box in the first image, or search for the object of a saved model without one."""
     detectors, forest, trainer = Detectors(settings), Forest(settings), Trainer(settings)
     for number, image in enumerate(images):
-        pyramid, results, continued = detectors.pyramid(image), {}, {}
+        pyramid, results, continued = Pyramid(image), {}, {}
         if number == 0:
             if learned is not None:
-                continued = {UNNAMED: learned.compressor(settings, detectors.network)}
+                continued = {UNNAMED: learned.compressor(settings)}
             if box is not None:
                 results = detectors.begin_all({UNNAMED: box}, pyramid)
             elif learned is not None:

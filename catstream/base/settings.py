@@ -234,19 +234,6 @@ class BeliefSettings(_Group):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureSettings(_Group):
-    """Features beside HOG and colours.
-
-    network  ONNX file of a network from `catstream network prepare` (empty: none). Set it if objects are lost because
-             they rotate, deform or are blurred.
-    """
-
-    group = "features"
-
-    network: str = _setting("", local=True)
-
-
-@dataclass(frozen=True, kw_only=True)
 class TrainingSettings(_Group):
     """The training rows of a frame, and how a model is trained on them.
 
@@ -305,7 +292,7 @@ class Settings:
 
     Parameters
     ----------
-    run, coreset, search, belief, features, training, extent : the group, or a mapping of its names to values
+    run, coreset, search, belief, training, extent : the group, or a mapping of its names to values
         Defaults apply to the rest.
 
     Raises
@@ -323,7 +310,6 @@ class Settings:
     coreset: CoresetSettings = field(default_factory=CoresetSettings)
     search: SearchSettings = field(default_factory=SearchSettings)
     belief: BeliefSettings = field(default_factory=BeliefSettings)
-    features: FeatureSettings = field(default_factory=FeatureSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
     extent: ExtentSettings = field(default_factory=ExtentSettings)
 
@@ -336,7 +322,6 @@ class Settings:
             coreset: CoresetSettings | Mapping[str, object] = ...,
             search: SearchSettings | Mapping[str, object] = ...,
             belief: BeliefSettings | Mapping[str, object] = ...,
-            features: FeatureSettings | Mapping[str, object] = ...,
             training: TrainingSettings | Mapping[str, object] = ...,
             extent: ExtentSettings | Mapping[str, object] = ...,
         ) -> None: ...

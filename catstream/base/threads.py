@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-_Item = TypeVar("_Item")
-_Result = TypeVar("_Result")
 
 #: Environment variables that limit the libraries of a new process to one thread.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
@@ -104,17 +102,6 @@ def one_thread(*, opencv: bool = False) -> Iterator[None]:
     finally:
         if opencv:
             cv2.setNumThreads(threads)
-
-
-def one_at_a_time(function: Callable[[_Item], _Result]) -> Callable[[_Item], _Result]:
-    """The same function, of which no two threads are inside at once."""
-    lock = threading.Lock()
-
-    def alone(item: _Item) -> _Result:
-        with lock:
-            return function(item)
-
-    return alone
 
 
 @cache

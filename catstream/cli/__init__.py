@@ -41,14 +41,13 @@ COMMANDS = {
     "merge": ("models", "Merge saved models of one object."),
     "stop": ("attach", "Stop a running pipeline as if its source had ended."),
     "fleet": ("fleet_commands", "Run many streams on one machine or many."),
-    "network": ("network_commands", "Use the features of a small network beside HOG and colours."),
     "keys": ("configure", "Manage the keys of a pipeline and its clients."),
     "settings": ("configure", "List all settings with their defaults and descriptions."),
 }
 
 
 #: Commands that run on every system; the others start or use the processes of a pipeline.
-_PORTABLE = {"annotate", "batch", "find", "evaluate", "export", "report", "merge", "network", "settings"}
+_PORTABLE = {"annotate", "batch", "find", "evaluate", "export", "report", "merge", "settings"}
 
 
 def load_command(name: str) -> click.Command:

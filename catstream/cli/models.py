@@ -55,9 +55,6 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
     metavar="LOW,HIGH",
     help="Range of sizes, relative to the trained size.",
 )
-@click.option(
-    "--network", type=PATH, metavar="FILE", help="Network (features.network) that the models were trained with."
-)
 @click.option("--fps", type=float, default=25.0, show_default=True, help="Frames per second of a folder of images.")
 @with_skip_damaged
 def find(
@@ -68,7 +65,6 @@ def find(
     threshold: float,
     every: float,
     sizes: tuple[float, float],
-    network: Path | None,
     fps: float,
     skip_damaged: bool,
 ) -> None:
@@ -106,7 +102,7 @@ def find(
         from catstream.finding.results import SearchLog, write_report, write_tables
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
-    search = Search(load_models(models), reading, threshold, every, sizes, str(network or ""))
+    search = Search(load_models(models), reading, threshold, every, sizes)
     files = find_files(paths)
     with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
         try:

@@ -36,16 +36,15 @@ class Compressor:
     box          last box in which the object was detected
     detector     the detector state after the newest frame: a restarted detector continues from it
     last_sample  the newest sample, None before the first
-    network      digest of the network that computes a part of the rows, empty if there is none
     """
 
-    def __init__(self, settings: Settings, name: str = "", network: str = "") -> None:
+    def __init__(self, settings: Settings, name: str = "") -> None:
         if settings.coreset.share:
             raise SettingsError(
                 f"coreset.share={settings.coreset.share:g} is a share of a video's length: "
                 "call Settings.for_length first, or set coreset.size"
             )
-        self.settings, self.name, self.network = settings, name, network
+        self.settings, self.name = settings, name
         self.trees = {name: REDUCTIONS[settings.coreset.reduction](settings.coreset.size) for name in TREES}
         self.began, self.frame = 0, -1
         self.box: Box | None = None
@@ -66,12 +65,11 @@ class Compressor:
         origins: tuple[str, ...],
         settings: Settings,
         name: str = "",
-        network: str = "",
     ) -> Compressor:
         """A compressor that inserts another stream into copies of the trees of an earlier one; call `begin` next."""
-        self = cls(settings, name, network)
+        self = cls(settings, name)
         self.trees = {kind: tree.copy() for kind, tree in trees.items()}
-        self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name, network=network), centres
+        self.last_sample, self.centres = sample_of(self.trees, version, 0, centres, name), centres
         self._sampled_leaves, self._earlier = self.leaves, origins
         return self
 
@@ -105,9 +103,7 @@ class Compressor:
         if not self._due():
             return None
         self._sampled_leaves = self.leaves
-        self.last_sample = sample_of(
-            self.trees, version, frame, self.centres, self.name, self.began, network=self.network
-        )
+        self.last_sample = sample_of(self.trees, version, frame, self.centres, self.name, self.began)
         return self.last_sample
 
     @property
@@ -149,7 +145,6 @@ class Compressor:
             "trees": trees,
             "origin": self._origin,
             "earlier": list(self._earlier),
-            "network": self.network,
         }
         # The trees have grown since the last sample. It is stored, too, so that a restarted trainer trains the model
         # that the detector uses.
@@ -162,7 +157,7 @@ class Compressor:
     @classmethod
     def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings, name: str = "") -> Compressor:
         """Restore a compressor from its `state`; KeyError, TypeError or ValueError if it is something else."""
-        self = cls(settings, name, str(metadata.get("network", "")))  # which an older checkpoint lacks
+        self = cls(settings, name)
         self.began, self.frame = int(metadata["began"]), int(metadata["frame"])
         self.box = Box(*metadata["box"]) if metadata["box"] else None
         if "detector" in metadata:
@@ -203,11 +198,10 @@ def sample_of(
     centres: np.ndarray,
     name: str,
     began: int = 0,
-    network: str = "",
 ) -> Sample:
     """The sample of all trees of an object that have a leaf."""
     summaries = {kind: tree.sample() for kind, tree in trees.items() if tree.nodes}
-    return Sample(version, frame, summaries, centres, name, began, network)
+    return Sample(version, frame, summaries, centres, name, began)
 
 
 def _rows_of(tree: Tree, training: TrainingRows) -> Float32:

@@ -43,13 +43,7 @@ class Forest:
         self._states: deque[tuple[int, dict[str, DetectorState]]] = deque(maxlen=_MAX_STATES)  # of the last messages
 
     def check_features(self, features: Features) -> None:
-        """Raise ProtocolError if rows differ in length from earlier ones, or are of another network."""
-        if others := {compressor.network for compressor in self.compressors.values()} - {features.network}:
-            raise ProtocolError(
-                f"features are of the network {features.network or 'none'}, those before of {max(others) or 'none'}: "
-                "start all processes with the same catstream and the same settings",
-                "width",
-            )
+        """Raise ProtocolError if rows differ in length from earlier ones."""
         width = max((compressor.width for compressor in self.compressors.values()), default=0)
         for part in features.objects.values():
             for training in part.training.values():
@@ -82,7 +76,7 @@ class Forest:
         compressors: dict[str, Compressor] = {}
         for name, part in features.objects.items():
             compressor = continued.get(name) if part.begins else self.compressors.get(name)
-            compressors[name] = compressor or Compressor(self.settings, name, features.network)
+            compressors[name] = compressor or Compressor(self.settings, name)
         self.compressors = compressors
         samples: list[Sample] = []
         for name, part in features.objects.items():

@@ -9,7 +9,6 @@ from catstream.base.settings import Settings
 from catstream.detection.similarity import Similarity
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap
-from catstream.features.vectors import VectorMap
 from catstream.messages.kinds import Model
 
 
@@ -30,13 +29,13 @@ class FrameContext:
     seq: int = 0
     similarity: Similarity | None = None
 
-    def scores_around(self, window: Window, side: int, vectors: VectorMap | None = None) -> ScoreMap:
+    def scores_around(self, window: Window, side: int) -> ScoreMap:
         """Scores of all windows in `side` x `side` cells around a window: see `ScoreMap.around`."""
-        return ScoreMap.around(self.pyramid, window, side, self.model, vectors)
+        return ScoreMap.around(self.pyramid, window, side, self.model)
 
-    def scores_within(self, region: Region, window: Window, *, described: bool = False) -> ScoreMap:
+    def scores_within(self, region: Region, window: Window) -> ScoreMap:
         """Scores of all windows of a size in a region: see `ScoreMap.within`."""
-        return ScoreMap.within(self.pyramid, region, window, self.model, described=described)
+        return ScoreMap.within(self.pyramid, region, window, self.model)
 
     def scores_of_frame(self, window: Window) -> ScoreMap:
         """Scores of all windows of a size in the frame: see `ScoreMap.whole`."""

@@ -23,8 +23,7 @@ from catstream.detection.similarity import Similarity
 from catstream.detection.teacher import Training
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.cells import Cells
-from catstream.features.descriptor import Descriptor
-from catstream.features.layout import WINDOW, row_length
+from catstream.features.layout import ROW_LENGTH, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
 
@@ -52,8 +51,8 @@ class Detector:
     similarity      to the object of a saved model, until its first detection; None without a saved model
     """
 
-    def __init__(self, settings: Settings, name: str = "", descriptor: Descriptor | None = None) -> None:
-        self.settings, self.name, self.descriptor = settings, name, descriptor
+    def __init__(self, settings: Settings, name: str = "") -> None:
+        self.settings, self.name = settings, name
         self.state: DetectorState | None = None
         self.model = Model(0, -1, np.empty(0, np.float32), 0.0)
         self.newest_version = 0
@@ -97,10 +96,9 @@ class Detector:
         of the frame, in several successive frames; of two similar objects, neither is. ProtocolError if the model is of
         other features.
         """
-        width = row_length(self.descriptor.channels if self.descriptor is not None else 0)
-        if len(model.weights) != width:
+        if len(model.weights) != ROW_LENGTH:
             raise ProtocolError(
-                f"the model has {len(model.weights)} weights, the features of a window are {width}: "
+                f"the model has {len(model.weights)} weights, the features of a window are {ROW_LENGTH}: "
                 "train it again with this version of catstream"
             )
         window = Window.around(box, self.settings.search.context)

@@ -19,7 +19,6 @@ from catstream.detection.detector import Detector, Result
 from catstream.detection.search import Detection
 from catstream.detection.similarity import Similarity
 from catstream.errors import ObjectError
-from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Features, Model, Track, Tracks
 
@@ -32,17 +31,13 @@ class Detectors:
     """Tracks the objects of one stream, with a detector for each, by name in the order in which they began.
 
     For a frame, `begin` or `correct` the objects whose boxes are known, and `seek` the objects of saved models; then
-    call `step`. All of them take the `pyramid` of the frame.
-
-    SettingsError or MissingExtraError if the network of the settings cannot be used, see `descriptor_of`. If `network`
-    is not empty, the network must have this digest.
+    call `step`. All of them take the pyramid of the frame.
     """
 
-    def __init__(self, settings: Settings, network: str = "") -> None:
+    def __init__(self, settings: Settings) -> None:
         if settings.training.bootstrap == "scm":  # two seconds, for sklearn: before there is a frame
             import catstream.paper.scm  # noqa: F401
-        self.settings, self.descriptor = settings, descriptor_of(settings, network)
-        self.seq = 0
+        self.settings, self.seq = settings, 0
         self.detectors: dict[str, Detector] = {}
 
     def add(self, name: str) -> Detector:
@@ -56,16 +51,7 @@ class Detectors:
 
     def _new_detector(self, name: str) -> Detector:
         check_count(len(self.detectors) + 1, self.settings.run.max_objects)
-        return Detector(self.settings, check_name(name), self.descriptor)
-
-    @property
-    def network(self) -> str:
-        """Digest of the network, empty if there is none."""
-        return digest_of(self.descriptor)
-
-    def pyramid(self, image: np.ndarray) -> Pyramid:
-        """The pyramid of a frame, uint8 (h, w, 3) BGR."""
-        return Pyramid(image, self.descriptor)
+        return Detector(self.settings, check_name(name))
 
     def begin(self, name: str, frame: Pyramid, box: Box, time: float = 0.0, later: Iterable[Pyramid] = ()) -> Result:
         """Start an object with its box in the next frame; another one of this name is forgotten.
@@ -144,7 +130,7 @@ class Detectors:
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
         tracks: dict[str, Track] = {name: results[name][0] for name in names}
         objects = {name: results[name][1] for name in names}
-        return Tracks(self.seq - 1, tracks), Features(self.seq - 1, time, objects, self.network)
+        return Tracks(self.seq - 1, tracks), Features(self.seq - 1, time, objects)
 
     def forget(self, name: str) -> None:
         """Stop tracking an object; ObjectError if there is none of this name."""

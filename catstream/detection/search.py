@@ -16,16 +16,14 @@ from catstream.base.box import Window
 from catstream.detection import belief, extent
 from catstream.detection.context import FrameContext
 from catstream.detection.similarity import Similarity
-from catstream.features.layout import EDGE, WINDOW
+from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Region
-from catstream.features.score_map import ScoreMap, non_maximum_suppression, vertex
-from catstream.features.vectors import VectorMap
+from catstream.features.score_map import ScoreMap, vertex
 from catstream.messages.heads import ASPECT, EXTENT, SIZE
 from catstream.messages.kinds import DetectorState
 
 _MAX_CELLS = 16_384  # limit of a search of the whole frame in one frame, over all sizes: about 14 ms
 _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best position may be a cell away from that at another size
-_MAX_DESCRIBED = 10  # windows of a search of the whole frame, the best by HOG and colours, that a descriptor scores
 _FULL_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _INITIAL_FACTORS = tuple(1.25**k for k in range(-4, 5))  # the same before the first detection of a saved model's object
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
@@ -107,10 +105,9 @@ def _fit_size_by_similarity(context: FrameContext, detection: Detection, similar
     The score alone prefers windows that are too small, because they contain less background, and it may be higher than
     that of the object's mean, 1. The subspace of the object contains its own outline and margin.
     """
-    vectors = _vectors(context, detection)
 
     def evaluate(step: int) -> tuple[float, Detection]:
-        scores = context.scores_around(detection.window.scaled(extent.size(step)), _FINE_SIDE, vectors)
+        scores = context.scores_around(detection.window.scaled(extent.size(step)), _FINE_SIDE)
         best = Detection(*scores.best())
         return min(best.score, 1.0) + similarity(scores.cells.row(*scores.argmax())), best
 
@@ -192,20 +189,8 @@ def _best_of(context: FrameContext, parts: list[_Part], window: Window) -> Detec
 
 
 def _score_parts(context: FrameContext, parts: Iterable[_Part], window: Window) -> list[tuple[float, ScoreMap]]:
-    """Return the factor and the scores of several parts, each searched at the size of a window times its factor.
-
-    With a descriptor, these are the scores around the best windows of all by HOG and colours.
-    """
-    maps = [(factor, context.scores_within(region, window.scaled(factor))) for factor, region in parts]
-    if context.pyramid.descriptor is None:
-        return maps
-    candidates = [
-        (float(scores.scores[place]), factor, scores.window(*place))
-        for factor, scores in maps
-        for place in non_maximum_suppression(scores.scores, _MAX_DESCRIBED, WINDOW // 2)
-    ]
-    best = sorted(candidates, key=lambda candidate: -candidate[0])[:_MAX_DESCRIBED]
-    return [(factor, context.scores_around(candidate, _FINE_SIDE)) for _, factor, candidate in best]
+    """Return the factor and the scores of several parts, each searched at the size of a window times its factor."""
+    return [(factor, context.scores_within(region, window.scaled(factor))) for factor, region in parts]
 
 
 def _best_map(maps: Sequence[tuple[float, ScoreMap]]) -> ScoreMap:
@@ -262,10 +247,9 @@ def fit_extent(context: FrameContext, detection: Detection, first: Window | None
 
 def _fit_size(context: FrameContext, detection: Detection, first: Window) -> Detection:
     growth = math.log(detection.window.area / first.area) / 2
-    vectors = _vectors(context, detection)
 
     def evaluate(step: int) -> tuple[float, Detection]:
-        scores = context.scores_around(detection.window.scaled(extent.size(step)), _FINE_SIDE, vectors)
+        scores = context.scores_around(detection.window.scaled(extent.size(step)), _FINE_SIDE)
         best = Detection(*scores.best())
         fit = _extent_value(context, scores.cells.row(1, 1), SIZE)
         cost = extent.cost(step * extent.SIZE_CHANGE, growth, context.settings.extent.prior)
@@ -278,26 +262,15 @@ def _fit_size(context: FrameContext, detection: Detection, first: Window) -> Det
 def _fit_aspect(context: FrameContext, detection: Detection, first: Window) -> Detection:
     window = detection.window
     widening = math.log(window.w / window.h * first.h / first.w)
-    vectors = _vectors(context, detection)
 
     def evaluate(step: int) -> tuple[float, Detection]:
-        scores = context.scores_around(window.scaled(*extent.stretch(step)), WINDOW, vectors)
+        scores = context.scores_around(window.scaled(*extent.stretch(step)), WINDOW)
         fit = _extent_value(context, scores.cells.row(0, 0), ASPECT)
         cost = extent.cost(step * extent.ASPECT_CHANGE, widening, context.settings.extent.prior)
         return float(scores.scores[0, 0]) + fit - cost, detection
 
     _, step, offset = _climb(evaluate, context.settings.extent.aspect_count // 2)
     return replace(detection, window=window.scaled(*extent.stretch(step + offset)))
-
-
-def _vectors(context: FrameContext, detection: Detection) -> VectorMap | None:
-    """The vectors around a detection, from which those of other sizes are sampled; None without a descriptor."""
-    frame = context.pyramid
-    if detection.around is not None:
-        return detection.around.vectors
-    if frame.descriptor is None:
-        return None
-    return VectorMap.of(frame.descriptor, frame.around(detection.window, WINDOW, EDGE), detection.window)
 
 
 def _extent_value(context: FrameContext, row: np.ndarray, name: str) -> float:

@@ -23,11 +23,9 @@ from catstream.detection.search import due_part
 from catstream.detection.similarity import Similarity
 from catstream.errors import BoxError
 from catstream.features.cells import window_rows
-from catstream.features.descriptor import Descriptor
-from catstream.features.layout import CELL, COLOURS, EDGE, MARGIN, WINDOW
+from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
-from catstream.features.vectors import VectorMap
 from catstream.messages.heads import APPEARANCE, DISCRIMINANT_RIDGE, EXTENT
 from catstream.messages.kinds import Model, TrainingRows
 from catstream.numerics import ridge
@@ -43,9 +41,6 @@ _EXTENT_INTERVAL = 2  # frames from one set of windows of wrong extents to the n
 _OBJECT_WEIGHT = 8.0  # sum of the weights of a frame's rows of the object; any other row has weight 1
 _BACKGROUND = 12  # background windows around the object in a frame
 _SIDE = 20  # side, in cells, of the smallest region around the object from which background is cut
-_DESCRIBED = (
-    _SIDE + 2 * EDGE
-)  # side, in cells, of the input of a descriptor for a copy of the object, as for the object
 _MINING_INTERVAL = 8  # frames between two searches for hard negatives; a large frame is searched in parts
 _MAX_CELLS = 4096  # limit of a search for hard negatives in one frame: about 4 ms
 _MAX_OVERLAP = 0.2  # IoU of a hard negative with the object's window
@@ -74,7 +69,7 @@ def first_training(
         rows = _appearance(frame, window, around, rng, options, hardest=0)
     else:
         context, moved = settings.search.context, options.other_backgrounds
-        copies = affine_copies(frame, window, count, rng, around.vectors, context=context, moved=moved)
+        copies = affine_copies(frame, window, count, rng, context=context, moved=moved)
         rows = _rows(copies, 1, _OBJECT_WEIGHT, options)
         rows += _surroundings(around, window, count, 0, rng, options)
     training = _first_extents(frame, window, rng, settings)
@@ -109,7 +104,7 @@ def training_at(
     rows = _appearance(context.pyramid, window, around, rng, settings.training, hardest=_BACKGROUND // 2)
     training = {APPEARANCE: rows}
     if extents:
-        training |= _extents(context.pyramid, window, around.vectors, rows, settings)
+        training |= _extents(context.pyramid, window, rows, settings)
     return training
 
 
@@ -120,7 +115,7 @@ def training_of_background(context: FrameContext, window: Window, similarity: Si
     """
     settings = context.settings
     scores = context.scores_of_frame(window)
-    rows = _hardest(context, scores, window, settings.training.hard_negatives, settings.belief.weak_score)
+    rows = _hardest(scores, window, settings.training.hard_negatives, settings.belief.weak_score)
     dissimilar = rows[[similarity(row) < settings.belief.min_similarity for row in rows]]
     return {APPEARANCE: _rows(dissimilar, 0, 1, settings.training)} if len(dissimilar) else {}
 
@@ -128,8 +123,7 @@ def training_of_background(context: FrameContext, window: Window, similarity: Si
 def hard_negatives(context: FrameContext, window: Window) -> TrainingRows:
     """The windows of the whole frame with the highest scores, except those that overlap the object's window."""
     options = context.settings.training
-    rows = _hardest(context, context.scores_of_frame(window), window, options.hard_negatives)
-    return _rows(rows, 0, 1, options)
+    return _rows(_hardest(context.scores_of_frame(window), window, options.hard_negatives), 0, 1, options)
 
 
 def _mine(context: FrameContext, window: Window) -> TrainingRows | None:
@@ -149,23 +143,18 @@ def _mine(context: FrameContext, window: Window) -> TrainingRows | None:
     count = (number + 1) * rows // shares - number * rows // shares
     if not count:
         return None
-    scores = context.scores_within(parts[number], window, described=True)
-    return _rows(_hardest(context, scores, window, count), 0, 1, options)
+    scores = context.scores_within(parts[number], window)
+    return _rows(_hardest(scores, window, count), 0, 1, options)
 
 
-def _hardest(
-    context: FrameContext, scores: ScoreMap, window: Window, count: int, threshold: float = -math.inf
-) -> np.ndarray:
+def _hardest(scores: ScoreMap, window: Window, count: int, threshold: float = -math.inf) -> np.ndarray:
     """The rows, float32 (k, d), of up to `count` windows with the highest scores above a threshold.
 
-    They are selected by non-maximum suppression, and hardly overlap `window`. If the scores are those of HOG and
-    colours, a descriptor computes only what these rows need.
+    They are selected by non-maximum suppression, and hardly overlap `window`.
     """
     places = non_maximum_suppression(scores.scores, count + 1, WINDOW // 2, threshold)
     places = [place for place in places if scores.window(*place).overlap(window) < _MAX_OVERLAP][:count]
-    complete = [scores.complete(context.pyramid, place, context.model) for place in places]
-    rows = [described.cells.row(row, column) for described, row, column in complete]
-    return np.array(rows, np.float32).reshape(-1, len(context.model.weights))
+    return scores.cells.rows(places)
 
 
 def initial_model(rows: TrainingRows) -> Model:
@@ -191,7 +180,6 @@ def affine_copies(
     window: Window,
     count: int,
     rng: np.random.Generator,
-    vectors: VectorMap | None = None,
     *,
     context: float = 1.0,
     moved: float = 0.0,
@@ -202,28 +190,18 @@ def affine_copies(
     All copies of a frame have the same background in the corners of the window, which is not the object: the share
     `moved` of the copies is put on another background of the frame. An object that turns shows another side, which is
     often the mirror image: the last `mirrored` copies are flipped left to right. Returns float32 (count, d); the first
-    row is that of the window itself, which is `context` times as large as the object's box. With a descriptor, copies
-    with the same background are sampled from its `vectors` around the window, unless they are flipped.
+    row is that of the window itself, which is `context` times as large as the object's box.
     """
     changes = rng.normal(size=(count, 4))
     if count:
         changes[0] = 0
-    patches, of_vectors = [], []
+    patches = []
     for number, (scale, right, down, turn) in enumerate(changes):
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _random_offset(window, rng) if _is_moved(number, moved) else None
-        is_mirrored = number >= max(count - mirrored, 1)
         patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
-        if is_mirrored:
-            patch = patch[:, :, ::-1]
-        patches.append(patch)
-        if frame.descriptor is not None and (vectors is None or is_mirrored or offset is not None):
-            of_vectors.append(
-                _described(frame, frame.descriptor, copy, _TURN * turn, patch, offset, is_mirrored).row(copy)
-            )
-        elif vectors is not None:
-            of_vectors.append(vectors.row(copy, _TURN * turn))
-    return window_rows(patches, of_vectors)
+        patches.append(patch[:, :, ::-1] if number >= max(count - mirrored, 1) else patch)
+    return window_rows(patches)
 
 
 def _is_moved(number: int, share: float) -> bool:
@@ -263,26 +241,6 @@ def _patch(
     return np.stack([cv2.blendLinear(*pair, share, 1 - share) for pair in channels])
 
 
-def _described(
-    frame: Pyramid,
-    descriptor: Descriptor,
-    window: Window,
-    turn: float,
-    patch: np.ndarray,
-    offset: tuple[float, float] | None,
-    is_mirrored: bool = False,
-) -> VectorMap:
-    """The vectors of a patch, in the middle of the background around it."""
-    x, y = window.centre
-    right, down = offset or (0.0, 0.0)
-    pixel = window.w / (WINDOW * CELL), window.h / (WINDOW * CELL)
-    whole = frame.cut(x + right, y + down, *pixel, _DESCRIBED * CELL, turn)
-    whole = whole[:, :, ::-1].copy() if is_mirrored else whole
-    edge = (_DESCRIBED * CELL - _PATCH) // 2
-    whole[:, edge:-edge, edge:-edge] = patch
-    return VectorMap.of(descriptor, whole, window)
-
-
 def _ellipse(across: float, down: float) -> np.ndarray:
     """Alpha mask of the object in a patch, float32: 1 inside its ellipse, falling to 0 around it.
 
@@ -304,7 +262,7 @@ def _appearance(
     hardest: int,
 ) -> TrainingRows:
     """Rows of the object, of affine copies of it, of near misses and of background, `hardest` of it by score."""
-    own = affine_copies(frame, window, 1 + options.copies, rng, around.vectors, mirrored=options.mirrored_copies)
+    own = affine_copies(frame, window, 1 + options.copies, rng, mirrored=options.mirrored_copies)
     rows = _rows(own, 1, _OBJECT_WEIGHT / len(own), options)
     return rows + _surroundings(around, window, _BACKGROUND, hardest, rng, options)
 
@@ -332,15 +290,12 @@ def _surroundings(
     return _rows(around.cells.rows([*places, *background]), [*labels, *[0.0] * len(background)], 1, options)
 
 
-def _extents(
-    frame: Pyramid, window: Window, vectors: VectorMap | None, rows: TrainingRows, settings: Settings
-) -> Training:
+def _extents(frame: Pyramid, window: Window, rows: TrainingRows, settings: Settings) -> Training:
     """Rows of group "extent": the first of `rows`, whose window fits, and windows of wrong extents."""
     trials = [trial for kind in extent.trials(window, settings.extent) for trial in kind]
     if not trials:
         return {}
-    of_vectors = [] if vectors is None else [vectors.row(trial.window) for trial in trials]
-    cuts = window_rows([frame.around(trial.window, WINDOW) for trial in trials], of_vectors)
+    cuts = window_rows([frame.around(trial.window, WINDOW) for trial in trials])
     return {EXTENT: _fits([extent.Trial(window), *trials], np.vstack([rows.rows[:1], cuts]), 1, settings.training)}
 
 
@@ -353,29 +308,21 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
     if not kinds:
         return {}
     cuts = [cut for kind in kinds for cut in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings)]
-    trials, patches, vectors = zip(*cuts, strict=True)
-    rows = window_rows(patches, [row for row in vectors if row is not None])
-    return {EXTENT: _fits(trials, rows, 1 / len(kinds), settings.training)}
+    trials, patches = zip(*cuts, strict=True)
+    return {EXTENT: _fits(trials, window_rows(patches), 1 / len(kinds), settings.training)}
 
 
 def _first_cuts(
     frame: Pyramid, window: Window, trials: list[extent.Trial], rng: np.random.Generator, settings: Settings
-) -> Iterator[tuple[extent.Trial, np.ndarray, np.ndarray | None]]:
-    """Yield trials at copies of the object in the first frame, with their patches and their vectors.
-
-    A descriptor computes the vectors of the first trial of a copy, from which those of the others are sampled.
-    """
+) -> Iterator[tuple[extent.Trial, np.ndarray]]:
+    """Yield trials at copies of the object in the first frame, with their patches."""
     for number in range(math.ceil(settings.coreset.size / len(trials))):
         right, down, turn = rng.normal(size=3) if number else np.zeros(3)
         copy = _shifted(window, right, down)
         offset = _random_offset(window, rng) if _is_moved(number, settings.training.other_backgrounds) else None
-        vectors = None
         for trial in trials:
             cut = trial.window.centred(*copy.centre)
-            patch = _patch(frame, cut, _TURN * turn, copy.box(settings.search.context), offset)
-            if frame.descriptor is not None and vectors is None:
-                vectors = _described(frame, frame.descriptor, cut, _TURN * turn, patch, offset)
-            yield trial, patch, None if vectors is None else vectors.row(cut)
+            yield trial, _patch(frame, cut, _TURN * turn, copy.box(settings.search.context), offset)
 
 
 def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, options: TrainingSettings) -> TrainingRows:

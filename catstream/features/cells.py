@@ -7,8 +7,6 @@ HOG and mean colours depend on the position in the window. An object that deform
 colours: 288 shades of Lab, 8 of lightness by 6 x 6 of a and b. So a window's row also contains a histogram of the
 shades in its middle 6 x 6 cells, which are mostly object, with 4 x 4 shades per cell. The features are the square roots
 of the shares, so that Euclidean distances are Hellinger distances.
-
-If there is a descriptor, the row ends with its vectors at 4 x 4 places of the window.
 """
 
 from __future__ import annotations
@@ -20,10 +18,8 @@ import numpy as np
 
 from catstream.base.arrays import writable
 from catstream.features import kernels
-from catstream.features.descriptor import Descriptor
-from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, PLACES, WINDOW, row_length
+from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, ROW_LENGTH, WINDOW
 from catstream.features.pyramid import planes_of
-from catstream.features.vectors import VectorMap
 
 _CHROMA_STEP = 10  # Lab units from one level of a or b to the next
 _MEAN_COLOUR = slice(CHANNELS - 3, CHANNELS)
@@ -37,27 +33,24 @@ _LOWEST = float(np.finfo(np.float32).min)  # the kernels do not compute with inf
 class Cells:
     """Features of a part of an image, cell by cell.
 
-    grid     float32 (rows, columns, 34), HOG and mean colour
-    shades   uint16 (4 * rows, 4 * columns), 4 x 4 of each cell
-    vectors  float32 (rows - 1, columns - 1, channels) of a descriptor, where four cells meet; None without one
+    grid    float32 (rows, columns, 34), HOG and mean colour
+    shades  uint16 (4 * rows, 4 * columns), 4 x 4 of each cell
     """
 
     grid: np.ndarray
     shades: np.ndarray
-    vectors: np.ndarray | None = None
 
     @classmethod
-    def of(cls, image: np.ndarray, descriptor: Descriptor | None = None) -> Cells:
-        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells; with vectors of a descriptor, if any."""
+    def of(cls, image: np.ndarray) -> Cells:
+        """Cells of an image, uint8 (h, w, 3) BGR, whose sides are whole cells."""
         planes = planes_of(image)
-        vectors = None if descriptor is None else VectorMap.between_cells(descriptor, planes)
-        return cls(grid(planes), shades(planes), vectors)
+        return cls(grid(planes), shades(planes))
 
     @classmethod
-    def within(cls, planes: np.ndarray, vectors: np.ndarray | None = None, margin: int = MARGIN) -> Cells:
+    def within(cls, planes: np.ndarray) -> Cells:
         """Cells of a patch, uint8 (3, h, w), without its margin, where features depend on pixels beyond the patch."""
-        edge = margin * CELL
-        return cls(grid(planes, margin), shades(planes[:, edge:-edge, edge:-edge]), vectors)
+        edge = MARGIN * CELL
+        return cls(grid(planes, MARGIN), shades(planes[:, edge:-edge, edge:-edge]))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -84,24 +77,15 @@ class Cells:
 
     def rows(self, places: Sequence[tuple[int, int]]) -> np.ndarray:
         """Feature rows of the windows whose first cells are at (row, column), float32 (k, d)."""
-        features = np.empty((len(places), row_length()), np.float32)
+        features = np.empty((len(places), ROW_LENGTH), np.float32)
         lines = self.grid.reshape(len(self.grid), -1)
         kernels.cut_rows(lines, self.shades, np.array(places, np.int64).reshape(-1, 2), features)
-        if self.vectors is None:
-            return features
-        of_windows = [self.vectors[row : row + WINDOW : 2, column : column + WINDOW : 2] for row, column in places]
-        return np.hstack([features, np.reshape(of_windows, (len(places), -1))])
+        return features
 
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
-        """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7).
-
-        Without vectors, it is the part of the score that depends on HOG and colours.
-        """
+        """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7)."""
         scores = self._cell_scores(weights, bias)
         add_colour_scores(self.shades, weights[COLOURS], scores)
-        if self.vectors is not None:
-            of_vectors = writable(weights[COLOURS.stop :]).reshape(PLACES**2, -1)
-            kernels.add_vector_scores(self.vectors, of_vectors, scores)
         return scores
 
     def respond_above(self, weights: np.ndarray, bias: float, threshold: float) -> np.ndarray:
@@ -127,15 +111,12 @@ class Cells:
         return scores
 
 
-def window_rows(patches: Sequence[np.ndarray], vectors: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """Feature rows of the windows in the middle of patches, with their vectors if there is a descriptor.
-
-    The patches are uint8 (3, 96, 96). Returns float32 (k, d).
-    """
-    features = np.empty((len(patches), row_length()), np.float32)
+def window_rows(patches: Sequence[np.ndarray]) -> np.ndarray:
+    """Feature rows, float32 (k, d), of the windows in the middle of patches, uint8 (3, 96, 96)."""
+    features = np.empty((len(patches), ROW_LENGTH), np.float32)
     if len(patches):
         kernels.describe_windows(np.stack(patches), MARGIN, _SHARES, _SHADES_OF, features)
-    return np.hstack([features, vectors]) if len(vectors) else features
+    return features
 
 
 def grid(planes: np.ndarray, margin: int = 0) -> np.ndarray:

@@ -432,51 +432,6 @@ def add_cell_scores(grid: Float32, weights: Float32, scores: Float32) -> None:
                 scores[row - i, column] += total
 
 
-@_kernel("void(float32[:,:,::1], float32[:,::1], float32[:,::1])")
-def add_vector_scores(vectors: Float32, weights: Float32, scores: Float32) -> None:
-    """Add the products of weights, (16, channels), with the 4 x 4 vectors of each window, every second one."""
-    for row in range(scores.shape[0]):
-        for column in range(scores.shape[1]):
-            total = float32(0)
-            for place in range(len(weights)):
-                vector, line = vectors[row + 2 * (place // 4), column + 2 * (place % 4)], weights[place]
-                for channel in range(len(line)):
-                    total += vector[channel] * line[channel]
-            scores[row, column] += total
-
-
-@_part
-def _spline(offset: float, weights: Float32) -> None:
-    """Weights of four neighbours in a cubic B-spline, `offset` from the second of them to the third."""
-    rest = 1 - offset
-    weights[0] = rest * rest * rest / 6
-    weights[1] = (4 - 3 * offset * offset * (1 + rest)) / 6
-    weights[2] = (4 - 3 * rest * rest * (1 + offset)) / 6
-    weights[3] = offset * offset * offset / 6
-
-
-@_kernel("void(float32[:,:,::1], float64[:,::1], float32[:,:,::1])")
-def sample_vectors(vectors: Float32, places: Float64, output: Float32) -> None:
-    """Cubic B-spline of vectors: at the first of three places, then in steps to the right, and to the row below."""
-    across, down = np.empty(4, np.float32), np.empty(4, np.float32)
-    rows, columns = vectors.shape[0], vectors.shape[1]
-    for row in range(output.shape[0]):
-        for column in range(output.shape[1]):
-            x = places[0, 0] + column * places[1, 0] + row * places[2, 0]
-            y = places[0, 1] + column * places[1, 1] + row * places[2, 1]
-            _spline(x - np.floor(x), across)
-            _spline(y - np.floor(y), down)
-            total = output[row, column]
-            for channel in range(len(total)):
-                total[channel] = 0
-            for i in range(4):
-                line = vectors[min(max(int(np.floor(y)) - 1 + i, 0), rows - 1)]
-                for j in range(4):
-                    vector, share = line[min(max(int(np.floor(x)) - 1 + j, 0), columns - 1)], down[i] * across[j]
-                    for channel in range(len(total)):
-                        total[channel] += share * vector[channel]
-
-
 @_kernel("void(uint8[:,::1], float64, float64, float64, float64, uint8[:,:,::1])")
 def sample(image: UInt8, left: float, top: float, across: float, down: float, output: UInt8) -> None:
     """Linear interpolation at left, left + across ... and top, top + down ...: between rows first, then in the row."""

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from catstream.base.box import Window
-from catstream.features.descriptor import Descriptor
 from catstream.features.kernels import average, sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
 
@@ -59,11 +58,10 @@ class Pyramid:
     Parameters
     ----------
     image : uint8 (h, w, 3) BGR, or (h, w) grey; patches have the same channels
-    descriptor : computes a part of the features of a window, None for HOG and colours alone
     """
 
-    def __init__(self, image: np.ndarray, descriptor: Descriptor | None = None) -> None:
-        self.image, self.descriptor = np.ascontiguousarray(image), descriptor
+    def __init__(self, image: np.ndarray) -> None:
+        self.image = np.ascontiguousarray(image)
         self._halves = {0: self.image}
 
     @property
@@ -88,11 +86,11 @@ class Pyramid:
                 self._halves[level] = _half(self._halves[level - 1])
         return self._halves[level], 1 << level
 
-    def around(self, window: Window, side: int, margin: int = MARGIN) -> np.ndarray:
+    def around(self, window: Window, side: int) -> np.ndarray:
         """Cut `side` x `side` cells and a margin around a window, which then has 64 x 64 pixels: see `cut`."""
         x, y = window.centre
         step_x, step_y = window.w / WINDOW, window.h / WINDOW
-        return self.cut(x, y, step_x / CELL, step_y / CELL, (side + 2 * margin) * CELL)
+        return self.cut(x, y, step_x / CELL, step_y / CELL, (side + 2 * MARGIN) * CELL)
 
     @property
     def region(self) -> Region:

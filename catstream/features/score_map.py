@@ -8,9 +8,8 @@ import numpy as np
 
 from catstream.base.box import Window
 from catstream.features.cells import Cells
-from catstream.features.layout import EDGE, MARGIN, WINDOW
+from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid, Region
-from catstream.features.vectors import VectorMap
 from catstream.messages.kinds import Model
 
 
@@ -18,59 +17,40 @@ from catstream.messages.kinds import Model
 class ScoreMap:
     """Features of a part of a frame at one scale, and the scores of all windows in them.
 
-    cells    of rows x columns
-    scores   float32 (rows - 7, columns - 7), of the window whose first cell has the same index
-    origin   corner of the first cell in the frame, (x, y) in pixels
-    step     width and height of a cell, in pixels of the frame
-    vectors  from which those of the cells were sampled; None without a descriptor, or for a region of the frame
+    cells   of rows x columns
+    scores  float32 (rows - 7, columns - 7), of the window whose first cell has the same index
+    origin  corner of the first cell in the frame, (x, y) in pixels
+    step    width and height of a cell, in pixels of the frame
     """
 
     cells: Cells
     scores: np.ndarray
     origin: tuple[float, float]
     step: tuple[float, float]
-    vectors: VectorMap | None = None
 
     @classmethod
-    def around(
-        cls, frame: Pyramid, window: Window, side: int, model: Model | None, vectors: VectorMap | None = None
-    ) -> ScoreMap:
-        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0.
-
-        If the frame has a descriptor, it computes the vectors around the window, unless `vectors` has them.
-        """
-        margin = MARGIN if frame.descriptor is None or vectors is not None else EDGE
-        patch = frame.around(window, side, margin)
-        if frame.descriptor is not None and vectors is None:
-            vectors = VectorMap.of(frame.descriptor, patch, window)
-        cells = Cells.within(patch, None if vectors is None else vectors.grid(window, side), margin)
+    def around(cls, frame: Pyramid, window: Window, side: int, model: Model | None) -> ScoreMap:
+        """All windows in `side` x `side` cells around a window, of its size; without a model all scores are 0."""
+        cells = Cells.within(frame.around(window, side))
         if model is None:
             scores = np.zeros((side - WINDOW + 1,) * 2, np.float32)
         else:
             scores = cells.respond(model.weights, model.bias)
         x, y = window.centre
         step = window.w / WINDOW, window.h / WINDOW
-        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step, vectors)
+        return cls(cells, scores, (x - side / 2 * step[0], y - side / 2 * step[1]), step)
 
     @classmethod
-    def within(
-        cls, frame: Pyramid, region: Region, window: Window, model: Model, *, described: bool = False
-    ) -> ScoreMap:
-        """All windows of a size in a region of a frame, by HOG and colours alone; with a descriptor if `described`."""
+    def within(cls, frame: Pyramid, region: Region, window: Window, model: Model) -> ScoreMap:
+        """All windows of a size in a region of a frame."""
         image, step = frame.part(region).resized(window)
-        cells = Cells.of(image, frame.descriptor if described else None)
+        cells = Cells.of(image)
         return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)
 
     @classmethod
     def whole(cls, frame: Pyramid, window: Window, model: Model) -> ScoreMap:
         """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
         return cls.within(frame, frame.region_around(window), window, model)
-
-    def complete(self, frame: Pyramid, place: tuple[int, int], model: Model) -> tuple[ScoreMap, int, int]:
-        """The map, row and column of a window with all its features: a map of its own if this one lacks vectors."""
-        if frame.descriptor is None or self.cells.vectors is not None:
-            return self, *place
-        return ScoreMap.around(frame, self.window(*place), WINDOW, model), 0, 0
 
     def window(self, row: float, column: float) -> Window:
         """The window at (row, column), which may lie between cells."""

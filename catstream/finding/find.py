@@ -29,7 +29,6 @@ from catstream.detection.search import Detection as Candidate
 from catstream.detection.similarity import Similarity
 from catstream.errors import SettingsError, VideoError
 from catstream.features.cells import Cells
-from catstream.features.descriptor import Descriptor, descriptor_of, digest_of
 from catstream.features.layout import CELL, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap, non_maximum_suppression
@@ -127,7 +126,6 @@ class Scan:
 
     threshold : minimum score of a detection
     sizes : smallest and largest size, as multiples of the learned size
-    descriptor : that the models were learned with, if there is one
     """
 
     def __init__(
@@ -135,9 +133,8 @@ class Scan:
         models: Iterable[SavedModel],
         threshold: float = THRESHOLD,
         sizes: tuple[float, float] = SIZES,
-        descriptor: Descriptor | None = None,
     ) -> None:
-        self._threshold, self._descriptor = threshold, descriptor
+        self._threshold = threshold
         self._templates = [_Template.of(saved) for saved in models]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
         for number, template in enumerate(self._templates):
@@ -147,7 +144,7 @@ class Scan:
     @one_thread()
     def __call__(self, image: np.ndarray) -> list[list[Match]]:
         """Search a frame, uint8 (h, w, 3): for each model, fitted windows that do not overlap, best first."""
-        frame = Pyramid(image, self._descriptor)
+        frame = Pyramid(image)
         results = []
         for template, windows in zip(self._templates, self.windows(frame), strict=True):
             matches = (_fitted(frame, candidate.window, template) for candidate in windows)
@@ -164,23 +161,18 @@ class Scan:
             image, step = frame.resized(window, averaged=False)
             cells = Cells.of(image)
             for number in numbers:
-                matches[number] += self._maxima(frame, cells, step, self._templates[number])
+                matches[number] += self._maxima(cells, step, self._templates[number])
         return [_suppressed(of_model) for of_model in matches]
 
-    def _maxima(self, frame: Pyramid, cells: Cells, step: tuple[float, float], template: _Template) -> list[Match]:
-        """The best windows of one size, whose cells are `step` pixels wide and high.
-
-        With a descriptor, HOG and colours choose the windows, and it describes only these.
-        """
+    def _maxima(self, cells: Cells, step: tuple[float, float], template: _Template) -> list[Match]:
+        """The best windows of one size, whose cells are `step` pixels wide and high."""
         least = _FITTED * self._threshold
         model = template.model
-        if frame.descriptor is None:  # no similarity is above 1 / share
-            appearance = cells.respond_above(model.weights, model.bias, least * template.similarity.share)
-        else:
-            appearance = cells.respond(model.weights, model.bias)
+        # No similarity is above 1 / share.
+        appearance = cells.respond_above(model.weights, model.bias, least * template.similarity.share)
         scores = ScoreMap(cells, appearance, (0.0, 0.0), step)
         places = non_maximum_suppression(appearance, _MOST_MAXIMA, WINDOW // 2)
-        matches = [template.match(*scores.complete(frame, place, model), scores.window(*place)) for place in places]
+        matches = [template.match(scores, *place, scores.window(*place)) for place in places]
         return [match for match in matches if match.score >= least]
 
 
@@ -240,7 +232,6 @@ class Search:
     threshold   minimum score of a detection
     every       seconds of a video between two frames that are searched, 0 for every frame
     sizes       smallest and largest size that is searched, as multiples of the learned size
-    network     file of the network that the models were learned with, empty for none
     """
 
     models: Mapping[str, SavedModel]
@@ -248,17 +239,13 @@ class Search:
     threshold: float = THRESHOLD
     every: float = EVERY
     sizes: tuple[float, float] = SIZES
-    network: str = ""
     _scan: Scan = field(init=False)
 
     def __post_init__(self) -> None:
         low, high = self.sizes
         if not 0 < low <= high < 100:
             raise SettingsError(f"expected the smallest and the largest size, got {low:g},{high:g}: for example 0.5,2")
-        descriptor = descriptor_of(Settings(features={"network": self.network}))
-        for name, saved in self.models.items():
-            saved.check_network(digest_of(descriptor), f"the model of {name!r}", "this search has")
-        self._scan = Scan(self.models.values(), self.threshold, self.sizes, descriptor)
+        self._scan = Scan(self.models.values(), self.threshold, self.sizes)
 
     @property
     def description(self) -> dict[str, Any]:
@@ -294,7 +281,6 @@ def find(
     every: float = EVERY,
     sizes: tuple[float, float] = SIZES,
     skip_damaged: bool = False,
-    network: str | os.PathLike[str] = "",
 ) -> Iterator[Detection]:
     """Find the objects of saved models in videos, folders and images.
 
@@ -312,8 +298,6 @@ def find(
         Smallest and largest size that is searched, as multiples of the size that was learned.
     skip_damaged : bool
         Continue after a damaged place in a video.
-    network : path
-        The file `features.network` that the models were learned with, if there was one.
 
     Yields
     ------
@@ -325,8 +309,7 @@ def find(
     ServiceError, ProtocolError
         If a model does not exist, or is damaged or of other features.
     SettingsError
-        If two models have one name, the sizes are not positive, the smaller one first, or a model was learned with
-        another network.
+        If two models have one name, the sizes are not positive, the smaller one first.
     VideoError
         If a path does not exist or has nothing to search; after all other files, for the first file that is damaged.
 
@@ -336,7 +319,7 @@ def find(
     ...     print(detection.file, detection.time, detection.box, detection.score)
     """
     reading = RunSettings(skip_damaged=skip_damaged)
-    search = Search(load_models(_several(models)), reading, threshold, every, sizes, os.fspath(network))
+    search = Search(load_models(_several(models)), reading, threshold, every, sizes)
     return _detections(search, find_files(_several(paths)))
 
 

@@ -105,7 +105,6 @@ class Job:
     rate      frames per second, None if that is not known yet
     results   files that `catstream track` writes
     paused    whether the run starts paused, until the command `resume`
-    network   digest of the file `features.network`, empty if there is none, or the processes were started by hand
 
     The others hold for one start of the run, and are not in the copy that is kept:
 
@@ -126,7 +125,6 @@ class Job:
     rate: float | None = None
     results: Results = Results()
     paused: bool = False
-    network: str = ""
     endpoint: str = ""
     state: Path | None = None
     resume: bool = False
@@ -205,7 +203,7 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {quote(str(path))}")
-        metadata: dict[str, Any] = {"network": "", "rate": None} | storage.read(file)[1]  # which an older job lacks
+        metadata: dict[str, Any] = {"rate": None} | storage.read(file)[1]  # which an older job lacks
         try:
             settings = Settings.from_values(metadata.pop("settings"))
             read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}

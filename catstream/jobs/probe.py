@@ -9,7 +9,6 @@ from typing import NamedTuple
 from catstream.base.addresses import is_live
 from catstream.base.names import check_boxes
 from catstream.errors import SettingsError
-from catstream.features.descriptor import descriptor_of, digest_of
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import check_files
 from catstream.video.source import open_source
@@ -50,9 +49,6 @@ def prepared(job: Job, info: SourceInfo) -> Job:
     """
     check_boxes(job.boxes, *info.size)
     settings = job.settings.for_length(info.frames)
-    if settings.features.network:
-        settings = settings.replace({"features.network": str(Path(settings.features.network).absolute())})
-    network = digest_of(descriptor_of(settings, job.network))
-    check_files(job.models, settings, network)
+    check_files(job.models, settings)
     source = job.source if info.live else str(Path(job.source).absolute())
-    return replace(job, source=source, size=info.size, rate=info.rate, settings=settings, network=network)
+    return replace(job, source=source, size=info.size, rate=info.rate, settings=settings)

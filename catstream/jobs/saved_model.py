@@ -27,7 +27,7 @@ from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
 from catstream.detection.similarity import Similarity
 from catstream.errors import MissingFileError, ProtocolError, ServiceError, SettingsError
-from catstream.features.layout import row_length
+from catstream.features.layout import ROW_LENGTH
 from catstream.messages import storage
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, Features, Model
@@ -77,30 +77,21 @@ class SavedModel:
             raise ServiceError("nothing was learned of the object yet, so there is nothing to save")
         trees = {label: tree.copy() for label, tree in compressor.trees.items()}
         centres, name = compressor.centres, compressor.name
-        model = _trained(trees, centres, compressor.version, name, settings, compressor.network)
+        model = _trained(trees, centres, compressor.version, name, settings)
         return cls(name, trees, centres, compressor.origins, compressor.box, model, settings)
 
-    def compressor(self, settings: Settings, network: str = "", name: str = "") -> Compressor:
+    def compressor(self, settings: Settings, name: str = "") -> Compressor:
         """A compressor that inserts the frames of another stream into copies of the trees; versions continue.
 
         The object has this name in that stream. SettingsError as of `check_fits`.
         """
-        self.check_fits(settings, network)
+        self.check_fits(settings)
         version = self.model.version
-        return Compressor.continuing(self.trees, version, self.centres, self.origins, settings, name, network)
+        return Compressor.continuing(self.trees, version, self.centres, self.origins, settings, name)
 
-    def check_fits(self, settings: Settings, network: str) -> None:
-        """Raise SettingsError if a run with these settings, and a network of this digest, cannot continue the trees."""
+    def check_fits(self, settings: Settings) -> None:
+        """Raise SettingsError if a run with these settings cannot continue the trees."""
         _check_same(self.settings, settings, "the saved model was learned", "this run has")
-        self.check_network(network)
-
-    def check_network(self, network: str, one: str = "the saved model", other: str = "this run has") -> None:
-        """Raise SettingsError unless it was learned with the network of this digest; empty is none."""
-        if (own := self.model.network) != network:
-            ours, theirs = (f"the network of digest {digest}" if digest else "no network" for digest in (own, network))
-            raise SettingsError(
-                f"{one} was trained with {ours}, {other} {theirs}: use the same file for features.network"
-            )
 
     @one_thread()
     def similarity(self) -> Similarity:
@@ -171,10 +162,10 @@ class SavedModel:
             learned._check()
         except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{name} is not a saved model ({error}): `catstream save` writes one") from None
-        width, network = len(learned.model.weights), learned.model.network
-        if width != row_length() and not network:
+        width = len(learned.model.weights)
+        if width != ROW_LENGTH:
             raise ProtocolError(
-                f"{name} has {width} features of a window, this catstream has {row_length()}: "
+                f"{name} has {width} features of a window, this catstream has {ROW_LENGTH}: "
                 "track the object again with this version"
             )
         return learned
@@ -207,14 +198,14 @@ class SavedModel:
                 raise ValueError(f"its tree {name!r} has {tree.size} rows of length {tree.width}")
 
 
-def check_files(files: Mapping[str, Path], settings: Settings, network: str) -> None:
+def check_files(files: Mapping[str, Path], settings: Settings) -> None:
     """Raise an error unless objects can begin with the saved models in these files, by name, in the first frame.
 
     ServiceError or ProtocolError if one cannot be read; SettingsError if one was learned with other settings, or they
     are too large.
     """
     for file in files.values():
-        SavedModel.load(file).check_fits(settings, network)
+        SavedModel.load(file).check_fits(settings)
     check_sizes({name: file.stat().st_size for name, file in files.items()})
 
 
@@ -241,9 +232,7 @@ def continued(features: Features, settings: Settings) -> dict[str, Compressor]:
     """
     models = {name: part.model for name, part in features.objects.items() if part.model}
     return {
-        name: SavedModel.from_bytes(model, f"the saved model of {listed([name])}").compressor(
-            settings, features.network, name
-        )
+        name: SavedModel.from_bytes(model, f"the saved model of {listed([name])}").compressor(settings, name)
         for name, model in models.items()
     }
 
@@ -297,7 +286,7 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
         centres=centres,
         origins=tuple(origin for part in parts for origin in part.origins),
         box=first.box.scaled(float(width) / first.box.w, float(height) / first.box.h),
-        model=_trained(trees, centres, version, name, first.settings, first.model.network),
+        model=_trained(trees, centres, version, name, first.settings),
     )
 
 
@@ -309,7 +298,6 @@ def _check_merge(one: SavedModel, other: SavedModel, origins: set[str]) -> None:
             "merge models of the same object"
         )
     _check_same(one.settings, other.settings, "one saved model was trained", "another")
-    one.check_network(other.model.network, "one saved model", "another with")
     if origins & set(other.origins):
         raise SettingsError(
             "two of the models were trained on the same frames, which would count twice: "
@@ -345,13 +333,11 @@ def _check_alike(parts: Sequence[SavedModel]) -> None:
         )
 
 
-def _trained(
-    trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings, network: str
-) -> Model:
+def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, name: str, settings: Settings) -> Model:
     from catstream.training.trainer import Trainer
 
     with one_thread():  # as a pipeline's own trainer: the model has the same bits
-        return Trainer(settings).train(sample_of(trees, version, 0, centres, name, network=network))
+        return Trainer(settings).train(sample_of(trees, version, 0, centres, name))
 
 
 def _check_same(ours: Settings, theirs: Settings, one: str, other: str) -> None:

@@ -6,7 +6,7 @@ A message is frozen and complete by itself. In one process the stages pass the o
 The annotations are the schema (see `catstream.messages.schema`), and the docstrings describe the fields. The checks,
 the files of `catstream.messages.storage`, the tables of `docs/protocol.md` and the fuzzers are derived from both.
 
-`d` is the length of a feature row (`catstream.features.layout.row_length`), `n` the coreset size, frames count from 0.
+`d` is the length of a feature row (`catstream.features.layout.ROW_LENGTH`), `n` the coreset size, frames count from 0.
 The objects of a stream have names (`catstream.base.names`); an object that is alone may have the name "".
 """
 
@@ -183,13 +183,11 @@ class Features(_Numbered):
     frame    number of the frame that the rows were cut from: 0, 1, 2 ... without a gap
     time     seconds since the start of the source, or of the run if the source is live
     objects  the part of each object that is tracked, by name
-    network  digest of the network that computed a part of the rows, empty if there is none
     """
 
     frame: Integer
     time: Number
     objects: ByObject[ObjectFeatures]
-    network: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +237,6 @@ class Sample:
     centres  centre of the object in each frame of the last complete block, pixels; NaN while absent
     object   name of the object
     began    number of the object's first frame
-    network  digest of the network that computed a part of the rows, empty if there is none
     """
 
     version: Integer
@@ -248,7 +245,6 @@ class Sample:
     centres: Annotated[np.ndarray, Array("float64", ("m", 2), may_be_nan=True)]
     object: ObjectName = ""
     began: Integer = 0
-    network: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +262,6 @@ class Model:
     biases   bias of each of these heads that has one
     object   name of the object
     began    number of the object's first frame
-    network  digest of the network that computes a part of a row, empty if there is none
     """
 
     version: Integer
@@ -280,7 +275,6 @@ class Model:
     biases: Annotated[dict[str, float], Named(_WITH_BIAS)] = field(default_factory=dict)
     object: ObjectName = ""
     began: Integer = 0
-    network: Text = ""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -10,6 +10,7 @@ from catstream.base.text import listed
 from catstream.detection.detector import Result
 from catstream.detection.objects import Detectors
 from catstream.errors import BoxError, ObjectError
+from catstream.features.pyramid import Pyramid
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Answer, Command, Model
 from catstream.processes.commands import Commands
@@ -66,7 +67,7 @@ class Beginnings:
                 continue
             self._process.watchdog.allow()
             if not desired.model:
-                pyramid = detectors.pyramid(frame.image)
+                pyramid = Pyramid(frame.image)
                 yield Beginning(name, detectors.begin(name, pyramid, desired.box, frame.time))
             elif (saved := commands.models.get(desired.model)) is not None:
                 detectors.seek(name, saved.model, saved.box, saved.similarity())
@@ -100,7 +101,7 @@ class Beginnings:
         names = commands.desired.objects.keys() | command.boxes.keys()
         check_count(len(names), self._process.settings.run.max_objects)
         self._process.watchdog.allow()
-        results = detectors.begin_all(command.boxes, detectors.pyramid(frame.image), frame.time)
+        results = detectors.begin_all(command.boxes, Pyramid(frame.image), frame.time)
         for name, box in command.boxes.items():
             commands.desired = commands.desired.with_object(name, DesiredObject(box, detectors.seq + 1))
         effect = f"{listed(command.boxes)} begin in frame {detectors.seq}"
@@ -121,7 +122,7 @@ class Beginnings:
             place = f"at {box} in the picture {frame.time - command.time:.1f} s before frame {detectors.seq}"
         elif command.time is not None:
             place += ", as the picture in which it was drawn is not stored any more"
-        pyramids = (detectors.pyramid(one.image) for one in frames)
+        pyramids = (Pyramid(one.image) for one in frames)
         first = next(pyramids)
         check_room(name, commands.desired, self._process.settings.run.max_objects)
         self._process.watchdog.allow()

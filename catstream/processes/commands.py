@@ -124,7 +124,7 @@ class Commands(AbstractContextManager["Commands"]):
             return None
         self._process.watchdog.allow()
         saved = SavedModel.from_bytes(command.model, "the file")
-        saved.check_fits(self._process.settings, self._detectors.network)
+        saved.check_fits(self._process.settings)
         return self.models.add(saved)
 
     def take_boxes(self) -> list[Command]:

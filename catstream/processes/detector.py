@@ -19,6 +19,7 @@ import cv2
 from catstream.base.addresses import is_live, without_password
 from catstream.detection.objects import Detectors
 from catstream.errors import VideoError
+from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import Features, Model, Track, Tracks, run_state
 from catstream.numerics import ridge
 from catstream.processes.beginnings import Beginning, Beginnings
@@ -76,7 +77,7 @@ class DetectorLoop:
         # The name of a file need not be UTF-8.
         process.source = without_password(process.job.source).encode(errors="replace").decode()[:_LONGEST_SOURCE]
         self.process = process
-        self.detectors = Detectors(process.settings, process.job.network)
+        self.detectors = Detectors(process.settings)
         self.lag = TrainingLag()
         self.commands = stack.enter_context(Commands(process, self.detectors))
         self.outputs = stack.enter_context(Outputs(process, self.turn, self.lag.reply))
@@ -182,7 +183,7 @@ class DetectorLoop:
         """Find all objects in a frame; `beginnings` are those whose first frame it is."""
         results = {beginning.name: beginning.result for beginning in beginnings if beginning.result is not None}
         saved = {beginning.name: beginning.model for beginning in beginnings if beginning.model is not None}
-        tracks, features = self.detectors.step(self.detectors.pyramid(frame.image), frame.time, results)
+        tracks, features = self.detectors.step(Pyramid(frame.image), frame.time, results)
         self.models.adopt_early(tracks.tracks)
         number = self.process.job.source_frame(frame.number)
         numbered = {name: replace(track, pts=frame.pts, source_frame=number) for name, track in tracks.tracks.items()}

@@ -52,8 +52,7 @@ class Trainer:
         motion = _motion(np.ascontiguousarray(sample.centres, np.float64).tobytes())
         bias = -float(weights @ background_mean)
         heads, biases = self._head_vectors(sample, weights)
-        about = sample.object, sample.began, sample.network
-        return Model(sample.version, sample.frame, weights, bias, motion, heads, biases, *about)
+        return Model(sample.version, sample.frame, weights, bias, motion, heads, biases, sample.object, sample.began)
 
     def _directions(self, sample: Sample) -> list[np.ndarray]:
         settings = self.settings

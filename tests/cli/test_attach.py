@@ -11,7 +11,7 @@ import pytest
 
 from catstream.cli.attach import _format, _summary
 from catstream.client.attach import control
-from catstream.features.layout import row_length
+from catstream.features.layout import ROW_LENGTH
 from catstream.messages.kinds import End, Health, Track
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
@@ -97,7 +97,7 @@ def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting
     model = json.loads(output)
     assert model["version"] >= 1
     assert model["weights"].keys() == {"dtype", "shape", "norm"}
-    assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [row_length()])
+    assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [ROW_LENGTH])
     assert (code, errors) == (0, "1 models, 0 missed\n")
 
 

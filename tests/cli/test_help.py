@@ -114,7 +114,6 @@ def test_as_json_a_program_reads_names_and_defaults(said, words):
         (["set_box"], "set-box"),
         (["fleet", "staus"], "status"),
         (["keys", "alow"], "allow"),
-        (["network", "prepair"], "prepare"),
     ],
 )
 def test_the_nearest_command_is_suggested_for_a_mistyped_one(fail, words, meant):

@@ -12,7 +12,7 @@ from catstream.detection.detector import Detector
 from catstream.detection.objects import Detectors
 from catstream.detection.similarity import Similarity
 from catstream.errors import BoxError, ProtocolError
-from catstream.features.layout import row_length
+from catstream.features.layout import ROW_LENGTH
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import APPEARANCE, GROUPS
 from catstream.messages.kinds import Model, Motion
@@ -61,7 +61,7 @@ def test_the_first_frame_teaches_a_leaf_of_each_tree(scene, moved):
     assert (track.seq, track.frame, track.state, track.time) == (1, 0, "bootstrapping", 2.5)
     assert track.box == pytest.approx(START)
     size, training = detector.settings.coreset.size, features.training[APPEARANCE]
-    assert training.rows.shape[1] == row_length()
+    assert training.rows.shape[1] == ROW_LENGTH
     assert (training.labels == 1).sum() == size <= (training.labels == 0).sum()
     assert set(features.training) == set(GROUPS)
     assert min(map(len, features.training.values())) >= size

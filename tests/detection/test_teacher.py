@@ -9,7 +9,7 @@ from catstream.detection import teacher
 from catstream.detection.context import FrameContext
 from catstream.detection.teacher import affine_copies
 from catstream.features.cells import Cells
-from catstream.features.layout import COLOURS, WINDOW, row_length
+from catstream.features.layout import COLOURS, ROW_LENGTH, WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.heads import APPEARANCE, EXTENT
@@ -26,7 +26,7 @@ def frame(texture):
 
 @pytest.fixture
 def model(rng):
-    return Model(1, 0, rng.normal(size=row_length()).astype(np.float32), 0.0)
+    return Model(1, 0, rng.normal(size=ROW_LENGTH).astype(np.float32), 0.0)
 
 
 def cut(frame, model, around=None, window=OBJECT):

@@ -12,7 +12,7 @@ from catstream.features import cells as features
 from catstream.features import kernels, layout
 from catstream.features.cells import Cells
 from catstream.features.kernels import COMPILING
-from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, SHADES, row_length
+from catstream.features.layout import CELL, CHANNELS, COLOURS, MARGIN, ROW_LENGTH, SHADES
 from catstream.features.pyramid import planes_of
 
 
@@ -23,7 +23,7 @@ def cells(rng):
 
 
 def test_every_window_scores_weights_times_row_plus_bias(cells, rng):
-    weights = rng.normal(size=row_length()).astype(np.float32)
+    weights = rng.normal(size=ROW_LENGTH).astype(np.float32)
     scores = cells.respond(weights, 0.5)
     expected = [[cells.row(row, column) @ weights + 0.5 for column in range(7)] for row in range(4)]
     np.testing.assert_allclose(scores, expected, rtol=1e-4, atol=1e-3)
@@ -31,14 +31,14 @@ def test_every_window_scores_weights_times_row_plus_bias(cells, rng):
 
 def test_a_row_is_the_windows_cells_and_then_its_colours(cells):
     row = cells.row(2, 3)
-    assert (row.shape, row.dtype) == ((row_length(),), np.float32)
+    assert (row.shape, row.dtype) == ((ROW_LENGTH,), np.float32)
     np.testing.assert_array_equal(row[: COLOURS.start], cells.grid[2:10, 3:11].ravel())
     assert np.linalg.norm(row[COLOURS]) == pytest.approx(3, abs=1e-5)
 
 
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 0.9, 1.0])
 def test_the_scores_from_a_threshold_on_are_those_of_all_windows(cells, rng, quantile):
-    weights = rng.normal(size=row_length()).astype(np.float32)
+    weights = rng.normal(size=ROW_LENGTH).astype(np.float32)
     scores = cells.respond(weights, 0.5)
     least = float(np.quantile(scores, quantile)) + 1e-3
     expected = np.where(scores >= least, scores, -np.inf)

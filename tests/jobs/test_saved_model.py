@@ -11,13 +11,13 @@ from catstream.base.settings import Settings
 from catstream.compression.compressor import Compressor
 from catstream.compression.reduce import energy
 from catstream.errors import ProtocolError, ServiceError, SettingsError
-from catstream.features.layout import row_length
+from catstream.features.layout import ROW_LENGTH
 from catstream.jobs.saved_model import SavedModel, check_sizes, merge
 from catstream.messages import storage
 from catstream.messages.heads import APPEARANCE, TREES
 from tests.learning import BOX, features, rows_of
 
-SIZE, WIDTH, FRAMES = 8, row_length(), 60
+SIZE, WIDTH, FRAMES = 8, ROW_LENGTH, 60
 SETTINGS = Settings(coreset={"size": SIZE})
 
 
@@ -100,7 +100,7 @@ def test_a_run_has_nothing_to_save_before_the_first_sample_or_before_a_detection
 
 def test_a_model_of_other_features_is_an_error(learned, tmp_path, monkeypatch):
     learned.save(tmp_path / "one")
-    monkeypatch.setattr("catstream.jobs.saved_model.row_length", lambda: WIDTH + 1)
+    monkeypatch.setattr("catstream.jobs.saved_model.ROW_LENGTH", WIDTH + 1)
     with pytest.raises(ProtocolError, match=f"{WIDTH} features of a window, this catstream has {WIDTH + 1}"):
         SavedModel.load(tmp_path / "one")
 

@@ -7,6 +7,7 @@ import pytest
 
 from catstream.base.box import Box
 from catstream.detection.objects import Detectors
+from catstream.features.pyramid import Pyramid
 from catstream.jobs.job import Job
 from catstream.messages.kinds import Command
 from catstream.processes.beginnings import Beginnings
@@ -33,7 +34,7 @@ class Stream:
         beginnings = self.beginnings.in_frame(Frame(number, number / 25, self._image), held=held)
         if beginnings or not held:
             results = {one.name: one.result for one in beginnings}
-            self.detectors.step(self.detectors.pyramid(self._image), number / 25, results)
+            self.detectors.step(Pyramid(self._image), number / 25, results)
         self.answers = [(answered.object, answered.done) for answered in answers]
         return [one.name for one in beginnings]
 
