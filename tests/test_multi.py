@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.errors import BoxError, FrameError, ObjectError, ServiceError, SettingsError
+from catstream.errors import BoxError, ObjectError, ServiceError, SettingsError
 from catstream.multi import MultiTracker
 
 STEPS = {"anna": (4, 1), "ben": (-3, 2), "cleo": (0, -4)}  # pixels a frame
@@ -115,24 +115,11 @@ def test_if_one_box_of_several_is_refused_it_is_named_and_nothing_changes(frames
     tracker, other = started(frames, settings={"run.max_objects": 4}), started(frames)
     with pytest.raises(error, match=why):
         tracker.update(frames[1], begin=begin)
+    with pytest.raises(error, match=why):
+        tracker.init(frames[1], begin)
     with pytest.raises(TypeError):
         tracker.update(frames[1], begin)  # it would be taken for the time
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
-
-
-def test_the_box_of_an_object_without_a_name_may_be_an_array(frames):
-    tracker = started(frames)
-    assert tracker.update(frames[1], begin=np.array(box_of("ben", 1)))[""].box == box_of("ben", 1)
-
-
-def test_an_invalid_init_keeps_the_objects_before(frames):
-    tracker = started(frames)
-    for boxes, error in (({}, ObjectError), ({"ben": (1, 1, 0, 0)}, BoxError), ({"anna": "x"}, BoxError)):
-        with pytest.raises(error):
-            tracker.init(frames[1], boxes)
-    with pytest.raises(FrameError):
-        tracker.update(frames[1][:100])
-    assert list(tracker.update(frames[1])) == ["anna"]
 
 
 def test_forget_drops_one_object_and_an_unknown_one_is_an_error(frames):

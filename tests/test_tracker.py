@@ -92,13 +92,6 @@ def test_a_tracker_says_what_it_is_and_that_it_needs_a_box_first(video):
     assert repr(started(video)) == "<catstream.Tracker, at frame 0: the object bootstrapping>"
 
 
-def test_frames_of_other_libraries_give_the_boxes_of_the_same_frames(video, boxes_found):
-    frames, boxes = video
-    read_only = [np.frombuffer(frame.tobytes(), np.uint8).reshape(frame.shape) for frame in frames]
-    assert follow((read_only, boxes), Settings())[0] == boxes_found
-    assert follow(([frame.astype(np.float32) / 255 for frame in frames], boxes), Settings())[0] == boxes_found
-
-
 @pytest.mark.parametrize("bad", [None, np.zeros((3, 240, 320), np.uint8), np.zeros((240, 320), bool)])
 def test_an_invalid_frame_is_rejected_and_the_tracker_continues(video, bad):
     frames, boxes = video

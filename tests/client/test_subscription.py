@@ -14,7 +14,7 @@ import catstream
 from catstream.errors import ObjectError, ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, ObjectFeatures, TrainingRows
 from catstream.wire import socket
-from catstream.wire.channels import CHANNELS, FEATURES, HEALTH, MODELS, TRACKS
+from catstream.wire.channels import FEATURES, HEALTH, MODELS, TRACKS
 from catstream.wire.discovery import reserve_endpoint
 from catstream.wire.newest import Publisher
 from tests.wire.examples import model
@@ -168,25 +168,6 @@ def test_a_late_subscriber_gets_the_last_model_once_and_ends_with_the_tracks(end
     assert subscription.end.reason == "the source has ended"
 
 
-def test_the_health_of_each_process_arrives_once(endpoint):
-    names = CHANNELS["health"].senders
-    with contextlib.ExitStack() as stack:
-        publishers = [stack.enter_context(Publisher(HEALTH, endpoint, name)) for name in names]
-        subscription = stack.enter_context(catstream.subscribe(str(endpoint), "health", timeout=0.3))
-        heard = []
-        for name, publisher in zip(names, publishers, strict=True):
-            publisher.send(Health(name, 1.0))
-        for _ in range(100):
-            for publisher in publishers:
-                publisher.serve_late_joiners()
-            with contextlib.suppress(SilenceError):
-                heard.append(next(subscription).process)
-                continue
-            if len(heard) >= len(names):
-                break
-    assert sorted(heard) == sorted(names)
-
-
 def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(endpoint, until):
     with (
         Publisher(FEATURES, endpoint) as training,
@@ -287,24 +268,3 @@ def test_who_asks_for_the_newest_gets_that_of_each_object_and_then_the_end(endpo
     assert len(heard) < 2 * 48
     assert subscription.missed > 0
     assert subscription.end.reason == "the source has ended"
-
-
-def test_a_reader_that_never_waits_receives_the_end_of_a_restarted_pipeline(endpoint, until):
-    with Publisher(TRACKS, endpoint) as first:
-        subscription = attached(endpoint, first)
-        for seq in range(2, 900):
-            first.send(track(seq))
-    with subscription, Publisher(TRACKS, endpoint) as second:
-        heard = []
-
-        def read():
-            second.serve_late_joiners()
-            time.sleep(0.01)
-            heard.append(next(subscription).seq)
-
-        until(lambda: len(second._subscribed) == 2, read)
-        assert heard[-1] < 899, "a track was there at each look"
-        second.send(End(920, "the source has ended"))
-        heard += [message.seq for message in subscription]
-        assert heard == list(range(2, 900))
-        assert (subscription.end.reason, subscription.missed) == ("the source has ended", 21)

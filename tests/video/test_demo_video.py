@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -69,11 +67,3 @@ def test_the_video_is_written_with_its_ground_truth(tmp_path):
         assert sum(1 for _ in source) == len(truth) == 4
     rows = np.loadtxt(path.with_name("groundtruth_rect.txt"), delimiter=",")
     np.testing.assert_allclose(rows, np.array(truth, float), atol=1e-3)
-
-
-def test_it_is_rendered_without_pillow(monkeypatch):
-    """Which only the packages of developers bring with them."""
-    monkeypatch.setitem(sys.modules, "PIL", None)
-    image, box = next(render(1, (320, 240)))
-    assert image.shape == (240, 320, 3)
-    assert box is not None

@@ -7,7 +7,6 @@ import pytest
 
 from catstream.errors import VideoError
 from catstream.video import live_demo, rendered
-from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
 
 
@@ -64,31 +63,12 @@ def test_a_later_start_continues_with_the_image_of_that_number(clock):
         assert np.array_equal(frame.image, read(whole, clock, 0.121).image)
 
 
-def test_the_images_in_memory_cannot_be_changed_by_a_reader():
-    with open_source("demo:1") as source:
-        frame = next(source)
-        frame.image[:] = 0
-        assert source._image(0).any()
-
-
 def test_a_reader_that_waits_is_asked_whether_to_go_on_and_a_closed_source_ends(clock):
     with open_source("demo:1", idle=lambda: True, image_rate=1.0) as source:
         next(source)
         assert next(source, None) is None
     clock.now += 10
     assert next(source, None) is None
-
-
-@pytest.mark.parametrize("seed", [0, 1, 7])
-def test_the_first_box_is_that_of_the_object(seed):
-    text = f"demo:{seed}"
-    box = first_box(text)
-    assert box.validated(320, 240)
-    with open_source(text) as source:
-        image = next(source).image.astype(int)
-    x, y = map(int, box.centre)
-    blue, _, red = image[y - 10 : y + 10, x - 10 : x + 10].mean(axis=(0, 1))
-    assert red > 1.5 * blue, "the dahlia is orange"
 
 
 @pytest.mark.parametrize("text", ["demo:", "demo:x", "demo:-1", "demo:1?rate=10"])
