@@ -70,7 +70,7 @@ _WITH_BIAS = {name: 0 for name, head in HEADS.items() if head.has_bias}
 class Motion:
     """Parameters of the Kalman filter of the centre, found by EM (paper, section "Classification").
 
-    process      covariance of what the constant-velocity model misses in a frame; of x, y, then their speeds
+    process      process noise covariance per frame of the constant-velocity model: x, y, then their speeds
     observation  covariance of a measured centre, pixels squared
     """
 
@@ -82,16 +82,16 @@ class Motion:
 class DetectorState:
     """All that a detector knows after a frame, besides the model: with both, another one continues bit for bit.
 
-    first_frame       the object's first, see `began` of a track
+    first_frame       number of the object's first frame
     level             belief that the object was found
-    window            window of the object; the next search is centred on it
-    confident_window  the same in the last confident frame; before a saved model's object is found, the best window
-    first_window      the same in the first frame; None before a saved model's object is found
-    trusted           false after the object was found again elsewhere, until its score is high
-    sightings         frames in a row in which a saved model's object was seen in one place
-    motion            of the Kalman filter of the centre, None before a model had any
-    centre            its estimate: mean (x, y, and their speeds) above covariance; None before it has one
-    together          earlier objects, each with its first frame, whose boxes overlap the object's since its first frame
+    window            window of the object, the centre of the next search
+    confident_window  window of the last confident frame; the best one while a saved model's object is searched for
+    first_window      window of the first frame, None while a saved model's object is searched for
+    trusted           false after a detection elsewhere, until the score is high
+    sightings         successive frames with a saved model's object in one place
+    motion            parameters of the Kalman filter, None before the first
+    centre            its state, None before the first: mean (x, y, and their speeds) above covariance
+    together          first frame of each earlier object whose box has always overlapped this one, by name
     """
 
     first_frame: Integer
@@ -116,11 +116,11 @@ class TrainingRows:
     """Feature rows of windows of a frame, each with its label and weight.
 
     rows     features of the windows
-    labels   group "appearance": 1 for the object, 0 for background; group "extent": 1 for a window of the right size
-             and aspect; between them for a near miss
-    weights  number of ordinary rows that each stands for
-    offsets  group "extent": 0.5 for the right size, 1/16 more for each step that it is too large; then the same for the
-             aspect; None if all are right
+    labels   1 for the object, or in the group "extent" for the right size and aspect; 0 for background; between them
+             for a near miss
+    weights  number of ordinary rows that each row counts as
+    offsets  group "extent": 0.5 for the right size, plus 1/16 for each step above it, and the same for the aspect;
+             None if all are right
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("k", "d"))]
@@ -150,11 +150,11 @@ class TrainingRows:
 class ObjectFeatures:
     """The part of `Features` for one object.
 
-    box       the object's box, None if it was not found
-    training  training rows of each group; a group without rows is left out
-    detector  state of the detector after this frame, None before it has one
-    begins    whether a new object begins under this name: its trees start empty
-    model     the saved model that the trees continue, if the object begins with one; otherwise empty
+    box       box of the object, None if it was not found
+    training  rows of each group that has any
+    detector  state of the detector after this frame, None before the first
+    begins    whether a new object begins under this name, with empty trees
+    model     saved model with which the object begins, otherwise empty
     """
 
     box: Box | None
@@ -180,8 +180,8 @@ class _Numbered:
 class Features(_Numbered):
     """The training rows of one frame, detector -> compressor; one message a frame.
 
-    frame    number of the frame that the rows were cut from: 0, 1, 2 ... without a gap
-    time     seconds since the start of the source, or of the run if the source is live
+    frame    number of the frame: 0, 1, 2 ... without a gap
+    time     time of the frame in seconds
     objects  the part of each object that is tracked, by name
     """
 
@@ -194,13 +194,13 @@ class Features(_Numbered):
 class Position:
     """Acknowledgement of messages, receiver -> sender. The message of frame n has number n + 1.
 
-    seq        all messages up to this one are stored, except for the last `in_memory` ones: the sender drops its copies
-    processed  all messages up to this one have been processed
-    in_memory  how many of the messages up to `seq` are in memory only, because the disk cannot be written
-    versions   version of the newest Sample of each object that has one, by name
-    again      whether the sender has to send all messages after `processed` again, as they may be lost
-    states     for a sender that was restarted: the state of each object's detector after the message that it asked
-               for, or after the nearest one that is known, by name
+    seq        newest acknowledged message: the sender drops its copies up to this one
+    processed  newest processed message
+    in_memory  number of acknowledged messages that are in memory only, because the disk cannot be written
+    versions   version of the newest sample of each object
+    again      whether the sender has to send all messages after `processed` again
+    states     for a restarted sender: state of each object's detector after the message that it asked for, or after
+               the nearest known one
     """
 
     seq: Integer = 0
@@ -215,10 +215,10 @@ class Position:
 class Summary:
     """A hierarchical sample of one coreset tree (paper, section "Coreset Appearance Model").
 
-    rows    at most 2n rows, rotated and rescaled so that each has the weight of one original row
-    mean    exact mean of all rows that were inserted
-    count   number of rows that were inserted
-    levels  level of each node in memory, oldest first, strictly decreasing
+    rows    at most 2n rows, rotated and rescaled to the weight of one original row each
+    mean    exact mean of all inserted rows
+    count   number of inserted rows
+    levels  level of each node, oldest first, strictly decreasing
     """
 
     rows: Annotated[np.ndarray, Array("float32", ("r", "d"))]
@@ -231,10 +231,10 @@ class Summary:
 class Sample:
     """A training sample of all frames so far, compressor -> trainer; only the newest of each object is used.
 
-    version  1, 2, 3 ... in the order in which the samples of all objects are made
-    frame    number of the newest frame that it summarises
-    trees    the summary of each tree; a tree without a leaf is left out
-    centres  centre of the object in each frame of the last complete block, pixels; NaN while absent
+    version  1, 2, 3 ... over the samples of all objects
+    frame    number of the newest summarised frame
+    trees    summary of each tree that has a leaf
+    centres  centres of the object in the last complete block of frames, pixels; NaN while absent
     object   name of the object
     began    number of the object's first frame
     """
@@ -251,12 +251,12 @@ class Sample:
 class Model:
     """A trained appearance model, trainer -> detector and anyone.
 
-    version  version of the Sample that it was trained on
-    frame    number of the newest frame that the sample summarises
+    version  version of the sample
+    frame    number of the newest frame in the sample
     weights  of the score of a window: weights @ row + bias
-    bias     chosen so that the score is 0 at the mean of the background and 1 at the mean of the object
-    motion   parameters of the Kalman filter, None until there are enough centres for EM
-    heads    vector of each head that does not add to the score, once it is trained. A window fits well if
+    bias     so that the mean of the background scores 0, and the mean of the object 1
+    motion   parameters of the Kalman filter, None before the first EM
+    heads    vector of each trained head that does not add to the score. A window fits well if
              (weights + heads["extent"]) @ row is high, and heads[name] @ row + biases[name] is near 0.5 for "size" and
              "aspect"
     biases   bias of each of these heads that has one
@@ -281,24 +281,20 @@ class Model:
 class Track(_Numbered):
     """An object in one frame, detector -> anyone.
 
-    frame          number of the frame: 0, 1, 2 ... over the tracked frames, the same for all objects; skipped frames
-                   are not counted. A gap means missed messages, or that the object was not tracked in between
+    frame          number of the tracked frame, from 0, the same for all objects. A gap means missed messages, or that
+                   the object was not tracked
     time           seconds since the start of the source, or of the run if the source is live
-    state          "absent" if no box is reported. Otherwise "bootstrapping" while the model is that of the object's
-                   first frame (version 0), then "present"
+    state          "absent" without a box, "bootstrapping" with the model of the first frame (version 0), then "present"
     box            box of the object, in pixels of the frame; None while absent
     score          confidence: about 0 on background, about 1 on the object
-    model_version  version of the model that scored it, 0 before the first
-    pts            time stamp of the frame in a live stream, in seconds of the stream's own clock; None for a file, and
-                   if the stream states none, as mostly for its first frame
-    object         name of the object; "" if it has none
-    began          number of the object's first frame. If it differs from that of the track before, another object was
-                   given this name, by a box or a saved model
-    doubtful       whether the box should be looked at: the level of belief is "weak" or "redetected"
+    model_version  version of the model of the score, 0 before the first
+    pts            time stamp of a live stream, in seconds of its own clock; None for a file or without a stamp
+    object         name of the object
+    began          number of the object's first frame. Another number is another object of the same name
+    doubtful       whether the box should be checked: the level of belief is "weak" or "redetected"
     source_frame   number of the frame in its file or folder: start + stride * frame; `frame` for a live source
-    checked        of an annotation: "keyframe" with a box that a person drew, "checked" where passes in both directions
-                   agree, else "unchecked"; "" of any other run
-    probability    of an annotation: probability that the box, or its absence, is right; None of any other run
+    checked        in an annotation: "keyframe" with a drawn box, "checked" if both directions agree, else "unchecked"
+    probability    in an annotation: probability that the box, or its absence, is right
 
     >>> Track(12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)
     Track(frame=12, time=0.400, state='present', box=(120.0, 80.0, 64.0, 48.0), score=0.93, model_version=4)
@@ -359,7 +355,7 @@ class Tracks(_Numbered):
     """The tracks of one frame, detector -> the owner of the run; one message a frame.
 
     frame   number of the frame: 0, 1, 2 ... without a gap
-    tracks  the track of each object, by name
+    tracks  the track of each object
     """
 
     frame: Integer
@@ -371,11 +367,11 @@ class Preview:
     """A small picture of a frame, detector -> anyone.
 
     frame   number of the frame
-    time    of the frame, as in its track
+    time    time of the frame, as in its track
     width   width of the frame in pixels; the picture may be smaller
     height  height of the frame in pixels
-    boxes   box of each object that is present, in pixels of the frame, by name
-    jpeg    the picture as a JPEG file, with the frame's aspect ratio
+    boxes   box of each present object, in pixels of the frame
+    jpeg    picture as a JPEG file, with the frame's aspect ratio
     """
 
     frame: Integer
@@ -394,8 +390,8 @@ class Preview:
 class ModelFile:
     """Everything that was learned of an object, compressor -> anyone.
 
-    version  version of the newest sample of the object
-    file     the file that `catstream save` writes: the coreset trees whole, and a model
+    version  version of the object's newest sample
+    file     file that `catstream save` writes: all coreset trees, and a model
     object   name of the object
     """
 
@@ -410,12 +406,11 @@ class Health:
 
     process   name of the process
     time      seconds since the epoch (1970)
-    counters  counters of the process, by name
-    trouble   description of a problem of the process, empty if there is none
-    source    the video source without user and password; empty except for the detector
-    objects   counters of each object, by name; `score` and `present` only while frames are tracked
-    state     of the detector: "running" while frames are tracked. Otherwise the source is "lost", or the run is
-              "waiting" for a box, "paused" or "ended"; None for the other processes
+    counters  counters of the process
+    trouble   description of a problem, empty if there is none
+    source    of the detector: video source without user and password
+    objects   counters of each object; `score` and `present` only while frames are tracked
+    state     of the detector: "running" while frames are tracked, "lost" without a source, "waiting" for a box
     """
 
     process: Text
@@ -451,11 +446,11 @@ def run_state(counters: Mapping[str, float]) -> tuple[RunState, str]:
 class End(_Numbered):
     """The last message of a stream.
 
-    frame   number of the last frame before it, plus one
-    reason  description of why the stream ended
-    failed  whether it ended because of an error
-    totals  final counters, by name: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
-            the `truncated` seconds of a file, and the `reconnects` of a live source
+    frame   number of the last frame, plus one
+    reason  why the stream ended
+    failed  whether it ended with an error
+    totals  final counters: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
+            `truncated` seconds of a file, `reconnects` of a live source
     """
 
     frame: Integer
@@ -468,19 +463,16 @@ class End(_Numbered):
 class Command:
     """A control command to a running pipeline, anyone -> detector.
 
-    id       unique for each command: a command that is received twice is executed once and answered twice
+    id       unique for each command: if it is received twice, it is executed once and answered twice
     verb     the action
-    box      for "set-box" only: box of the object in the next frame that is tracked; during a pause of a file, in the
-             frame that is held
-    keep     for "set-box": whether it is the same object, so that everything learned about it is kept
-    object   for "set-box", "search", "forget" and "save": name of the object
-    model    for "search" only: the saved model of the object, which is searched for from the next frame on
-    seconds  for "pause" only: time after which the pause ends by itself, unless the command is repeated; 0 ends it now.
-             A pause without it lasts until "resume"
-    time     for "set-box" on a live source only: time of the preview in which the box was drawn. If its frame is still
-             kept, the object is searched for from there to the next frame that is tracked
-    boxes    for "set-box", in place of `box` and `object`: boxes of several objects by name, which begin in the same
-             frame, or none of them
+    box      "set-box": box of the object in the next tracked frame; in a paused file, in the current frame
+    keep     "set-box": whether it is the same object, whose trees and model are kept
+    object   "set-box", "search", "forget", "save": name of the object
+    model    "search": saved model of the object, which is searched for from the next frame on
+    seconds  "pause": time after which it ends by itself unless it is repeated; 0 ends it now. None: until "resume"
+    time     "set-box" on a live source: time of the preview in which the box was drawn. While its frame is kept, the
+             object is searched for from there to the next tracked frame
+    boxes    "set-box", in place of `box` and `object`: boxes of several objects that begin in one frame
     """
 
     id: Text
@@ -506,11 +498,11 @@ class Answer:
 
     id       id of the command
     done     whether it was executed
-    reason   description of the effect, or of the reason for a rejection
-    frame    number of the newest frame that was processed
+    reason   the effect, or the reason of a rejection
+    frame    number of the newest processed frame
     box      last box of the object, None if there is none
-    version  version of the newest model of this object, 0 before the first
-    object   name of the object that the command was for
+    version  version of the object's newest model, 0 before the first
+    object   name of the object
     """
 
     id: Text
@@ -527,18 +519,18 @@ class StreamStatus:
     """The state of one stream of a fleet: where it runs, and how it is.
 
     name            name of the stream, unique in its fleet
-    state           "waiting" for a box, "moving" between two nodes, "stopping" if it is to run on none
-    node            name of the node on which it runs, empty if it runs on none
-    source          the video source without user and password
-    endpoint        of its pipeline, in the format of the setting `run.endpoint`; empty if it does not run
-    server          public key of the sockets of its pipeline, empty if the pipeline has no keys
-    token           fencing token of its pipeline: each pipeline that is started for the stream has a larger one
-    live            whether the source is live: frames that were lost are not repeated, and their numbers are used again
-    frame           number of the newest frame that was tracked
-    skipped         frames of a live source that this pipeline did not track, because it was too slow
-    models          version of the newest model of each object that has one, by name
-    present         whether each object is present in that frame, by name; empty if no frames are tracked
-    stored_seconds  seconds since its state and that in the store were the same; None if there is none
+    state           "waiting" for a box, "moving" between nodes, "stopping" if it is to run on none
+    node            name of its node, empty if it runs on none
+    source          video source without user and password
+    endpoint        endpoint of its pipeline, as in `run.endpoint`; empty if it does not run
+    server          public key of its sockets, empty without keys
+    token           fencing token, larger for each new pipeline of the stream
+    live            whether the source is live: lost frames are not repeated, and their numbers are used again
+    frame           number of the newest tracked frame
+    skipped         frames of a live source that were skipped because the pipeline was too slow
+    models          version of the newest model of each object
+    present         whether each object is present in that frame; empty if no frames are tracked
+    stored_seconds  seconds since the store had the newest state, None without one
     trouble         description of a problem, empty if there is none
     """
 
@@ -601,7 +593,7 @@ class Question:
     """A question about the streams and nodes of a fleet, anyone -> controller of the fleet.
 
     id      unique for each question
-    stream  name of the one stream that it is about; empty for all streams and nodes
+    stream  name of one stream; empty for all streams and nodes
     """
 
     id: Text
@@ -613,7 +605,7 @@ class Listing:
     """The answer to a Question, controller of the fleet -> its sender.
 
     id      id of the question
-    fleet   the state of the fleet as JSON, of the stream that the question is about alone
+    fleet   state of the fleet, or of the one stream, as JSON
     """
 
     id: Text

@@ -18,15 +18,15 @@ import pytest
 from catstream.base.box import Box, Window
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import (
-    DetectorState,
     End,
     Motion,
-    NodeStatus,
     ObjectFeatures,
     Position,
+    Question,
     StreamStatus,
     Summary,
     Track,
+    Tracks,
     TrainingRows,
 )
 from catstream.messages.schema import LARGEST_INTEGER, LONGEST_LIST, LONGEST_TEXT, fields
@@ -38,8 +38,9 @@ from tests.wire.examples import track
 
 PATH = Path(__file__).parents[2] / "docs" / "protocol.md"
 PAGE = PATH.read_text()
-PARTS = [DetectorState, Motion, NodeStatus, ObjectFeatures, StreamStatus, Summary, TrainingRows]
-MESSAGES = [*codec.KINDS.values(), *PARTS]
+PARTS = [Motion, ObjectFeatures, StreamStatus, Summary, TrainingRows]
+INTERNAL = {Position, Tracks}  # between the processes of a pipeline: no subscriber sees them
+MESSAGES = [*(kind for kind in codec.KINDS.values() if kind not in INTERNAL), *PARTS]
 PLAIN = {int: "integer", float: "number", str: "text", bool: "boolean", Box: "box", Window: "window"}
 
 
@@ -68,12 +69,13 @@ def described(field):
 
 def kind_of(field):
     if field.values is not None:
-        names = "objects" if field.keys.is_name else names_of(field.named)
-        return f"map of {names} to {kind_of(field.values)}"
+        keys = "object" if field.keys.is_name else names_of(field.named)
+        kind, _, inner = kind_of(field.values).partition(" by ")
+        return f"{kind} by {keys}" + (f" and {inner}" if inner else "")
     if field.is_name:
         return "name of an object"
     if field.is_message:
-        return f"`{field.type.__name__.lower()}`"
+        return f"`{field.type.__name__.lower()}`" if field.type in MESSAGES else "map"
     if array := field.array:
         nan = ", may be NaN" if array.may_be_nan else ""
         return f"{array.dtype} ({', '.join(map(str, array.shape))}){array.range()}{nan}"
@@ -90,7 +92,7 @@ def kind_of(field):
 
 def names_of(named):
     if named is None:
-        return "text"
+        return "name"
     return ", ".join(f"`{name}`" + (" (always)" if name in named.required else "") for name in named.columns)
 
 
@@ -122,7 +124,7 @@ def test_every_channel_has_its_row(channel):
     ports = ", ".join(f"+{channel.port + offset}" for offset in range(len(channel.senders)))
     cells = (
         f"`{channel.name}`", kinds, ", ".join(channel.senders), channel.receiver or "anyone", channel.keeps, ports,
-        f"{channel.megabytes} MiB", channel.role,
+        str(channel.megabytes), channel.role,
     )  # fmt: skip
     assert f"| {' | '.join(cells)} |" in PAGE, "docs/protocol.md, table of channels"
 
@@ -145,7 +147,7 @@ def test_the_limits_are_those_of_the_codec():
 
 def test_the_example_in_bytes_agrees_with_the_encoded_message():
     example = re.search(r"^```\n((?:[0-9a-f]{2}[ \n])+)```", PAGE, re.MULTILINE)[1]
-    assert bytes.fromhex(example) == codec.encode(Position(5, 7, 0, {"anna": 2}))
+    assert bytes.fromhex(example) == codec.encode(Question("7", "cam1"))
     assert f"`{codec.opening(End).hex(' ')}` for `end`" in PAGE
     assert f"`{codec.opening(Track, 'anna').hex(' ')}` for" in PAGE
 
