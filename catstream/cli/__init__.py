@@ -41,7 +41,7 @@ COMMANDS = {
     "merge": ("models", "Merge saved models of one object."),
     "stop": ("attach", "Stop a running pipeline as if its source had ended."),
     "fleet": ("fleet_commands", "Run many streams on one machine or many."),
-    "keys": ("configure", "Manage the keys of a pipeline and its clients."),
+    "keys": ("keys", "Manage the keys of a pipeline and its clients."),
     "settings": ("configure", "List all settings with their defaults and descriptions."),
 }
 

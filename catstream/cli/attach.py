@@ -37,13 +37,12 @@ from catstream.cli.options import (
 from catstream.client.address import Address
 from catstream.client.attach import control, subscribe, wait_until_running
 from catstream.client.control import Control
-from catstream.client.subscription import REMOVED, Subscription
+from catstream.client.subscription import Subscription
 from catstream.errors import ServiceError, SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
 from catstream.messages.kinds import Health, run_state
-from catstream.wire.channels import CHANNELS, HEALTH, PUBLIC
-from catstream.wire.monitor import silence
+from catstream.wire.channels import CHANNELS, PUBLIC
 
 _SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
 _OLD_SECONDS = 5.0  # age of what is read, from which they say that the reader is slow
@@ -247,8 +246,7 @@ def status(address: Address, as_json: bool, wait: float) -> None:
                 objects.add_row(name or "-", *("-" if cell is None else str(cell) for cell in cells.values()))
             screen().print("", objects, sep="\n")
     if silent := [name for name in _PROCESSES if name not in reports]:
-        at = address.resolve()
-        problem = "" if reports else f": {REMOVED if at.lacks_sockets() else silence(at.address(HEALTH))}"
+        problem = "" if reports else f": {address.resolve().hint()}"
         complain(f"no health report at {address} within {wait:g} s from: {', '.join(silent)}{problem}")
         sys.exit(1)
 

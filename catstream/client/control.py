@@ -28,7 +28,6 @@ from catstream.wire.channels import CONTROL, SAVED_MODELS
 from catstream.wire.commands import Requester
 from catstream.wire.discovery import source_at
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.monitor import silence
 from catstream.wire.newest import Subscriber
 
 ANSWER_SECONDS = 5.0  #: limit for the answer to a command, by default
@@ -167,7 +166,7 @@ class Control(AbstractContextManager["Control"]):
         if (answer := self._commands.ask(command, self.timeout)) is None:
             raise SilenceError(
                 f"no answer to {verb} from {self.endpoint} within {self.timeout:g} s: "
-                f"{silence(self.endpoint.address(CONTROL))} Check it with catstream status"
+                f"{self.endpoint.hint()} Check it with catstream status"
             )
         if not answer.done:
             raise CommandRejectedError(f"{verb}: {answer.reason}")

@@ -47,8 +47,8 @@ class Registry(AbstractContextManager["Registry"]):
         answer = self._requester.ask(Question(uuid4().hex, only), self.timeout)
         if answer is None:
             raise SilenceError(
-                f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: is its "
-                "controller running there?"
+                f"no answer from the fleet {self._name} at {self._endpoint} within {self.timeout:g} s: "
+                f"{self._endpoint.hint('its controller')}"
             )
         return _status(answer)
 
@@ -77,7 +77,7 @@ class Registry(AbstractContextManager["Registry"]):
                 f"the stream {status.name} requires authentication: pass a folder of keys that its fleet allows "
                 "(--keys DIR, see catstream keys)"
             )
-        of_stream = keys.for_server(status.server) if status.server and keys is not None else ""
+        of_stream = replace(keys, server=status.server.encode()) if status.server and keys is not None else ""
         return replace(Endpoint.parse(status.endpoint, of_stream), source=status.source)
 
     def request(self, stream: str) -> None:

@@ -23,14 +23,11 @@ from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import End, Features, Health, Track, run_state
 from catstream.wire.channels import HEALTH, PUBLIC, TRACKS, Channel
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.monitor import silence
 from catstream.wire.newest import GapCounter, Subscriber
 
 CHECK_SECONDS = 0.2  #: between two checks whether the pipeline has rejected the keys or removed its sockets, or moved
 REASON_SECONDS = 2.0  #: before the end of a timeout, in which a health report says why nothing arrives
 DRAIN_SECONDS = 0.5  #: for messages after the end, which arrives on a connection of its own and may overtake them
-#: Why nothing arrives from a folder without sockets.
-REMOVED = "is a pipeline running there? It has no sockets: if it runs, they were removed; end it and start it again"
 
 Message = TypeVar("Message")
 
@@ -272,10 +269,7 @@ class Subscription(Generic[Message]):
         """The reason why no message arrives, as far as it is known."""
         if self._connection is not None and self._connection.state:
             return f"the state of the pipeline is: {self._connection.state}"
-        if self.endpoint is not None and self.endpoint.lacks_sockets():
-            return REMOVED
-        address = "" if self.endpoint is None else self.endpoint.address(self._channel)
-        return silence(address) if (self.timeout or 0.0) >= REASON_SECONDS else "is a pipeline running there?"
+        return self.endpoint.hint() if self.endpoint is not None else "is a pipeline running there?"
 
     def _pipeline_ended(self, end: End, seconds: float) -> None:
         """End after so many seconds."""

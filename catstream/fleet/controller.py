@@ -27,7 +27,7 @@ from catstream.fleet.registry import RegistryServer
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json, to_json
 from catstream.fleet.store import Store
 from catstream.messages.kinds import FleetStatus, NodeState, NodeStatus, StreamStatus
-from catstream.wire.keys import Client, allowed, ensure
+from catstream.wire.keys import Client, clients, ensure
 
 #: Namespace of the named actors of all fleets.
 NAMESPACE = "catstream"
@@ -203,7 +203,7 @@ class Controller:
             self._nodes = cluster
             if self._keys is not None and time.monotonic() >= self._clients_due:
                 self._clients_due = time.monotonic() + _CLIENTS_SECONDS
-                self._clients = allowed(self._keys)  # the next reports tell the streams
+                self._clients = clients(self._keys)  # the next reports tell the streams
             for name in sorted(existing.keys() | self._spec.streams.keys()):
                 self._actors.setdefault(name, Actor())
             for name, actor in self._actors.items():

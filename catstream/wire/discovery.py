@@ -22,6 +22,7 @@ from catstream.base.forks import forked, generation
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint, is_too_long, socket_files
+from catstream.wire.keys import clients
 
 #: Ports that streams listen on, below those that the kernel gives to connections: each has a block of them.
 PORTS = range(21000, 32000, 1 + max(channel.port + len(channel.senders) for channel in CHANNELS.values()))
@@ -67,9 +68,9 @@ def reserve_endpoint(text: str, default: Path, keys: str = "", source: str = "",
     by a note in it, with the source of the frames, without a password, or the name of the fleet.
     """
     endpoint = Endpoint.parse(text or str(default), keys)
-    if endpoint.keys is not None:  # else its own processes would wait until the file of a client is mended
+    if endpoint.keys is not None:  # otherwise its own processes would wait until the file is correct
         endpoint.keys.listening()
-        endpoint.keys.client(endpoint.keys.public.decode())
+        clients(endpoint.keys.folder)
     with contextlib.ExitStack() as stack:
         if text and endpoint.folder is not None:  # of tcp, the kernel gives a port to one process only
             folder = stack.enter_context(_locked(endpoint.folder.absolute(), text))

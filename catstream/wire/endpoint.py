@@ -128,6 +128,12 @@ class Endpoint:
         """Return True if it is a folder without any socket: a pipeline removes all of its own at its end."""
         return self.folder is not None and not any(file.exists() for file in socket_files(self.folder))
 
+    def hint(self, what: str = "a pipeline") -> str:
+        """What to check if nothing arrives from this endpoint."""
+        if self.lacks_sockets():
+            return f"is {what} running there? It has no sockets: if it runs, they were removed; start it again"
+        return f"is {what} running there{f', with the keys in {self.keys.folder}' if self.keys is not None else ''}?"
+
     def check_access(self) -> None:
         """Raise ServiceError if it is a folder that this user may not enter."""
         try:

@@ -1,15 +1,15 @@
-"""CURVE keys of a pipeline, and the list of clients that may connect, with their roles.
+"""CURVE keys of a pipeline, and the clients that may connect, with their roles.
 
-A pipeline that can be reached from other machines has a folder of keys, made by `catstream keys new`:
+A pipeline that other machines can reach has a folder of keys, made by `catstream keys new`:
 
-    server.key       key pair of the sockets that listen
+    server.key       key pair of the listening sockets
     server.pub       its public key, by which clients recognise the pipeline
-    client.key       key pair of the pipeline's own processes, for the sockets that connect
+    client.key       key pair of the pipeline's own processes
     clients/NAME     a client that may connect: its role and its public key
 
-A client has a folder with `server.pub` and its own `client.key`. Every file is TOML, and only its owner can read it,
-from its first byte on. The files in `clients` are read at each handshake, so a client can be added or removed without
-a restart. What is wrong with a folder of keys is a ServiceError.
+A client has a folder with `server.pub` and its own `client.key`. Every file is TOML, and private from its first byte.
+The files in `clients` are read at each handshake: a new one allows a client, and a removed one revokes it, without a
+restart. All errors are ServiceErrors.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
@@ -36,7 +36,7 @@ _OWN = "pipeline"  # the name of the pipeline's own processes among the clients
 _FLEET = "fleet.pipeline"  # the name of the fleet's own processes among the clients of its streams
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _KEY = re.compile(r"[0-9a-zA-Z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")  # Z85, as ZeroMQ writes a key
-_LONGEST = 4096  # bytes of a file
+_MAX_BYTES = 4096  # of a file
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Client:
 class Keys:
     """The keys with which a process connects, and the folder of the clients that may connect to it.
 
-    server          public key of the sockets that listen
+    server          public key of the listening sockets
     public, secret  key pair of the sockets that connect
     """
 
@@ -68,133 +68,66 @@ class Keys:
         return cls(folder, public_key(folder).encode(), public, secret)
 
     def listening(self) -> bytes:
-        """The secret key of the sockets that listen."""
-        if not (self.folder / _SERVER).exists():
-            raise ServiceError(
-                f"{self.folder} holds the keys of a client, a pipeline needs those that `catstream keys new` made: "
-                "pass that folder"
-            )
+        """The secret key of the listening sockets."""
         return _key(self.folder / _SERVER, "secret").encode()
-
-    def for_server(self, public: str) -> Keys:
-        """The same key pair, to connect to sockets with another public key."""
-        return replace(self, server=_checked(public).encode())
-
-    def client(self, public: str) -> tuple[str, Role] | None:
-        """Current name and role of the client with this public key; None if it is not allowed to connect."""
-        allowed = clients(self.folder)
-        return next(((name, client.role) for name, client in allowed.items() if client.public == public), None)
 
 
 def create(folder: Path) -> None:
-    """Make the keys of a pipeline: a pair for its sockets that listen, and one for its processes that connect."""
+    """Make the keys of a pipeline: a pair for its listening sockets, and one for its own processes."""
     if any((folder / name).exists() for name in (_SERVER, _SERVER_PUBLIC, _CLIENT, _CLIENTS)):
-        raise ServiceError(
-            f"{folder} holds keys already, and clients that have them would be locked out: use another folder"
-        )
+        raise ServiceError(f"{folder} contains keys already: use another folder, or its clients would be locked out")
     _write(folder / _SERVER_PUBLIC, public=_pair(folder / _SERVER))
     _write(folder / _CLIENTS / _OWN, role="pipeline", public=_pair(folder / _CLIENT))
 
 
 def ensure(folder: Path) -> None:
-    """Make the keys of a pipeline as `create`, unless the folder holds them already."""
-    if not (folder / _CLIENTS / _OWN).exists():  # which is made last
+    """Make the keys of a pipeline, unless the folder contains them already."""
+    if not (folder / _CLIENTS / _OWN).exists():  # the file that is made last
         create(folder)
 
 
-def allow(folder: Path, name: str, role: Role, output: Path | None = None, public: str | None = None) -> None:
-    """Add a client, which may connect from now on: with keys in the new folder `output`, or with its own public key."""
-    others, server = clients(folder), public_key(folder)
-    if _named(name) in others:
-        raise ServiceError(f"there is a client {name} already: take another name, or `catstream keys revoke` it first")
-    for other, client in others.items():
-        if client.public == public:
-            raise ServiceError(f"this key is that of {other}, a {client.role} client: `catstream keys revoke` it first")
-    if public is not None:
-        _checked(public)
-    elif output is not None:
-        _write(output / _SERVER_PUBLIC, public=server)
-        public = _pair(output / _CLIENT)
-    else:
-        raise ServiceError("a new client needs a folder for its keys, or its public key")
-    _write(folder / _CLIENTS / name, role=role, public=public)
-
-
-def revoke(folder: Path, name: str) -> None:
-    """Remove a client, also one whose file is damaged: it cannot connect any more."""
-    names = [path.name for path in _listed(folder)]
-    if name not in names:
-        raise ServiceError(f"no client named {name!r} (clients: {', '.join(names)})")
-    if name == _OWN:
-        raise ServiceError(f"{name!r} is the key of the pipeline itself: to replace it, make keys in another folder")
-    with writing(folder / _CLIENTS):
-        (folder / _CLIENTS / name).unlink(missing_ok=True)
-
-
-def allowed(folder: Path) -> dict[str, Client]:
-    """The clients that a fleet with these keys allows at its streams, by name: its own processes are one of them."""
-    return {_FLEET if name == _OWN else name: client for name, client in clients(folder).items()}
-
-
-def synchronise(folder: Path, desired: Mapping[str, Client]) -> None:
-    """Allow these clients and no others, besides the pipeline's own processes; all others are revoked.
-
-    A client that stays is allowed at any time. A connection that is open stays open.
-    """
-    texts = {
-        _named(name): _text(role=client.role, public=_checked(client.public))
-        for name, client in desired.items()
-        if name != _OWN
-    }
-    present = {path.name for path in _listed(folder)} - {_OWN}
-    with writing(folder / _CLIENTS):
-        for name in present - texts.keys():
-            (folder / _CLIENTS / name).unlink(missing_ok=True)
-        for name, text in texts.items():
-            path = folder / _CLIENTS / name
-            if name not in present or path.read_bytes() != text:
-                write_atomically(path, text, mode=0o600)
+def allow(folder: Path, name: str, role: Role, output: Path) -> None:
+    """Make keys for a client in the new folder `output`, and allow it to connect from now on."""
+    if not _NAME.fullmatch(name):
+        raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
+    if name in clients(folder):
+        raise ServiceError(f"there is a client {name} already: use another name, or remove {folder / _CLIENTS / name}")
+    _write(output / _SERVER_PUBLIC, public=public_key(folder))
+    _write(folder / _CLIENTS / name, role=role, public=_pair(output / _CLIENT))
 
 
 def clients(folder: Path) -> dict[str, Client]:
     """The clients that may connect, by name."""
     by_name = {}
-    for path in _listed(folder):
+    try:
+        paths = sorted(path for path in (folder / _CLIENTS).iterdir() if _NAME.fullmatch(path.name))
+    except OSError as error:
+        raise ServiceError(f"no keys in {folder} ({error.strerror}): make them with `catstream keys new`") from None
+    for path in paths:
         try:
             if (role := _read(path).get("role")) not in ROLES:
-                raise ServiceError(
-                    f"{path} gives the role {role!r}, there are {', '.join(ROLES)}: revoke it, and allow it again"
-                )
+                raise ServiceError(f"{path} gives the role {role!r}, expected {', '.join(ROLES)}: correct or remove it")
             by_name[path.name] = Client(role, _key(path, "public"))
         except ServiceError:
-            if path.exists():  # otherwise it was revoked meanwhile
+            if path.exists():  # otherwise it was removed meanwhile
                 raise
     return by_name
 
 
+def synchronise(folder: Path, desired: Mapping[str, Client]) -> None:
+    """Allow the clients of a fleet at one of its streams, and no others beside the stream's own processes."""
+    texts = {_FLEET if name == _OWN else name: _text(**asdict(client)) for name, client in desired.items()}
+    with writing(folder / _CLIENTS):
+        for path in (folder / _CLIENTS).iterdir():
+            if path.name not in (_OWN, *texts):
+                path.unlink(missing_ok=True)
+        for name, text in texts.items():
+            write_atomically(folder / _CLIENTS / name, text, mode=0o600)
+
+
 def public_key(folder: Path) -> str:
-    """The public key of the sockets that listen."""
+    """The public key of the listening sockets."""
     return _key(folder / _SERVER_PUBLIC, "public")
-
-
-def _listed(folder: Path) -> list[Path]:
-    """The files of the clients."""
-    try:
-        return sorted(path for path in (folder / _CLIENTS).iterdir() if _NAME.fullmatch(path.name))
-    except OSError as error:
-        raise ServiceError(f"no keys in {folder} ({error.strerror}): make them with `catstream keys new`") from None
-
-
-def _named(name: str) -> str:
-    if not _NAME.fullmatch(name):
-        raise ServiceError(f"a client's name is of letters, digits, dots and dashes, at most 64, got {name!r}")
-    return name
-
-
-def _checked(public: str) -> str:
-    if not _KEY.fullmatch(public):
-        raise ServiceError(f"a public key is 40 characters of Z85, got {public!r}")
-    return public
 
 
 def _pair(path: Path) -> str:
@@ -209,7 +142,7 @@ def _write(path: Path, **facts: str) -> None:
     with writing(path):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         try:
-            create_atomically(path, _text(**facts))  # beside a file whose name begins with a dot, as no client's does
+            create_atomically(path, _text(**facts))
         except FileExistsError:
             raise ServiceError(f"{path} exists already and is not overwritten: use another folder") from None
 
@@ -223,7 +156,7 @@ def _key(path: Path, name: str) -> str:
     """The key of this name in a file."""
     key = _read(path).get(name)
     if not isinstance(key, str) or not _KEY.fullmatch(key):
-        raise ServiceError(f"{path} holds no {name} key as ZeroMQ writes it, 40 characters: make new keys")
+        raise ServiceError(f"{path} contains no valid {name} key (40 characters of Z85): make new keys")
     return key
 
 
@@ -236,11 +169,11 @@ def _read(path: Path) -> dict[str, Any]:
                 raise ServiceError(
                     f"other users can access {path}: chmod 600, and make new keys if somebody may have read it"
                 )
-            return tomllib.loads(file.read(_LONGEST).decode())
+            return tomllib.loads(file.read(_MAX_BYTES).decode())
     except OSError as error:
         raise ServiceError(
-            f"cannot read {path} ({error.strerror}): a folder of keys is made with `catstream keys new` for a "
-            "pipeline, with `catstream keys allow` for a client"
+            f"cannot read {path} ({error.strerror}): a pipeline needs the folder that `catstream keys new` made, and a "
+            "client one that `catstream keys allow` made"
         ) from None
     except (ValueError, RecursionError) as error:
         raise ServiceError(f"{path} is damaged ({error}): make new keys") from None

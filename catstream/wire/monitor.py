@@ -1,23 +1,15 @@
-"""Events of the connections of a socket, as ZeroMQ reports them, and a probe of a listener."""
+"""Events of the connections of a socket, as ZeroMQ reports them."""
 
 from __future__ import annotations
 
 import itertools
-import socket as sockets
 import struct
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
 from enum import Enum
-from typing import TypeGuard
-from urllib.parse import urlsplit
 
 import zmq
 
 _POLLIN = int(zmq.POLLIN)  # an operation with a member of an enumeration would take half as long as to look
-_PROBE_SECONDS = 0.5  # limit for a listener to answer a greeting
-_SHOWN = 40  # characters of what another program answers
-#: What a client of ZMTP 3.0 with keys sends first: signature, version, mechanism and padding. It receives the same.
-_GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(52, b"\0")
 
 
 class Event(Enum):
@@ -79,57 +71,3 @@ def arrives(socket: zmq.Socket[bytes], seconds: float) -> bool:
     # To look costs half as much as `poll`, and most sockets that are looked at have no message.
     has_message = int(socket.get(zmq.EVENTS)) & _POLLIN != 0
     return has_message or (seconds > 0 and bool(socket.poll(round(seconds * 1000))))
-
-
-def greeting(address: str) -> bytes | None:
-    """The first bytes of a listener to a client of ZeroMQ with keys, 64 at most; None if it closes the connection.
-
-    It is None, too, if nobody listens. A socket of ZeroMQ sends a greeting of its own, another program something else
-    or nothing. libzmq reports a listener with other keys as it does one that closes each connection, such as a tunnel
-    whose pipeline has not started.
-    """
-    parts = urlsplit(address)
-    answer = b""
-    with ExitStack() as stack:
-        try:
-            if parts.scheme == "ipc":
-                probe = stack.enter_context(sockets.socket(sockets.AF_UNIX))
-                probe.connect(address.removeprefix("ipc://"))
-            else:
-                host = (parts.hostname or "", parts.port or 0)
-                probe = stack.enter_context(sockets.create_connection(host, _PROBE_SECONDS))
-            probe.settimeout(_PROBE_SECONDS)
-            for question in (_GREETING, b"\r\n\r\n"):  # a web server waits for the end of a line
-                probe.sendall(question)
-                with suppress(TimeoutError):
-                    while len(answer) < len(_GREETING) and (part := probe.recv(len(_GREETING) - len(answer))):
-                        answer += part
-                    return answer or None
-                if answer:
-                    break
-        except OSError:
-            return None
-    return answer
-
-
-def has_keys(answer: bytes | None) -> bool:
-    """Return True if a greeting is that of a socket of ZeroMQ with keys."""
-    return _is_zeromq(answer) and answer[12:32] == _GREETING[12:32]
-
-
-def other_program(answer: bytes | None) -> str:
-    """A description of what listens, by its greeting, if that is no socket of ZeroMQ; empty if it may be one."""
-    if answer is None or _is_zeromq(answer):
-        return ""
-    said = f"sends {answer.decode(errors='replace').splitlines()[0][:_SHOWN]!r}" if answer else "does not answer"
-    return f"what listens there {said}"
-
-
-def silence(address: str) -> str:
-    """The reason why a pipeline at an address is silent, as a question."""
-    said = other_program(greeting(address))
-    return f"{said}: is it a pipeline?" if said else "is a pipeline running there?"
-
-
-def _is_zeromq(answer: bytes | None) -> TypeGuard[bytes]:
-    return answer is not None and answer[:1] == b"\xff" and answer[9:10] == b"\x7f"

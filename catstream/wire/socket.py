@@ -12,7 +12,6 @@ import errno
 import warnings
 from collections.abc import Callable
 from functools import cache
-from time import monotonic
 from typing import Any, Generic, Self, TypeVar
 from weakref import WeakSet
 
@@ -24,8 +23,7 @@ from catstream.errors import ProtocolError, ServiceError
 from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import public_key
-from catstream.wire.monitor import Event, Monitor, arrives, greeting, has_keys, other_program
+from catstream.wire.monitor import Event, Monitor, arrives
 from catstream.wire.rejects import disconnected, reject
 from catstream.wire.zap import ZapHandler
 
@@ -48,10 +46,6 @@ _OPTIONS = {
     zmq.RECONNECT_IVL: 20,  # before the first attempt to connect again; doubled each time
     zmq.RECONNECT_IVL_MAX: round(RECONNECT_MOST_SECONDS * 1000),
 }
-
-_FAILURES = 3  # failed handshakes in a row with a listener that has keys: they are those of another pipeline
-_PROBE_SECONDS = 0.4  # from one check of the listener to the next
-_PAUSE = 10  # or so many times as long as a check took, in which the program waits
 
 Message = TypeVar("Message")
 Kind = TypeVar("Kind")
@@ -122,7 +116,6 @@ class ChannelSocket(Generic[Message]):
         self._domain = b""  # name of this socket for ZAP, if it listens and there are keys
         self._monitor: Monitor | None = None
         self._generation = generation()
-        self._failures, self._probe_at = 0, 0.0  # see `_FAILURES`
         try:
             self._socket: zmq.Socket[bytes] = context().socket(kind)
         except zmq.ZMQError as error:
@@ -263,12 +256,9 @@ class ChannelSocket(Generic[Message]):
         check_not_forked(self._generation)
         for event in self._monitor.events(seconds) if self._monitor is not None else ():
             if event is Event.CONNECTED:
-                self._failures = 0
                 self._connected()
             elif event is Event.DISCONNECTED:
                 self._disconnected()
-                if not self._listens:  # libzmq reports no other failure of a handshake with keys, if what listens
-                    self._handshake_failed(event)  # answers like an old version, and does not connect again
             elif event is not Event.STOPPED:
                 self._handshake_failed(event)
             if event is until:
@@ -283,44 +273,20 @@ class ChannelSocket(Generic[Message]):
             disconnected()
 
     def _handshake_failed(self, event: Event) -> None:
-        """Count a peer that failed; a key that was denied is counted by the ZAP handler already. Or raise the cause."""
-        if not self._listens:
-            if (problem := self._denial(event)) is not None:
-                raise ServiceError(problem)
-        elif event is not Event.DENIED:
-            other = "does not speak ZeroMQ" if self._endpoint.keys is None else "lacks the pipeline's keys"
-            reject(self.channel.name, "handshake", f"a peer has failed the handshake: it has ended, or it {other}")
-
-    def _denial(self, event: Event) -> str | None:
-        """Why this client cannot connect, whenever it tries again; None if it may be able to later."""
+        """Count a peer that failed, unless the ZAP handler has counted it; as a client, raise an error if denied."""
         endpoint, keys = self._endpoint, self._endpoint.keys
-        if event is Event.DENIED:
-            return (
-                f"{endpoint} rejects this key: it was revoked, was never allowed, or lacks the role "
-                f"{self.channel.role}, which {self.channel.name} requires; the pipeline's log says which: "
-                "ask its administrator (catstream keys allow)"
+        if self._listens:
+            if event is not Event.DENIED:
+                other = "does not speak ZeroMQ" if keys is None else "lacks the pipeline's keys"
+                reject(self.channel.name, "handshake", f"a peer has failed the handshake: it has ended, or it {other}")
+        elif event is Event.DENIED:
+            raise ServiceError(
+                f"{endpoint} rejects the key in {keys and keys.folder}: it is not allowed, or lacks the role "
+                f"{self.channel.role}, which {self.channel.name} requires; ask its administrator (catstream keys allow)"
             )
-        if event is Event.OTHER_MECHANISM and keys is None:
-            return (
-                f"the pipeline at {endpoint} requires authentication: pass a folder of keys that it allows "
-                "(--keys DIR, see catstream keys)"
+        elif event is Event.OTHER_MECHANISM:
+            raise ServiceError(
+                f"the pipeline at {endpoint} requires authentication: pass a folder of keys that it allows (--keys DIR)"
+                if keys is None
+                else f"the pipeline at {endpoint} has no keys: connect without keys (omit --keys)"
             )
-        if event is Event.OTHER_MECHANISM:
-            return f"the pipeline at {endpoint} has no keys: connect without keys (omit --keys)"
-        now = monotonic()
-        if now < self._probe_at:
-            return None
-        answers = [greeting(endpoint.address(self.channel, sender)) for sender in self.channel.senders]
-        self._probe_at = monotonic() + max(_PROBE_SECONDS, _PAUSE * (monotonic() - now))
-        if said := next(filter(None, (other_program(answer) for answer in answers if answer)), ""):
-            return f"{endpoint} is not a pipeline, {said}: pass the endpoint of a running pipeline"
-        if keys is None or keys.server != public_key(keys.folder).encode():
-            return None  # a stream of a fleet has another key wherever it runs next
-        if event is Event.FAILED:
-            self._failures = self._failures + 1 if any(map(has_keys, answers)) else 0
-        if self._failures < _FAILURES:  # fewer may be from before the listener was there
-            return None
-        return (
-            f"the keys in {keys.folder} belong to another pipeline or fleet (the one at {endpoint} does not have the "
-            "key in server.pub): ask its administrator for current keys (catstream keys allow)"
-        )

@@ -10,19 +10,16 @@ from zmq.utils import z85
 
 from catstream.errors import ServiceError
 from catstream.wire.channels import Channel
-from catstream.wire.keys import ROLES, Keys
+from catstream.wire.keys import ROLES, Keys, clients
 from catstream.wire.rejects import reject
 
 
 class ZapHandler:
-    """Decides which peers may connect to the sockets of this process that listen, if the pipeline has keys.
+    """Decides which peers may connect to the listening sockets of this process, if the pipeline has keys.
 
     libzmq asks once for each connection, before it reads a message of it, by its protocol ZAP (RFC 27). A question
-    names the socket, as a "domain", and the peer's public key; the peer has proved by then that it holds the secret
-    one. The list of clients is read for each question, so no process has to be restarted if a client is allowed or
-    revoked. A connection that is open stays open. A thread answers while a socket is registered.
-
-    pyzmq's own handler, `zmq.auth`, is not used: see decision 23 in docs/decisions.md.
+    names the socket, as a "domain", and the peer's public key; the peer has already proved that it has the secret one.
+    A thread answers while a socket is registered. See decision 23 in docs/decisions.md.
     """
 
     _address = "inproc://zeromq.zap.01"
@@ -34,7 +31,7 @@ class ZapHandler:
         self._thread: threading.Thread | None = None
 
     def register(self, context: zmq.Context[zmq.Socket[bytes]], channel: Channel[object], keys: Keys) -> bytes:
-        """Register a socket that listens; returns its domain."""
+        """Register a listening socket; returns its domain."""
         with self._lock:
             domain = f"{channel.name} {next(self._numbers)}".encode()
             self._sockets[domain] = channel, keys
@@ -71,16 +68,14 @@ class ZapHandler:
         channel, keys = self._sockets[domain]
         public = z85.encode(credentials[0]).decode()
         try:
-            client = keys.client(public)
+            allowed = [(name, client.role) for name, client in clients(keys.folder).items() if client.public == public]
         except ServiceError as error:
-            reject(channel.name, str(error), f"nobody can connect: {error}")
+            reject(channel.name, str(error), f"no client can connect: {error}")
             return b"300"
-        if client is None:
-            reject(channel.name, public, f"{address} was rejected, its key {public} is not allowed")
-            return b"400"
-        name, role = client
-        if ROLES.index(role) < ROLES.index(channel.role):
-            text = f"{name} at {address} was rejected, its role is {role} and not {channel.role}"
-            reject(channel.name, public, text)
-            return b"400"
-        return b"200"
+        reason = f"its key {public} is not allowed"
+        for name, role in allowed:
+            if ROLES.index(role) >= ROLES.index(channel.role):
+                return b"200"
+            reason = f"the role of {name} is {role} and not {channel.role}"
+        reject(channel.name, public, f"{address} was rejected: {reason}")
+        return b"400"

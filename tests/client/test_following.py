@@ -19,7 +19,7 @@ from catstream.wire.channels import CONTROL, HEALTH, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import allow, allowed, create, public_key, revoke, synchronise
+from catstream.wire.keys import allow, clients, create, public_key, synchronise
 from catstream.wire.newest import Publisher
 from tests.wire.examples import present as track
 
@@ -180,7 +180,7 @@ def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
 
 def test_a_client_of_the_fleet_has_its_role_at_each_stream_until_it_is_revoked(stream, managing, keys, folder, tcp):
     create(folder / "stream")
-    synchronise(folder / "stream", allowed(keys))
+    synchronise(folder / "stream", clients(keys))
     allow(keys, "carl", "watch", output=folder / "carl")  # the stream does not know him yet
     anna, carl, server = str(folder / "anna"), str(folder / "carl"), public_key(folder / "stream")
     with managing(stream.status, "", str(keys)):
@@ -191,18 +191,18 @@ def test_a_client_of_the_fleet_has_its_role_at_each_stream_until_it_is_revoked(s
             with Responder[Command, Answer](CONTROL, pipeline._endpoint):
                 with (
                     catstream.control("fleet://cam-7", timeout=150, keys=anna) as control,
-                    pytest.raises(ServiceError, match=r"rejects this key: .* which control requires"),
+                    pytest.raises(ServiceError, match=r"rejects the key .* which control requires"),
                 ):
                     control.stop()
                 with (
                     catstream.subscribe("fleet://cam-7", "tracks", timeout=150, keys=carl) as rejected,
-                    pytest.raises(ServiceError, match=r"rejects this key: .* which tracks requires"),
+                    pytest.raises(ServiceError, match=r"rejects the key .* which tracks requires"),
                 ):
                     next(rejected)
-            revoke(keys, "anna")
-            synchronise(folder / "stream", allowed(keys))
+            (keys / "clients" / "anna").unlink()
+            synchronise(folder / "stream", clients(keys))
             stream.update(token=7)  # the pipeline was started again: she connects again
-            with pytest.raises(ServiceError, match="rejects this key"):
+            with pytest.raises(ServiceError, match="rejects the key"):
                 watched.result(60)
 
 

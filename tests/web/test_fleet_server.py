@@ -13,7 +13,7 @@ from catstream.client.address import Address
 from catstream.web import feed
 from catstream.web.feed import FleetFeed
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import allowed, create, public_key, synchronise
+from catstream.wire.keys import clients, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
 PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
@@ -47,7 +47,7 @@ def keyed(fleet, keys, folder, tcp):
     """Gives the fleet keys and a port, a client, and a stream with keys of its own, of which this is the folder."""
     stream = folder / "stream"
     create(stream)
-    synchronise(stream, allowed(keys))
+    synchronise(stream, clients(keys))
     fleet.listen, fleet.address = tcp, tcp.removeprefix("tcp://")
     fleet.keys, fleet.keys_of_client = str(keys), str(folder / "anna")
     return stream

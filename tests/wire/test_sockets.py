@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from catstream.messages.kinds import End, Position, Sample, Summary, Tracks
 from catstream.wire.acknowledged import Receiver, Sender
 from catstream.wire.channels import ALL_FEATURES, MODELS, RESULTS, SAMPLES, TRACKS
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.monitor import Event, Monitor, silence
+from catstream.wire.monitor import Event, Monitor
 from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.socket import context
 from tests.wire.examples import model, track
@@ -207,64 +207,3 @@ def test_a_process_that_ends_with_queued_messages_ends_normally(folder):
                 if receiver.poll(0):
                     receiver.recv_multipart()
             assert sender.returncode == 0, sender.stderr.read().decode()
-
-
-@pytest.mark.parametrize(
-    ("banner", "answer", "words"),
-    [
-        (b"SSH-2.0-OpenSSH_9.2p1\r\n", b"", "sends 'SSH-2.0-OpenSSH_9.2p1'"),
-        (b"", b"HTTP/1.0 400 Bad request\r\n\r\n", "sends 'HTTP/1.0 400 Bad request'"),
-        (b"\xff\xfd\x18\xff\xfd\x20", b"", "sends "),
-        (b"", b"", "does not answer"),
-    ],
-)
-def test_another_program_at_the_port_is_named_in_the_error(banner, answer, words):
-    with (
-        socket.create_server(("127.0.0.1", 0)) as server,
-        ThreadPoolExecutor() as pool,
-        ExitStack() as open_peers,
-        ExitStack() as stack,
-    ):
-        stack.callback(server.shutdown, socket.SHUT_RDWR)
-
-        def serve():
-            with suppress(OSError):  # it is closed
-                while True:
-                    peer = open_peers.enter_context(server.accept()[0])
-                    peer.sendall(banner)
-                    line = b""
-                    while answer and not line.endswith(b"\r\n\r\n"):
-                        line += peer.recv(100)
-                    peer.sendall(answer)
-
-        pool.submit(serve)
-        assert words in silence(f"tcp://127.0.0.1:{server.getsockname()[1]}")
-
-
-def test_a_pipeline_and_a_port_without_a_program_are_not_another_program(endpoint, tcp):
-    with Publisher(TRACKS, endpoint):
-        assert silence(endpoint.address(TRACKS)) == "is a pipeline running there?"
-    assert silence(tcp) == "is a pipeline running there?"
-
-
-@pytest.mark.parametrize("with_keys", [False, True])
-def test_a_client_at_the_port_of_a_program_that_answers_gets_an_error_at_once(keys, tcp, with_keys, until):
-    endpoint = Endpoint.parse(tcp, str(keys) if with_keys else "")
-    with (
-        closing(socket.create_server(("127.0.0.1", endpoint.port + TRACKS.port))) as server,
-        ThreadPoolExecutor() as pool,
-        ExitStack() as stack,
-        Subscriber(TRACKS, endpoint) as tracks,
-    ):
-        stack.callback(server.shutdown, socket.SHUT_RDWR)
-
-        def serve():
-            with suppress(OSError):  # it is shut down
-                while True:
-                    with server.accept()[0] as peer:
-                        peer.recv(100)
-                        peer.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-
-        pool.submit(serve)
-        with pytest.raises(ServiceError, match=r"is not a pipeline, what listens there sends 'HTTP/1\.1 400"):
-            until(lambda: False, lambda: tracks.receive(0.02))
