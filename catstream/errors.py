@@ -80,7 +80,6 @@ class StoreError(FleetError):
 
 #: Extra -> the feature that needs it, and the modules that the feature imports.
 EXTRAS = {
-    "parquet": ("a Parquet file", ("pyarrow",)),
     "fleet": ("a fleet", ("ray", "obstore")),
 }
 

@@ -61,7 +61,6 @@ IMPORTERS = {
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/store.py"],
     "ray": ["catstream/fleet"],
-    "pyarrow": ["catstream/sinks/exports.py"],
     "av": ["catstream/video", "catstream/loadtest/camera.py", "catstream/loadtest/rtsp.py"],
     "zmq": [
         "catstream/wire",
@@ -94,7 +93,7 @@ IMPORTERS = {
 }
 
 #: Libraries that take long to import: inside the function that needs them.
-SLOW = {"av", "pyarrow", "ray", "obstore"}
+SLOW = {"av", "ray", "obstore"}
 
 #: Modules of I/O, threads, clocks and randomness, which a stage does not import.
 IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "threading", "time", "zmq"}

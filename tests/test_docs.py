@@ -22,7 +22,8 @@ import catstream
 from catstream.base.settings import PRESETS, describe
 from catstream.cli import COMMANDS, load_command
 from catstream.jobs.job import Results
-from catstream.sinks.destinations import EXPORTS, SINKS
+from catstream.sinks.destinations import SINKS
+from catstream.sinks.exports import EXPORTS
 from catstream.sinks.track_log import places_of
 
 ROOT = Path(__file__).parents[1]

@@ -15,8 +15,10 @@ from catstream.base.text import counted
 from catstream.cli.options import PATH, with_overwrite
 from catstream.cli.write import with_table
 from catstream.errors import VideoError
-from catstream.sinks import destinations
-from catstream.sinks.destinations import EXPORTS, About, Head
+from catstream.sinks import exports
+from catstream.sinks.annotations import About, classes_of
+from catstream.sinks.destinations import Head
+from catstream.sinks.exports import EXPORTS
 from catstream.sinks.track_log import Log, logs_of
 from catstream.video.source import VIDEOS, open_source
 from catstream.video.writer import is_annotated
@@ -28,17 +30,12 @@ def _printable(_: click.Context, __: click.Parameter, text: str) -> str:
     return text
 
 
-def _classes(context: click.Context, parameter: click.Parameter, text: str) -> dict[str, int | None]:
-    """The number of each class by name; None if only names are given."""
-    classes: dict[str, int | None] = {}
-    for entry in _printable(context, parameter, text).split(",") if text else ():
-        name, equals, number = (word.strip() for word in entry.partition("="))
-        if not name or name in classes or (equals and not re.fullmatch(r"[0-9]{1,9}", number)):
-            raise click.BadParameter(f"expected a new NAME or NAME=NUMBER, got {entry!r}")
-        classes[name] = int(number) if equals else None
-    if None in classes.values() and set(classes.values()) != {None}:
-        raise click.BadParameter("expected a number for all classes or for none")
-    return classes
+def _classes(context: click.Context, parameter: click.Parameter, text: str) -> list[str]:
+    """The names of the classes."""
+    names = [name.strip() for name in _printable(context, parameter, text).split(",")] if text else []
+    if not all(names) or len({*names}) < len(names):
+        raise click.BadParameter(f"expected different names, NAME,NAME..., got {text!r}")
+    return names
 
 
 @click.command()
@@ -59,12 +56,11 @@ def _classes(context: click.Context, parameter: click.Parameter, text: str) -> d
 @click.option(
     "--classes",
     default="",
-    metavar="NAME,...|NAME=NUMBER,...",
+    metavar="NAME,...",
     callback=_classes,
-    help="Class numbers for coco, cvat and yolo, in this order or as stated; by default in order of appearance.",
+    help="Classes for coco, cvat and yolo in the order of their numbers; by default in order of appearance.",
 )
 @click.option("--images", is_flag=True, help="Also write the images of the tracked frames, for yolo.")
-@click.option("--append", is_flag=True, help="Add to an existing data set; its classes and labels stay unchanged.")
 @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of LOG.")
 @with_overwrite
 @with_table(EXPORTS)
@@ -74,60 +70,55 @@ def export(
     name: str | None,
     size: str | None,
     label: str,
-    classes: dict[str, int | None],
+    classes: list[str],
     images: bool,
-    append: bool,
     skip_damaged: bool,
     overwrite: bool,
 ) -> None:
     """Convert the log of a run to another format.
 
     LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream
-    sink`, or the folder of `catstream batch`, whose logs become one data set:
-    yolo, coco, otb, got10k or vot. The extension of DEST or --format selects the format. A folder gets
-    files for each object, such as NAME-OBJECT.txt; NAME is that of LOG. Frames
-    have their numbers in the source. Only CSV stores processing times; CSV
-    lacks the `doubtful` flag and the frame in which a reused name began.
+    sink`. For yolo, it may be the folder of `catstream batch`, whose logs
+    become one data set. The extension of DEST or --format selects the format.
+    Frames have their numbers in the source. CSV lacks the `doubtful` flag and
+    the frame in which a reused name began.
 
     {table}
 
     \b
     EXAMPLES
       catstream export out/walk.ndjson walk.sqlite
-      catstream export out/walk.csv results --format otb
       catstream export out/walk.ndjson walk.xml --label person
-      catstream export out/walk.ndjson dataset --format yolo --classes dog,cat
-      catstream export out/yard.ndjson dataset --format yolo --append
+      catstream export out/walk.ndjson dataset --format yolo --images --classes dog,cat
     """
-    if append and overwrite:
-        raise click.UsageError("--append and --overwrite are mutually exclusive")
-    row = destinations.export_of(dest, name)
-    if classes and not row.sized:
+    form = exports.export_of(dest, name)
+    if classes and not form.sized:
         raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
-    if images and row is not EXPORTS["yolo"]:
+    if images and form is not EXPORTS["yolo"]:
         raise click.UsageError("--images requires --format yolo")
-    logs = logs_of(log)
-    if log.is_dir() and not row.appends:
-        formats = ", ".join(name for name, other in EXPORTS.items() if other.appends)
-        raise VideoError(f"{log} is a folder, and this format holds one video: pass --format, one of {formats}")
-    if (append or not row.suffix) and dest.absolute().parent.is_dir():  # others that add to a data set wait meanwhile
-        click.get_current_context().with_resource(locked_folder(dest.absolute().parent, VideoError, math.inf))
-    destinations.check_export(dest, row, overwrite=overwrite, append=append, log=log)
-    for path in logs:
-        content = Log(path, skip_damaged=skip_damaged)
+    if log.is_dir() and form.suffix:
+        raise VideoError(f"{log} is a folder, and this format holds one video: pass one of its logs, or --format yolo")
+    logs = [Log(path, skip_damaged=skip_damaged) for path in logs_of(log)]
+    for content in logs:
         if next(content.frames(), None) is None:
-            raise VideoError(f"{path} contains no tracks")
-        about = About(path.stem, label=label, head=content.head() or Head(), classes=classes, append=append)
-        about = _with_source(about, path, size, required=images, useful=row.images)
+            raise VideoError(f"{content.path} contains no tracks")
+    if not form.suffix:
+        classes = classes or [*dict.fromkeys(name for content in logs for name in classes_of(content, label))]
+        if dest.absolute().parent.is_dir():  # another export into this folder waits
+            click.get_current_context().with_resource(locked_folder(dest.absolute().parent, VideoError, math.inf))
+    exports.check_export(dest, form, overwrite=overwrite, log=log)
+    for content in logs:
+        path = content.path
+        about = About(path.stem, content.head() or Head(), label=label, classes=classes, is_first=content is logs[0])
+        about = _with_source(about, path, size, required=images, useful=form.images)
         last = max(frame.tracks[0].source_frame for frame in content)
         if about.frames is not None and last >= about.frames:  # of a long video, the number is an estimate
             has = f"but {size or about.head.source} has {counted(about.frames, 'frame')}"
             click.echo(f"warning: {path} has frame {last}, {has}: pass --size SOURCE if it is another one", err=True)
-        if note := destinations.export(content, dest, row, about):
+        if note := exports.export(content, dest, form, about):
             click.echo(note, err=True)
         if content.damaged:
             click.echo(f"{counted(content.damaged, 'damaged line')} of {path} skipped", err=True)
-        append = True
 
 
 def _with_source(about: About, log: Path, size: str | None, *, required: bool, useful: bool) -> About:

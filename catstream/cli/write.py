@@ -25,14 +25,14 @@ from catstream.errors import SettingsError, SilenceError
 from catstream.jobs.job import SinkOptions
 from catstream.sinks import destinations
 from catstream.sinks import options as sink_options
-from catstream.sinks.destinations import SINKS, Head, Origin, Row, TrackedFrame
+from catstream.sinks.destinations import SINKS, Head, Origin, TrackedFrame
 from catstream.sinks.events import KINDS, check_zones
 from catstream.sinks.options import parse_when
 
 _REPORTS = 12  # of all processes, in which one of the detector says what it tracks: those of four seconds
 
 
-def with_table(rows: Mapping[str, Row]) -> Callable[[Command], Command]:
+def with_table(rows: Mapping[str, Any]) -> Callable[[Command], Command]:
     """Replace {table} in the help of a command by the lines of the destinations, or of the formats."""
 
     def changed(command: Command) -> Command:

@@ -31,7 +31,12 @@ from catstream.errors import CatstreamError, SettingsError, VideoError
 from catstream.evaluation.datasets import Sequence, Start
 from catstream.evaluation.peers import OPENCV
 from catstream.evaluation.scores import Score, score
-from catstream.sinks.exports import LAYOUTS, write_layout
+
+#: Layout -> the files of boxes, scores and times of a run: the toolkits of got10k (for OTB) and VOT read them.
+_LAYOUTS = {
+    "otb": ("{0}.txt", "{0}_confidence.value", "times/{0}_time.txt"),
+    "vot": ("{0}/{0}_001.txt", "{0}/{0}_001_confidence.value", "{0}/{0}_001_time.value"),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +97,23 @@ def prepare_folder(output: Path, settings: Settings) -> None:
 
 def _files(output: Path, tracker: str, name: str) -> list[Path]:
     """Return the paths of boxes, confidence and times of a run in the VOT toolkit's layout."""
-    return [output / tracker / "longterm" / pattern.format(name) for pattern in LAYOUTS["vot"]]
+    return [output / tracker / "longterm" / pattern.format(name) for pattern in _LAYOUTS["vot"]]
+
+
+def _write_layout(
+    layout: str, folder: Path, name: str, boxes: Float64, confidence: Float64 | None, seconds: Float64 | None
+) -> None:
+    """Write the files of one object in one of the `_LAYOUTS`.
+
+    boxes : float64 (frames, 4), x, y, w, h in pixels; NaN if there is none
+    confidence, seconds : score and processing time, float64 (frames,); None to write no such file
+    """
+    values = (boxes, confidence, seconds)
+    for pattern, column, form in zip(_LAYOUTS[layout], values, ("%.4f", "%.6f", "%.8f"), strict=True):
+        if column is not None:
+            file = folder / pattern.format(name)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(file, column, fmt=form, delimiter=",")
 
 
 def save(output: Path, run: EvaluationRun) -> None:
@@ -102,8 +123,8 @@ def save(output: Path, run: EvaluationRun) -> None:
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(folder, ignore_errors=True)
     with writing(home):
-        write_layout("otb", home, run.name, run.boxes, None, run.seconds)
-        write_layout("vot", part, run.name, run.boxes, run.confidence, run.seconds)
+        _write_layout("otb", home, run.name, run.boxes, None, run.seconds)
+        _write_layout("vot", part, run.name, run.boxes, run.confidence, run.seconds)
         folder.parent.mkdir(exist_ok=True)
         (part / run.name).rename(folder)
         part.rmdir()

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +20,9 @@ from catstream.base.box import Box
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import About, TrackedFrame
+from catstream.sinks.destinations import Head, TrackedFrame
 from catstream.video.frames import jpeg
 from catstream.video.source import open_source
-
-Fields = dict[str, Any]
 
 _VIA_COLUMNS = (
     *("filename", "file_size", "file_attributes", "region_count"),
@@ -50,9 +48,31 @@ _CVAT_BOX = (
     'z_order="0"><attribute name="doubtful">{}</attribute>{}</box>\n'
 )
 
-#: The classes in a data.yaml, as a list or by number, in brackets or one on each line.
-_YAML_NAMES = re.compile(r"^names:[ \t]*(?:[\[{]([^\]}]*)[\]}]|((?:\n[ \t]*(?:-|\d+ *:|#)[^\n]*)+))", re.MULTILINE)
-_YAML_NAME = re.compile(r"""\s*(?:(\d+)\s*:|-)?\s*(?:("(?:[^"\\]|\\.)*")|'([^']*)'|([^#"']*?))\s*(?:#.*)?""")
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """The parameters of an export.
+
+    name     name of the log, for the images
+    head     head of the log; an empty one if the log has none
+    size     width and height of a frame in pixels; None if unknown
+    frames   number of frames of the source; None if unknown
+    label    class of all objects; empty if the name of each is its class
+    classes  names of the classes in the order of their numbers; empty for the order of the log
+    images   files of the images of the source; empty if it is a video
+    source   path of the source whose images are written; empty to write none
+    is_first whether this is the first log of a data set: the labels of an earlier one are removed
+    """
+
+    name: str
+    head: Head = field(default_factory=Head)
+    size: tuple[int, int] | None = None
+    frames: int | None = None
+    label: str = ""
+    classes: Sequence[str] = ()
+    images: Sequence[Path] = ()
+    source: str = ""
+    is_first: bool = True
 
 
 class _Place(NamedTuple):
@@ -65,47 +85,29 @@ class _Place(NamedTuple):
 
 
 def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
-    """Write the objects of COCO, with the fields that TAO adds for videos and tracks; ids count from 1.
-
-    If `about.append`, add a video to an existing file. Raises VideoError if it contains one of the images, or if a
-    class has another number there.
-    """
-    try:
-        data: Fields = json.loads(path.read_bytes()) if about.append and path.exists() else {}
-        existing = {category["name"]: category["id"] for category in data.get("categories", [])}
-        names = {image["file_name"] for image in data.get("images", [])}
-        last_video, last_image, last_track, last_box = (
-            max((entry["id"] for entry in data.get(key, [])), default=0)
-            for key in ("videos", "images", "tracks", "annotations")
-        )
-    except (AttributeError, KeyError, TypeError, ValueError):
-        raise VideoError("the existing file is not in COCO format: pass --overwrite, or use another name") from None
-    classes = _numbers(frames, about, existing, first=1)
-    images: list[Fields] = []
-    tracks: dict[int, Fields] = {}
-    boxes: list[Fields] = []
-    size, video = _size(about), last_video + 1
+    """Write the objects of COCO, with the fields that TAO adds for videos and tracks; ids count from 1."""
+    classes = _numbers(frames, about, first=1)
+    images: list[dict[str, Any]] = []
+    tracks: dict[int, dict[str, Any]] = {}
+    boxes: list[dict[str, Any]] = []
+    size = _size(about)
     for frame, places in _places(frames, about):
-        image = {"id": last_image + frame + 1, "file_name": _image(about, frame), **size}
-        images.append(image | {"video_id": video, "frame_index": frame})
+        image = {"id": frame + 1, "file_name": _image(about, frame), **size}
+        images.append(image | {"video_id": 1, "frame_index": frame})
         for number, label, track, box in places:
-            number += last_track
-            of = {"category_id": classes[label], "video_id": video}
+            of = {"category_id": classes[label], "video_id": 1}
             tracks[number] = {"id": number, "name": track.object, **of}
-            ids = {"id": last_box + len(boxes) + 1, "image_id": image["id"], "track_id": number, **of}
+            ids = {"id": len(boxes) + 1, "image_id": image["id"], "track_id": number, **of}
             shape = {"bbox": [round(side, 2) for side in box], "area": round(box.area, 2), "iscrowd": 0}
             boxes.append({**ids, **shape, "score": track.score, "attributes": {"doubtful": track.doubtful}})
-    if common := names & {image["file_name"] for image in images}:
-        raise VideoError(f"the file contains the image {min(common)} already: replace the file with --overwrite")
-    data.setdefault("info", {"description": f"tracks of {about.name}"})
-    for key, entries in {
-        "videos": [{"id": video, "name": about.name, **size}],
+    data = {
+        "info": {"description": f"tracks of {about.name}"},
+        "videos": [{"id": 1, "name": about.name, **size}],
         "images": images,
-        "categories": [{"id": classes[name], "name": name} for name in classes if name not in existing],
+        "categories": [{"id": number, "name": name} for name, number in classes.items()],
         "tracks": [*tracks.values()],
         "annotations": boxes,
-    }.items():
-        data[key] = data.get(key, []) + entries
+    }
     path.write_text(json.dumps(data), encoding="utf-8")
 
 
@@ -146,42 +148,28 @@ def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
     return note
 
 
-def write_yolo(frames: Iterable[TrackedFrame], folder: Path, about: About) -> str:
+def write_yolo(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
     """Write the labels of a YOLO data set, `class x y w h` of the centre in parts of the frame, and its data.yaml.
 
-    There is a file for each frame, which is empty if there is no box. If `about.append`, the classes of the data set
-    keep their numbers, and files that exist are not replaced: returns how many; otherwise all labels are. Raises
-    VideoError if a class has another number in the data set.
+    There is a file for each frame, which is empty if there is no box.
     """
-    labels, yaml = folder / "labels", folder / "data.yaml"
-    existing = _yaml_names(yaml) if about.append and (yaml.exists() or labels.exists()) else {}
-    classes = _numbers(frames, about, existing)
+    classes, labels = _numbers(frames, about), folder / "labels"
     labels.mkdir(parents=True, exist_ok=True)
-    (folder / "labels.cache").unlink(missing_ok=True)  # Ultralytics takes it for that of other labels of the same size
-    if not about.append:
-        for file in labels.glob("*.txt"):
-            file.unlink()
-    text = yaml.read_text(encoding="utf-8") if existing else "train: images\nval: images\nnames:\n  - none\n"
-    yaml.write_text(_with_names(text, {number: name for name, number in classes.items()}), encoding="utf-8")
+    (folder / "labels.cache").unlink(missing_ok=True)  # Ultralytics takes it for the cache of other labels of this size
+    for file in labels.glob("*.txt") if about.is_first else ():
+        file.unlink()
+    names = "".join(f"  {number}: {json.dumps(name, ensure_ascii=False)}\n" for name, number in classes.items())
+    (folder / "data.yaml").write_text(f"train: images\nval: images\nnames:\n{names}", encoding="utf-8")
     width, height = _size(about).values()
-    added, skipped = 0, []
     for frame, places in _places(frames, about):
         lines = []
         for _, label, _, box in places:
             x, y = box.centre
             sides = x / width, y / height, box.w / width, box.h / height
             lines.append(f"{classes[label]} {' '.join(f'{side:.6f}' for side in sides)}\n")
-        file = labels / f"{Path(_image(about, frame)).stem}.txt"
-        if file.exists():
-            skipped.append(file.name)
-        else:
-            file.write_text("".join(lines))
-            added += 1
+        (labels / f"{Path(_image(about, frame)).stem}.txt").write_text("".join(lines))
     if about.source:
         _write_images(frames, folder / "images", about)
-    if not skipped:
-        return ""
-    return f"added {counted(added, 'label file')}, did not replace {len(skipped)} that exist ({skipped[0]} ...)"
 
 
 def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
@@ -196,32 +184,6 @@ def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) ->
             for number, frame in enumerate(source, min(missing)):
                 if number in missing:
                     (folder / _image(about, number)).write_bytes(jpeg(frame.image, quality=95))
-
-
-def _yaml_names(file: Path) -> dict[str, int]:
-    """Return the classes of a YOLO data set; raise VideoError if they cannot be read."""
-    names: dict[str, int] = {}
-    match = _YAML_NAMES.search(file.read_text(encoding="utf-8")) if file.exists() else None
-    entries = (match[1].split(",") if match[2] is None else match[2].splitlines()) if match else []
-    for entry in (entry for entry in entries if entry.strip() and not entry.lstrip().startswith("#")):
-        parsed = _YAML_NAME.fullmatch(entry)
-        if parsed is None:
-            names.clear()
-            break
-        number, double, single, plain = parsed.groups()
-        name = json.loads(double) if double else plain if single is None else single
-        names[name] = len(names) if number is None else int(number)
-    if not names:
-        raise VideoError(f"cannot read the classes of the data set in {file}: write them as lines 0: NAME below names:")
-    return names
-
-
-def _with_names(text: str, names: Mapping[int, str]) -> str:
-    """Return a data.yaml with these classes by number; Ultralytics needs a name for each number below the highest."""
-    numbers = range(max(names) + 1)
-    lines = "".join(f"\n  {n}: {json.dumps(names.get(n, f'class_{n}'), ensure_ascii=False)}" for n in numbers)
-    text = _YAML_NAMES.sub(lambda _: f"names:{lines}", text, count=1)
-    return re.sub(r"(?m)^nc:.*$", f"nc: {len(numbers)}", text)
 
 
 def write_via(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
@@ -250,36 +212,28 @@ def _places(frames: Iterable[TrackedFrame], about: About) -> Iterator[tuple[int,
         for track in frame.tracks:
             number = numbers.setdefault((track.object, track.began), len(numbers) + 1)
             if (box := _cut(track.box, about.size)) is not None:
-                places.append(_Place(number, _label(track, about), track, box))
+                places.append(_Place(number, _label(track, about.label), track, box))
         yield frame.tracks[0].source_frame, places
 
 
-def _numbers(
-    frames: Iterable[TrackedFrame], about: About, existing: Mapping[str, int] | None = None, *, first: int = 0
-) -> dict[str, int]:
-    """Return the number of each class: `existing` ones, those of `about.classes`, or the next number for each other.
+def _numbers(frames: Iterable[TrackedFrame], about: About, *, first: int = 0) -> dict[str, int]:
+    """Return the number of each class, in the order of `about.classes`, or else of the log.
 
-    An object that is never present has a class, too. Raises VideoError if two classes have the same number, or one has
-    two, or if `about.classes` lacks one.
+    An object that is never present has a class. Raises VideoError if `about.classes` lacks one.
     """
-    numbers = dict(existing or {})
-    for index, (label, number) in enumerate(about.classes.items(), first):
-        number = index if number is None else number
-        if numbers.setdefault(label, number) != number:
-            raise VideoError(f"--classes numbers {label} {number}, but in the data set it is class {numbers[label]}")
-    for label in dict.fromkeys(_label(track, about) for frame in frames for track in frame.tracks):
-        if label not in numbers and about.classes:
-            raise VideoError(f"--classes lacks {label}: add it, or give all objects one class with --label")
-        numbers.setdefault(label, max(numbers.values(), default=first - 1) + 1)
-    owners: dict[int, str] = {}
-    for label, number in numbers.items():
-        if owners.setdefault(number, label) != label:
-            raise VideoError(f"two classes have the number {number}, {owners[number]} and {label}: change --classes")
-    return dict(sorted(numbers.items(), key=lambda item: item[1]))
+    found = classes_of(frames, about.label)
+    if about.classes and (lacking := [name for name in found if name not in about.classes]):
+        raise VideoError(f"--classes lacks {lacking[0]}: add it, or give all objects one class with --label")
+    return {name: number for number, name in enumerate(about.classes or found, first)}
 
 
-def _label(track: Track, about: About) -> str:
-    return about.label or track.object or "object"
+def classes_of(frames: Iterable[TrackedFrame], label: str) -> list[str]:
+    """Return the classes of a log, in the order of their first tracks."""
+    return [*dict.fromkeys(_label(track, label) for frame in frames for track in frame.tracks)]
+
+
+def _label(track: Track, label: str) -> str:
+    return label or track.object or "object"
 
 
 def _cut(box: Box | None, size: tuple[int, int] | None) -> Box | None:

@@ -16,7 +16,7 @@ from catstream.base.files import open_locked, writing
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import About, Head, Origin, TrackedFrame
+from catstream.sinks.destinations import Head, Origin, TrackedFrame
 from catstream.sinks.remote import Warnings
 
 #: Column -> its type in SQLite. `seconds` is the time since the start of the source, `pts` the time stamp in a live
@@ -139,9 +139,10 @@ def create(database: sqlite3.Connection, head: Head) -> None:
         database.execute("INSERT INTO head VALUES (?)", (head.to_json(),))
 
 
-def write_sqlite(frames: Iterable[TrackedFrame], path: Path, about: About) -> None:
+def write_database(frames: Iterable[TrackedFrame], path: Path, head: Head) -> None:
+    """Write all frames to a new database."""
     with _errors(path), closing(sqlite3.connect(path)) as database, database:
-        create(database, about.head)
+        create(database, head)
         database.executemany(_INSERT, rows(frames))
 
 

@@ -1,16 +1,14 @@
-"""THE TABLE of destinations and formats of tracks.
+"""THE TABLE of destinations of tracks.
 
-A sink takes each frame while the run goes on: `catstream track --write DEST`, `catstream sink DEST`. An export is made
-from a log, an NDJSON or CSV file, afterwards: `catstream export LOG DEST`. A new one is a row here, a class or a
-function in a file of its own, and a line in docs/how-to/sinks.md.
+A sink takes each frame while the run goes on: `catstream track --write DEST`, `catstream sink DEST`. A new one is a row
+here, a class in a file of its own, and a line in docs/how-to/sinks.md. `catstream.sinks.exports` has the formats that
+are made from a log afterwards.
 """
 
 from __future__ import annotations
 
 import json
-import secrets
-import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -23,9 +21,9 @@ import msgspec
 
 from catstream.base.addresses import is_live, without_password
 from catstream.base.box import Box
-from catstream.base.files import check_file, check_unlocked, remove_parts, writing
+from catstream.base.files import check_file, check_unlocked
 from catstream.client.address import Address
-from catstream.errors import VideoError, require_extra
+from catstream.errors import VideoError
 from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.video.images import IMAGES
@@ -122,32 +120,6 @@ class Origin:
     size: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class About:
-    """The parameters of an export.
-
-    name     that of the log, for the files in a folder
-    size     width and height of a frame in pixels; None if it is not known
-    label    the class of all objects; empty if the name of each is its class
-    head     head of the log; an empty one if the log has none
-    classes  class -> its number, None for its place in this order; empty for all classes, in the order of the log
-    images   files of the images of the source; empty if it is a video
-    frames   number of frames of the source; None if unknown
-    append   whether to add to an existing data set
-    source   path of the source whose images are written, too; empty to write none
-    """
-
-    name: str
-    size: tuple[int, int] | None = None
-    label: str = ""
-    head: Head = field(default_factory=Head)
-    classes: Mapping[str, int | None] = field(default_factory=dict)
-    images: Sequence[Path] = ()
-    frames: int | None = None
-    append: bool = False
-    source: str = ""
-
-
 class Sink(Protocol):
     """Takes the frames in their order; made as `Class(place, origin)`.
 
@@ -166,29 +138,17 @@ class Sink(Protocol):
 class Row:
     """A row of the table.
 
-    home         the class of a sink, or the function `export(frames, path, about)`; it may return a note for the user
-    meaning      a line of the help
-    suffix       of the file of an export; empty for a folder
-    sized        whether an export has classes, and needs the size of a frame
-    images       whether an export refers to the images of the source
-    appends      whether an export can be added to an existing one
-    extra        the extra that it needs
-    options      fields of `SinkOptions` that a sink uses; any of them is an error if no destination does
+    home     the class of a sink, as module.Class
+    meaning  a line of the help
+    options  fields of `SinkOptions` that it uses; any of them is an error if no destination does
     """
 
     home: str
     meaning: str
-    suffix: str = ""
-    sized: bool = False
-    images: bool = False
-    appends: bool = False
-    extra: str = ""
     options: tuple[str, ...] = ()
 
     def load(self) -> Any:
-        """Import the class or function; raises MissingExtraError if its extra is not installed."""
-        if self.extra:
-            require_extra(self.extra)
+        """Import the class."""
         module, _, name = self.home.rpartition(".")
         return getattr(import_module(f"catstream.sinks.{module}"), name)
 
@@ -218,27 +178,6 @@ SINKS = {
     "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "picture", "key")),
 }
 
-#: Name of a format -> the export.
-EXPORTS = {
-    "mot": Row("exports.write_mot", "MOT text: frame,id,x,y,w,h,score,-1,-1,-1, counted from 1", ".txt"),
-    "csv": Row("exports.write_csv", "the CSV file of a run", ".csv"),
-    "sqlite": Row("database.write_sqlite", "the table tracks of a database", ".sqlite"),
-    "parquet": Row("exports.write_parquet", "the same columns in a column store", ".parquet", extra="parquet"),
-    "coco": Row(
-        "annotations.write_coco", "COCO, with the tracks and the video as in TAO", ".json", True, True, appends=True
-    ),
-    "cvat": Row("annotations.write_cvat", "CVAT for video 1.1", ".xml", True, True),
-    "yolo": Row(
-        "annotations.write_yolo", "a folder: labels of each frame, and data.yaml", "", True, True, appends=True
-    ),
-    "via": Row("annotations.write_via", "VIA tracks, which movement and napari open", ".via.csv", images=True),
-    "dlc": Row("exports.write_dlc", "DeepLabCut: the centre of each object by its name, for movement", ".dlc.csv"),
-    "sleap": Row("exports.write_sleap", "SLEAP's analysis: the same centres, for sleap-io", ".sleap.csv"),
-    "otb": Row("exports.write_otb", "a folder: boxes, confidence and times of each object, as for OTB", appends=True),
-    "got10k": Row("exports.write_got10k", "the same in the layout of GOT-10k", appends=True),
-    "vot": Row("exports.write_vot", "the same in the layout of VOT's long-term experiment", appends=True),
-}
-
 
 def sink_of(place: str) -> Row:
     """Return the row of a sink; raises VideoError if there is none for this suffix or scheme."""
@@ -250,14 +189,6 @@ def sink_of(place: str) -> Row:
             "where - is standard output; for other formats use catstream export"
         )
     return row
-
-
-def export_of(path: Path, name: str | None) -> Row:
-    """Return the row of an export, by its name, or else by the longest suffix; raises VideoError if there is none."""
-    rows = [row for row in EXPORTS.values() if row.suffix and path.name.endswith(row.suffix)]
-    if name is None and not rows:
-        raise VideoError(f"unknown format of {path}: pass --format, one of {', '.join(EXPORTS)}")
-    return max(rows, key=lambda row: len(row.suffix)) if name is None else EXPORTS[name]
 
 
 def is_file(place: str) -> bool:
@@ -276,7 +207,7 @@ def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | 
 
 
 def check_sink(place: str, options: SinkOptions, source: str = "") -> None:
-    """Raise VideoError or MissingExtraError if there is no such destination, or the address or an option is invalid.
+    """Raise VideoError if there is no such destination, or the address or an option is invalid.
 
     Also if it is the video of a live `source`.
     """
@@ -301,7 +232,7 @@ def redacted(place: str) -> str:
 
 
 def open_sink(place: str, origin: Origin) -> Sink:
-    """Open the sink of a destination; raises VideoError or MissingExtraError if that is not possible."""
+    """Open the sink of a destination; raises VideoError if that is not possible."""
     return cast(Sink, sink_of(place).load()(place, origin))
 
 
@@ -310,50 +241,3 @@ def idle(sinks: Iterable[Sink]) -> None:
     for sink in sinks:
         if hasattr(sink, "idle"):
             sink.idle()
-
-
-def check_export(path: Path, row: Row, *, overwrite: bool, append: bool, log: Path) -> None:
-    """Raise VideoError if an export would replace or extend something, unless `overwrite` or `append` allow that."""
-    if append and not row.appends:
-        raise VideoError(f"{path} can hold one video only: use another name, or pass --overwrite instead of --append")
-    if row.suffix:
-        check_result(path, overwrite=overwrite or append, source=str(log))
-    elif not (overwrite or append or _is_empty(path)):
-        raise VideoError(
-            f"the folder {path} is not empty: add to its data set with --append, replace it with --overwrite, or use "
-            "another folder"
-        )
-
-
-def _is_empty(folder: Path) -> bool:
-    """Return True if a folder has no files but the images of a data set, which may be there before its labels."""
-    entries = folder.iterdir() if folder.is_dir() else ()
-    return all(entry.name == "images" or entry.name.startswith(".") for entry in entries)
-
-
-def export(frames: Iterable[TrackedFrame], path: Path, row: Row, about: About) -> str:
-    """Make a file from the frames of a log, which gets its name once it is complete, or the files of a folder.
-
-    frames : read more than once by some formats
-
-    Returns what the user should know, mostly nothing. Raises VideoError if the files cannot be written, or if the size
-    of a frame is needed and unknown.
-    """
-    make: Callable[[Iterable[TrackedFrame], Path, About], str | None] = row.load()
-    if row.sized and about.size is None:
-        raise VideoError(
-            f"unknown size of the frames, required for {path}: pass --size WIDTHxHEIGHT, or --size SOURCE with the "
-            "video or folder that was tracked"
-        )
-    remove_parts(path)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    with writing(path, VideoError):
-        try:
-            if row.suffix and about.append and path.exists():
-                shutil.copyfile(path, part)
-            note = make(frames, part if row.suffix else path, about)
-            if row.suffix:
-                part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    return note or ""

@@ -1,7 +1,6 @@
 """`catstream batch`: the logs of many videos, what is not tracked again, and one data set of all."""
 
 import csv
-import json
 import signal
 from dataclasses import replace
 
@@ -131,12 +130,13 @@ def test_the_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video
     (tmp_path / "cam.mp4").write_bytes(demo_video(FRAMES)[0].read_bytes())
     boxes = table(tmp_path, f"cam.mp4,ben,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},")
     succeed("batch", boxes, "--output", tmp_path / "out", "--jobs", 1)
-    succeed("export", tmp_path / "out", tmp_path / "all.json", "--format", "coco", "--label", "person")
-    coco = json.loads((tmp_path / "all.json").read_text())
-    assert [video["name"] for video in coco["videos"]] == ["cam", "two_cam"]
-    assert len(coco["annotations"]) == 2 * FRAMES
+    succeed("export", tmp_path / "out", tmp_path / "set", "--format", "yolo")
+    assert (tmp_path / "set" / "data.yaml").read_text().endswith('names:\n  0: "ben"\n  1: "anna"\n')
+    labels = sorted((tmp_path / "set" / "labels").iterdir())
+    assert [file.stem.rpartition("_")[0] for file in labels] == ["cam"] * FRAMES + ["two_cam"] * FRAMES
+    assert {file.read_text()[0] for file in labels[FRAMES:]} == {"1"}
     assert "this format holds one video" in fail("export", tmp_path / "out", tmp_path / "all.xml")
-    assert "contains no .ndjson file" in fail("export", tmp_path / "two", tmp_path / "all2.json", "--format", "coco")
+    assert "contains no .ndjson file" in fail("export", tmp_path / "two", tmp_path / "set2", "--format", "yolo")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])

@@ -13,9 +13,6 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed,
     succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
     with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
         assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == list(range(32))
-    succeed("export", log, tmp_path / "otb", "--format", "otb")
-    for name in ("demo.txt", "demo_confidence.value", "times/demo_time.txt"):
-        assert len((tmp_path / "otb" / name).read_text().splitlines()) == 32
     for size in ("320x240", video[0]):
         succeed("export", log, tmp_path / "t.json", "--size", size, "--label", "person", "--overwrite")
         coco = json.loads((tmp_path / "t.json").read_text())
@@ -37,39 +34,25 @@ def test_a_file_that_is_no_log_is_not_exported(fail, tmp_path, log, words):
     assert not (tmp_path / "t.sqlite").exists()
 
 
-FOLDERS = {
-    "yolo": "labels/demo_000000.txt",
-    "otb": "demo.txt",
-    "got10k": "demo/demo_001.txt",
-    "vot": "demo/demo_001.txt",
-}
-
-
-@pytest.mark.parametrize("layout", FOLDERS)
-def test_a_folder_with_results_is_changed_only_if_an_option_says_how(whole_run, succeed, fail, tmp_path, layout):
-    command = ["export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", layout]
+def test_the_labels_of_a_data_set_are_replaced_only_on_request(whole_run, succeed, fail, tmp_path):
+    command = ["export", whole_run / "out" / "demo.ndjson", tmp_path / "set", "--format", "yolo"]
     succeed(*command)
-    label = tmp_path / "set" / FOLDERS[layout]
-    label.write_text("corrected by hand")
-    assert "is not empty: add to its data set with --append, replace it with --overwrite" in fail(*command)
-    if layout == "yolo":
-        succeed(*command, "--append")
-    else:
-        assert f"{label} exists already" in fail(*command, "--append")
+    label, other = (tmp_path / "set" / "labels" / name for name in ("demo_000000.txt", "other.txt"))
+    for file in (label, other):
+        file.write_text("corrected by hand")
+    assert "is not empty: replace its labels with --overwrite" in fail(*command)
     assert label.read_text() == "corrected by hand"
     succeed(*command, "--overwrite")
     assert label.read_text() != "corrected by hand"
+    assert not other.exists()
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--append", "--overwrite"], "--append and --overwrite are mutually exclusive"),
-        (["--append"], "can hold one video only"),
-        (["--classes", "a,a"], "expected a new NAME or NAME=NUMBER"),
+        (["--classes", "a,a"], "expected different names"),
+        (["--classes", "a,,b"], "expected different names"),
         (["--label", "a\x01b"], "expected printable characters"),
-        (["--classes", "a=x"], "expected a new NAME or NAME=NUMBER"),
-        (["--classes", "a=1,b"], "expected a number for all classes or for none"),
         (["--format", "mot", "--classes", "a"], "--classes requires a format with classes"),
         (["--images"], "--images requires --format yolo"),
         (["--size", "320x200"], "whose frames are 320x240: omit --size"),
@@ -85,25 +68,6 @@ def test_the_images_of_a_data_set_are_those_of_the_tracked_frames(whole_run, suc
     images, labels = (sorted((tmp_path / "set" / name).iterdir()) for name in ("images", "labels"))
     assert [file.stem for file in images] == [file.stem for file in labels]
     assert (len(images), cv2.imread(str(images[0])).shape) == (32, (240, 320, 3))
-
-
-def test_exports_that_add_to_one_data_set_at_once_all_succeed(whole_run, catstream, tmp_path):
-    names = [f"{letter}.ndjson" for letter in "abc"]
-    for name in names:
-        (tmp_path / name).write_bytes((whole_run / "out" / "demo.ndjson").read_bytes())
-    options = {"coco": ["all.json"], "yolo": ["set", "--format", "yolo"]}
-    started = [
-        catstream("export", name, *dest, "--append", "--label", name[0], cwd=tmp_path)
-        for dest in options.values()
-        for name in names
-    ]
-    assert [(process.wait(150), process.stderr.read()) for process in started] == [(0, "")] * len(started)
-    coco = json.loads((tmp_path / "all.json").read_text())
-    assert len(coco["videos"]) == len(coco["categories"]) == 3
-    classes = (tmp_path / "set" / "data.yaml").read_text().split("names:")[1]
-    for number, name in (line.strip().split(": ") for line in classes.splitlines() if ":" in line):
-        labels = (tmp_path / "set" / "labels").glob(f"{json.loads(name)}_*.txt")
-        assert {line.split()[0] for file in labels for line in file.read_text().splitlines()} == {number}
 
 
 def test_an_annotated_video_is_refused_as_the_source_of_the_size(whole_run, fail, tmp_path):

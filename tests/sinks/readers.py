@@ -3,8 +3,7 @@
     python tests/sinks/readers.py READER FILE
 
 runs in the environment of the libraries, without catstream: see test_readers.py. A line is frame, track, class, x, y,
-w, h: the number of the frame as the library counts them, from 0, and null for what the format does not have. Of
-poses, x and y are the centre, without w and h.
+w, h: the number of the frame as the library counts them, from 0, and null for what the format does not have.
 """
 
 import contextlib
@@ -121,29 +120,6 @@ def movement_via(file):
             (x, y), (w, h) = (data[key].sel(time=frame, individuals=individual).values for key in ("position", "shape"))
             if x == x:
                 yield frame, int(individual.removeprefix("id_")), None, x - w / 2, y - h / 2, w, h
-
-
-def movement_dlc(file):
-    from movement.io import load_poses
-
-    yield from of_poses(load_poses.from_dlc_file(file))
-
-
-def movement_slp(file):
-    import sleap_io
-    from movement.io import load_poses
-
-    sleap_io.save_slp(sleap_io.load_csv(str(file)), "walk.slp", verbose=False)
-    yield from of_poses(load_poses.from_sleap_file("walk.slp"))
-
-
-def of_poses(data):
-    assert data.keypoints.values.tolist() == ["centre"]
-    for individual in data.individuals.values.tolist():
-        centres = data.position.sel(individuals=individual, keypoints="centre")
-        for frame, (x, y) in zip(data.time.values.tolist(), centres.values.tolist(), strict=True):
-            if x == x:
-                yield frame, None, individual, x, y
 
 
 if __name__ == "__main__":

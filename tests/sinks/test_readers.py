@@ -24,14 +24,13 @@ from catstream.video.source import open_source
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-LIBRARIES = ["torch", "torchvision", "movement", "pycocotools", "supervision", "datumaro", "trackeval", "sleap-io"]
+LIBRARIES = ["torch", "torchvision", "movement", "pycocotools", "supervision", "datumaro", "trackeval"]
 BARE = ["ultralytics", "ultralytics-thop"]  # without their dependencies: only its data sets are used
 READERS = {
     **{"ultralytics_yolo": "set", "supervision_yolo": "set", "datumaro_yolo": "set"},
     **{"pycocotools_coco": "walk.json", "supervision_coco": "walk.json", "datumaro_coco": "walk.json"},
     **{"datumaro_cvat": "walk.xml", "trackeval_mot": "walk.txt", "movement_via": "walk.via.csv"},
 }
-POSES = {"movement_dlc": "walk.dlc.csv", "movement_slp": "walk.sleap.csv"}
 
 
 @pytest.fixture(scope="session")
@@ -80,7 +79,7 @@ def replace(endpoint, box):
 
 @pytest.fixture(scope="session")
 def exported(once, demo_video, succeed):
-    """Gives the folder of a run and its exports: walk.csv, walk.ndjson, walk.txt ... walk.sleap.csv, and set."""
+    """Gives the folder of a run and its exports: walk.csv, walk.ndjson, walk.txt ... walk.via.csv, and set."""
     video, boxes = demo_video(60)
 
     def track(kind, folder):
@@ -113,7 +112,7 @@ def exported(once, demo_video, succeed):
 
     def fill(kind, folder):
         track(kind, folder)
-        for suffix in (".txt", ".json", ".xml", ".via.csv", ".dlc.csv", ".sleap.csv"):
+        for suffix in (".txt", ".json", ".xml", ".via.csv"):
             succeed("export", folder / "walk.ndjson", folder / f"walk{suffix}")
         succeed("export", folder / "walk.ndjson", folder / "set", "--format", "yolo", "--images")
 
@@ -125,27 +124,18 @@ def run(request, exported):
     return exported(request.param)
 
 
-def boxes_in_csv(folder, *, cut=True):
+def boxes_in_csv(folder):
     """The boxes of a run: frame, number of the track, class, x, y, w, h, cut at the edges of the frame."""
     head, *lines = map(json.loads, (folder / "walk.ndjson").read_text().splitlines())
     with (folder / "walk.csv").open() as file:
         rows = [*csv.DictReader(file)]
-    (width, height), numbers = head["size"] if cut else (np.inf, np.inf), {}
-    least = 0 if cut else -np.inf
+    (width, height), numbers = head["size"], {}
     for row, line in zip(rows, lines, strict=True):  # the beginning of an object is in the NDJSON file only
         number = numbers.setdefault((line["object"], line["began"]), len(numbers) + 1)
         if row["x"]:
             x, y, w, h = (float(row[side]) for side in "xywh")
-            left, top, right, bottom = max(x, least), max(y, least), min(x + w, width), min(y + h, height)
+            left, top, right, bottom = max(x, 0), max(y, 0), min(x + w, width), min(y + h, height)
             yield int(row["source_frame"]), number, row["object"], left, top, right - left, bottom - top
-
-
-def centres_in_csv(folder):
-    """The centres of a run: frame, None, name, x, y; another object that was given a name has NAME@FRAME."""
-    names = {}
-    for frame, number, name, x, y, w, h in boxes_in_csv(folder, cut=False):
-        unique = names.setdefault(number, f"{name}@{frame}" if name in names.values() else name)
-        yield frame, None, unique, x + w / 2, y + h / 2
 
 
 def cvat(file, frames):
@@ -205,13 +195,6 @@ def read(run, libraries, tmp_path):
 @pytest.mark.parametrize("reader", READERS)
 def test_a_library_reads_the_boxes_of_the_csv_file(run, read, reader):
     assert_same(read(reader, READERS[reader]), boxes_in_csv(run))
-
-
-@pytest.mark.parametrize("reader", POSES)
-def test_movement_reads_the_centres_of_the_csv_file_by_the_names_of_the_objects(run, read, reader):
-    centres = read(reader, POSES[reader])
-    assert {name for _, _, name, *_ in centres} == {name for _, _, name, *_ in centres_in_csv(run)}
-    assert_same(centres, centres_in_csv(run))
 
 
 def test_cvat_shows_the_boxes_of_the_csv_file_and_none_after_the_last(run):
