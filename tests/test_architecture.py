@@ -45,7 +45,6 @@ IMPORTERS = {
         "catstream/detection",
         "catstream/paper",
         "catstream/video",
-        "catstream/loadtest/crowd.py",
         "catstream/base/threads.py",
         *("catstream/evaluation/peers.py", "catstream/evaluation/nanotrack.py"),
         "catstream/reports/provenance.py",  # its version
@@ -61,7 +60,7 @@ IMPORTERS = {
     "safetensors": ["catstream/messages/storage.py"],
     "obstore": ["catstream/fleet/store.py"],
     "ray": ["catstream/fleet"],
-    "av": ["catstream/video", "catstream/loadtest/camera.py", "catstream/loadtest/rtsp.py"],
+    "av": ["catstream/video"],
     "zmq": [
         "catstream/wire",
         "catstream/client/subscription.py",

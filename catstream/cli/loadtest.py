@@ -16,7 +16,7 @@ from catstream.cli.common import complain, line_of, messages, screen, stopped, t
 from catstream.cli.options import FOLDER, NumberRange, with_settings
 
 if TYPE_CHECKING:
-    from catstream.loadtest.load_test import Limit, Result
+    from catstream.loadtest.result import Limit, Result
 
 _QUIET_CORES = 0.25  # load by other processes above which a warning is printed
 #: Limits of a search if none are given.
@@ -36,22 +36,13 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--subscribers", type=click.IntRange(0, 1000), default=0, show_default=True, help="Subscribers to each pipeline."
 )
-@click.option(
-    "--slow-subscribers", type=click.IntRange(0), default=0, help="Number of slow or frozen subscribers among them."
-)
+@click.option("--slow-subscribers", type=click.IntRange(0), default=0, help="Number of slow subscribers among them.")
 @click.option(
     "--rate", type=NumberRange(0.5, 1000), default=25.0, show_default=True, help="Frames per second of each stream."
 )
 @click.option("--duration", type=NumberRange(1, 86400), default=10.0, show_default=True, help="Duration in seconds.")
 @click.option(
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
-)
-@click.option(
-    "--source",
-    type=click.Choice(["mjpeg", "h264"]),
-    default="mjpeg",
-    show_default=True,
-    help="MJPEG over HTTP, or H.264 over RTSP.",
 )
 @click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
 @click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
@@ -67,12 +58,12 @@ def loadtest(
 ) -> None:
     """Measure latency and dropped frames of pipelines under load.
 
-    The load test sends a rendered video with ground truth on the loopback
-    interface; a pipeline of its own tracks each stream. The camera does not
-    wait: frame i is due at start + i / RATE, and latency counts from
-    then. The latency of a skipped frame ends with the track of a newer one.
-    Slow subscribers read two tracks per second; half of them are frozen
-    instead.
+    The load test sends a rendered video with ground truth as a network camera
+    does, H.264 over RTSP, on the loopback interface; a pipeline of its own
+    tracks each stream. The camera does not wait: frame i is due at
+    start + i / RATE, and latency counts from then. The latency of a skipped
+    frame ends with the track of a newer one. Slow subscribers read two tracks
+    per second.
 
     \b
     LIMITS, of the worst stream
@@ -92,10 +83,11 @@ def loadtest(
       catstream loadtest --rate 30 --limit p99=0.1
       catstream loadtest --objects 8 --limit skipped=0.01
       catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
-      catstream loadtest --find-streams --rate 25 --size 1920x1080 --source h264
+      catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
     from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
-    from catstream.loadtest.load_test import KINDS, Limit, Plan, run_load_test, violations
+    from catstream.loadtest.load_test import run_load_test
+    from catstream.loadtest.result import Limit, Plan, violations
 
     parsed = [Limit.parse(text) for text in limits or (_SEARCH_LIMITS if find_streams else ())]
     parameters = Plan(**plan)
@@ -112,11 +104,11 @@ def loadtest(
 
         def done(result: Result) -> None:
             if find_streams:
-                (cores, memory), verdict = result.cost, "; ".join(violations(parsed, result)) or "met"
+                (cores, memory), verdict = result.mean_cost, "; ".join(violations(parsed, result)) or "met"
                 click.echo(
                     f"{counted(result.plan.streams, 'stream')}, {result.plan.rate:g} frames/s due; in the worst stream "
-                    f"{result.followed:.1f} tracked, p99 {milliseconds(KINDS['p99'].measure(result))} ms; each takes "
-                    f"{cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
+                    f"{result.rate(result.worst['skipped']):.1f} tracked, p99 {milliseconds(result.worst['p99'])} ms; "
+                    f"each takes {cores:.2f} cores, {memory / 1e6:.0f} MB: {verdict}"
                 )
 
         load_test = run_load_test(parameters, parsed, find=find_streams, report=report, done=done)

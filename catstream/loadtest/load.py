@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
-from collections.abc import Callable, Iterator, MutableSequence
+from collections.abc import Iterable, Iterator, MutableSequence
 from contextlib import ExitStack, suppress
 from time import monotonic, sleep
 from typing import Any, NamedTuple, Self
@@ -20,49 +19,62 @@ from catstream.base.workers import SPAWN, die_with, sharing, sigint_blocked
 from catstream.client.address import Address
 from catstream.client.attach import control
 from catstream.errors import CatstreamError, CommandRejectedError, SilenceError
-from catstream.loadtest import crowd
+from catstream.loadtest.result import Plan, Report
 from catstream.messages.kinds import End
 from catstream.pipeline import Pipeline
 from catstream.video import rendered
-from catstream.video.frames import jpeg
+from catstream.video.writer import Encoder
 from catstream.wire.channels import TRACKS
 from catstream.wire.newest import GapCounter, Subscriber
 
-_QUALITY = 90  # of JPEG, as network cameras use it
-_STOP_SECONDS = 30.0  # time-out for a pipeline to start, to answer `stop`, and to end after it
+_STILL_FRAMES = 24  # of which the first is a keyframe
+_STOP_SECONDS = 30.0  # timeout for a pipeline to start, to answer `stop`, and to end after it
 _PER_PROCESS = 20  # subscribers in one process, because most machines cannot run a process for each
 #: Maximum number of messages that a subscriber reads at once, and seconds between two reads.
 _QUICK, _SLOW = (64, 0.05), (1, 0.5)
-_DRAIN_SECONDS = 20.0  # time-out for fast subscribers to receive the last messages
+_DRAIN_SECONDS = 20.0  # timeout for fast subscribers to receive the last messages
 
 
 class Video(NamedTuple):
-    """The images that are sent, forwards, then backwards, and so on.
+    """The video that is sent over and over.
 
-    files  JPEG files
+    units  access units of H.264; the first one is a keyframe
+    still  those of the first image, which are sent before
     boxes  boxes of all objects in the first image, by name; the first object is the one whose tracks are measured
     truth  boxes of the first object in all images, float64 (images, 4), NaN if it is absent
     """
 
-    files: list[bytes]
+    units: list[bytes]
+    still: list[bytes]
     boxes: dict[str, Box]
     truth: Float64
 
 
-def render(objects: int, images: int, size: tuple[int, int], done: Callable[[int], None]) -> Video:
-    """Render the first images of the demo video of so many objects; `done` is called with their number so far."""
-    files, truth = [], []
-    frames: Iterator[tuple[np.ndarray, dict[str, Box | None]]]
-    if objects == 1:
-        frames = ((image, {UNNAMED: box}) for image, box in rendered.render(images, size))
-    else:
-        frames = crowd.render(objects, images, size)
-    for image, boxes in frames:
-        files.append(jpeg(image, quality=_QUALITY))
-        truth.append(boxes)
-        done(len(files))
-    name, *_ = first = {name: box for name, box in truth[0].items() if box is not None}
-    return Video(files, first, np.array([boxes[name] or (np.nan,) * 4 for boxes in truth]))
+def render(plan: Plan, report: Report) -> Video:
+    """Render the demo video, forwards, then backwards, and encode it."""
+    count, demo, truth = min(plan.frames, 2 * rendered.FRAMES - 2), rendered.Demo(plan.size), []
+
+    def encoded(numbers: Iterable[int]) -> Iterator[bytes]:
+        encoder = Encoder(plan.size, rate=25)
+        for number in numbers:
+            image, box = demo.image(number)
+            truth.append(box or (np.nan,) * 4)
+            report("rendering", number / count, f"{number} of {count} frames")
+            yield from map(bytes, encoder.packets(image))
+        yield from map(bytes, encoder.flush())
+
+    still = [*encoded([0] * _STILL_FRAMES)]
+    units = [*encoded(range(count))]
+    return Video(units, still, _boxes(plan, Box(*truth[0])), np.array(truth[_STILL_FRAMES:]))
+
+
+def _boxes(plan: Plan, dahlia: Box) -> dict[str, Box]:
+    """The boxes in the first image: the flower, and parts of the lake that stay in the picture."""
+    if plan.objects == 1:
+        return {UNNAMED: dahlia}
+    x, y = plan.size[0] / rendered.SIZE[0], plan.size[1] / rendered.SIZE[1]
+    lake = (Box(x * (10 + 80 * (n % 4)), y * (110 + 85 * (n // 4)), 60 * x, 60 * y) for n in range(plan.objects - 1))
+    return {f"object-{number}": box for number, box in enumerate((dahlia, *lake), 1)}
 
 
 class Stream(threading.Thread):
@@ -75,6 +87,7 @@ class Stream(threading.Thread):
 
     def __init__(self, number: int, url: str, boxes: dict[str, Box], settings: Settings) -> None:
         super().__init__(name=f"stream {number}", daemon=True)
+        self.number = number
         self.ready = threading.Event()
         self.address: Address | None = None
         self.error: CatstreamError | None = None
@@ -122,14 +135,16 @@ class Subscribers:
     """Subscribers to the tracks of one pipeline; a context manager.
 
     They run with idle priority, and the fast ones read twenty times per second, so that they take little processor time
-    from the pipeline. `slow` of the `readers` read two messages per second, and `frozen` are stopped by `freeze`.
+    from the pipeline. `slow` of the `readers` read two messages per second.
+
+    received, missed : number of frames whose tracks each of the fast subscribers has received, and missed by the gaps
+        in `frame`
     """
 
-    def __init__(self, address: Address, readers: int, *, slow: int = 0, frozen: int = 0) -> None:
-        self._quick, self._readers = readers - slow - frozen, readers
+    def __init__(self, address: Address, readers: int, slow: int) -> None:
+        self._quick, self._readers = readers - slow, readers
         with sharing():
             self._received, self._missed = (SPAWN.RawArray("l", max(readers, 1)) for _ in range(2))
-        self._frozen_since = 0.0  # time of `freeze`
 
         def processes(numbers: range, pace: tuple[int, float]) -> list[Any]:
             parts = [numbers[begin : begin + _PER_PROCESS] for begin in range(0, len(numbers), _PER_PROCESS)]
@@ -137,8 +152,7 @@ class Subscribers:
             return [SPAWN.Process(target=_read_until_end, args=(address, part, *rest), daemon=True) for part in parts]
 
         self._fast = processes(range(self._quick), _QUICK)
-        self._frozen = processes(range(readers - frozen, readers), _QUICK)
-        self._all = [*self._fast, *processes(range(self._quick, self._quick + slow), _SLOW), *self._frozen]
+        self._all = [*self._fast, *processes(range(self._quick, readers), _SLOW)]
 
     @property
     def pids(self) -> list[int]:
@@ -150,30 +164,18 @@ class Subscribers:
         return all(self._received[: self._readers])
 
     @property
-    def frozen_seconds(self) -> float:
-        """Seconds since `freeze`, 0 before it."""
-        return monotonic() - self._frozen_since if self._frozen_since else 0.0
+    def received(self) -> list[int]:
+        return list(self._received[: self._quick])
 
-    def freeze(self) -> None:
-        """Stop the processes of the subscribers to be frozen, if all are connected."""
-        if not self._frozen_since and self._frozen and self.connected:
-            for process in self._frozen:
-                os.kill(process.pid, signal.SIGSTOP)
-            self._frozen_since = monotonic()
+    @property
+    def missed(self) -> list[int]:
+        return list(self._missed[: self._quick])
 
     def wait(self) -> None:
-        """Wait until each fast subscriber has received the end, with a time-out."""
+        """Wait until each fast subscriber has received the end, with a timeout."""
         deadline = monotonic() + _DRAIN_SECONDS
         for process in self._fast:
             process.join(max(0.0, deadline - monotonic()))
-
-    def received(self) -> list[int]:
-        """Return the number of frames whose tracks each fast subscriber has received."""
-        return list(self._received[: self._quick])
-
-    def missed(self) -> list[int]:
-        """Return the number of frames whose tracks each fast subscriber has missed, by the gaps in `frame`."""
-        return list(self._missed[: self._quick])
 
     def __enter__(self) -> Self:
         with sigint_blocked():
@@ -211,11 +213,12 @@ def _read_until_end(
                         break
                     if isinstance(message, End):
                         gaps[number].end(message)
-                        missed[number] = gaps[number].missed
                         del readers[number]
-                        break
-                    gaps[number].take(message)
+                    else:
+                        gaps[number].take(message)
+                        received[number] += message.seq != last[number]
+                        last[number] = message.seq
                     missed[number] = gaps[number].missed
-                    received[number] += message.seq != last[number]
-                    last[number] = message.seq
+                    if number not in readers:
+                        break
             sleep(pause)

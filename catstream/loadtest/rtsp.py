@@ -9,15 +9,13 @@ period of the 32 bits of RTP. Other servers of live streams state no position, s
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from http.client import parse_headers
 from socketserver import StreamRequestHandler
 from struct import pack
 from threading import Thread
 from typing import Any
-
-from catstream.video.writer import Encoder
 
 _CLOCK = 90_000  # ticks per second of RTP time stamps of video
 _PERIOD = 2**32 / _CLOCK  # seconds
@@ -27,21 +25,6 @@ _DESCRIPTION = (
     b"v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=load test\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
     b"a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:video\r\n"
 )
-
-
-def encode(pictures: Sequence[bytes], size: tuple[int, int], done: Callable[[int], None]) -> list[bytes]:
-    """Encode JPEG files, forwards, then backwards; return one access unit for each frame, the first is a keyframe.
-
-    done : is called with the number of frames so far
-    """
-    import av
-
-    decoder, encoder, packets = av.CodecContext.create("mjpeg", "r"), Encoder(size, rate=25), []
-    for number, picture in enumerate([*pictures, *pictures[-2:0:-1]], 1):
-        (frame,) = decoder.decode(av.Packet(picture))
-        packets += encoder.packets(frame.to_ndarray(format="bgr24"))
-        done(number)
-    return [bytes(packet) for packet in [*packets, *encoder.flush()]]
 
 
 def due_time(pts: float, arrival: float) -> float:

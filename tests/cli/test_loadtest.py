@@ -22,13 +22,12 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     figures = json.loads((tmp_path / "x.json").read_text())
     (stream,) = figures["streams"]
     assert stream["frames"] == 60
-    assert stream["frames_per_second"] == pytest.approx(20 * (1 - stream["skipped"] / 60))
-    assert stream["sent"] == stream["stored"] >= 60 - stream["skipped"]
+    assert stream["frames_per_second"] == pytest.approx(20 * (1 - stream["skipped"]))
+    assert stream["sent"] == stream["stored"] >= 60 * (1 - stream["skipped"])
     assert 0 < stream["track"]["p50"] <= stream["track"]["max"]
     assert 0 < stream["model"]["p50"] <= stream["model"]["max"]
-    assert stream["success_followed"] > 0.5
-    assert figures["subscribers"]["received"] > 0
-    assert figures["subscribers"]["frozen_seconds"] >= 3
+    assert stream["success"] > 0.5
+    assert figures["subscribers"]["received"] != [0]
     assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
     assert figures["processes"]["detector 0"]["cores"] > 0
 

@@ -8,7 +8,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.loadtest.camera import Schedule
 from catstream.loadtest.latency import Measures
-from catstream.loadtest.load_test import Plan, Result
+from catstream.loadtest.result import Plan, Result
 from catstream.messages.kinds import Track
 
 BOX = Box(10.0, 10.0, 20.0, 20.0)
@@ -17,7 +17,7 @@ BOX = Box(10.0, 10.0, 20.0, 20.0)
 @pytest.fixture
 def schedule() -> Schedule:
     """Ten frames a second from moment 100 on."""
-    return Schedule(start=100.0, rate=10.0, frames=10)
+    return Schedule(start=100.0, rate=10.0)
 
 
 @pytest.fixture
@@ -36,14 +36,13 @@ def track(schedule) -> Callable[..., tuple[float, Track]]:
 def result() -> Callable[..., Result]:
     """A result of streams with these latencies to the track."""
 
-    def made(*streams: list[float], followed: float = 1.0, success: float = 1.0, **others) -> Result:
+    def made(*streams: list[float], tracked: float = 1.0, success: float = 1.0, **others) -> Result:
         measures = []
-        rates = {"success": success, "success_followed": success}
         for seconds in map(np.array, streams):
             frames = np.arange(len(seconds))
-            seen = {"due": 100 + frames / 10, "followed": frames < followed * len(seconds)}
-            measures.append(Measures(**seen, **rates, track=seconds, model=seconds, without_track=0, max_lag=3))
-        facts = {"usage": {}, "received": [], "missed": [], "frozen": 0.0}
-        return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, "camera_late": 0.001, **others})
+            seen = {"due": 100 + frames / 10, "tracked": frames < tracked * len(seconds)}
+            measures.append(Measures(**seen, success=success, track=seconds, model=seconds))
+        facts = {"usage": {}, "received": [], "missed": [], "camera_late": 0.001}
+        return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, **others})
 
     return made

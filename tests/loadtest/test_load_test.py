@@ -2,9 +2,7 @@
 
 import subprocess
 import time
-from contextlib import nullcontext
 
-import numpy as np
 import psutil
 import pytest
 from hypothesis import given
@@ -14,9 +12,9 @@ from catstream.base.settings import Settings
 from catstream.errors import ObjectError, ServiceError, SettingsError
 from catstream.loadtest import load_test as module
 from catstream.loadtest.latency import REST, Usage
-from catstream.loadtest.load import Video
 from catstream.loadtest.load_report import to_json
-from catstream.loadtest.load_test import KINDS, Limit, Plan, find_highest, run_load_test, violations
+from catstream.loadtest.load_test import find_highest, run_load_test
+from catstream.loadtest.result import KINDS, Limit, Plan, violations
 
 
 @pytest.fixture
@@ -79,14 +77,13 @@ def machine(monkeypatch, result):
             tried.append(plan.streams)
             if plan.streams > most:
                 raise ServiceError("it took too long")
-            followed = 1.0 if plan.streams <= capacity else 0.9
-            run = result(*[[0.01] * 50] * plan.streams, followed=followed)
+            tracked = 1.0 if plan.streams <= capacity else 0.9
+            run = result(*[[0.01] * 50] * plan.streams, tracked=tracked)
             run.plan = plan
             return run
 
         monkeypatch.setattr(module, "run", run)
-        monkeypatch.setattr(module, "Camera", lambda *_: nullcontext())
-        monkeypatch.setattr(module, "render", lambda *_: Video([], {}, np.empty((0, 4))))
+        monkeypatch.setattr(module, "render", lambda *_: None)
         return tried
 
     return made
@@ -132,7 +129,7 @@ def test_the_limit_on_success_is_a_minimum(result):
 
 
 def test_skipped_and_missed_frames_are_shares_and_a_failed_stream_is_a_violation(result):
-    run = result([0.01] * 10, followed=0.9, received=[99, 99], missed=[1, 1], errors=["stream 0: it died"])
+    run = result([0.01] * 10, tracked=0.9, received=[99, 99], missed=[1, 1], errors=["stream 0: it died"])
     assert violations([Limit("skipped", 0.1), Limit("missed", 0.01)], run) == ["stream 0: it died"]
     assert len(violations([Limit("skipped", 0.09), Limit("missed", 0.009)], run)) == 3
 
@@ -154,7 +151,7 @@ def test_a_malformed_limit_is_an_error(text):
     ("facts", "said"),
     [
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
-        ({"size": (321, 240), "source": "h264"}, "an even width"),
+        ({"size": (321, 240)}, "an even width"),
         ({"settings": Settings(run={"endpoint": "run"})}, "omit run.endpoint"),
     ],
 )

@@ -12,6 +12,7 @@ from catstream.loadtest import rtsp
 from catstream.loadtest.camera import Broadcast
 from catstream.video.nal_units import NalUnits
 from catstream.video.source import open_source
+from catstream.video.writer import Encoder
 
 START = b"\0\0\0\1"
 LONGEST = 100  # bytes of a fragment
@@ -63,15 +64,6 @@ def test_a_unit_has_the_time_of_its_first_fragment_and_says_whether_it_is_key():
     assert [(whole.pts, whole.is_keyframe) for whole in found] == [(0, True), (1, True), (2, True)]
 
 
-@pytest.fixture
-def pictures(rng):
-    """JPEGs that do not fit into one packet."""
-    noise = rng.integers(0, 256, (12, 160, 240, 3), np.uint8)
-    encoder = av.CodecContext.create("mjpeg", "w")
-    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = 240, 160, "yuvj420p", Fraction(1, 25)
-    return [bytes(packet) for image in noise for packet in encoder.encode(av.VideoFrame.from_ndarray(image, "bgr24"))]
-
-
 class _Patient(Broadcast):
     """Sends a frame when the one before was received."""
 
@@ -80,21 +72,23 @@ class _Patient(Broadcast):
         self.received = threading.Semaphore(1)
 
     def frames(self, _):
-        for number, access_unit in enumerate(self._files):
+        for number, access_unit in enumerate(self._units):
             self.received.acquire(timeout=20)
             yield 1 + number / 25, access_unit
 
 
 @pytest.fixture
-def access_units(pictures):
-    """One for each picture, all of them larger than a packet."""
-    return rtsp.encode(pictures, (240, 160), lambda _: None)
+def access_units(rng):
+    """H.264 access units, all of them larger than a packet."""
+    encoder = Encoder((240, 160), rate=25)
+    noise = rng.integers(0, 256, (12, 160, 240, 3), np.uint8)
+    return [bytes(packet) for image in noise for packet in encoder.packets(image)]
 
 
 def test_no_frame_over_rtsp_waits_for_the_next_one(access_units):
     assert min(map(len, access_units)) > 1400
     with (
-        _Patient(access_units, (240, 160), source="h264") as camera,
+        _Patient(access_units) as camera,
         open_source(*camera.urls, read_timeout_seconds=15) as source,
     ):
         seen = []
@@ -109,7 +103,7 @@ def test_no_frame_over_rtsp_waits_for_the_next_one(access_units):
 def test_a_camera_whose_fragments_have_several_lengths_is_read_with_the_parser(access_units, monkeypatch):
     monkeypatch.setattr(rtsp, "payloads", shrinking)
     with (
-        Broadcast(access_units, (240, 160), source="h264") as camera,
+        Broadcast(access_units) as camera,
         open_source(*camera.urls) as source,
     ):
         assert next(source).image.shape == (160, 240, 3)
