@@ -63,11 +63,7 @@ def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(s
     ("arguments", "message"),
     [
         (["--size", "640"], "a size is WIDTHxHEIGHT"),
-        (["--size", "20x20"], "for example 640x480"),
-        (["--subscribers", 1, "--slow-subscribers", 2], "more slow subscribers (2) than subscribers (1)"),
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
-        (["--rate", 0], "0.5<=x<=1000"),
-        (["--json", "missing/x.json"], "pass a file in an existing folder"),
         (["--output", "/dev/null/load"], "use another folder"),
         (["--set", "run.lockstep=true"], "omit run.lockstep"),
     ],
