@@ -1,7 +1,7 @@
 """Boxes and windows: axis-aligned rectangles in pixels, `x, y, w, h`.
 
 A `Box` is what is reported: tight around the object, as the benchmarks write it. A `Window` is what is cut from the
-frame, searched and learned from: the box with some of its surroundings, `context` times as wide and high. They are two
+frame, searched and learned from: the box with some of its surroundings, 1.25 times as wide and high. They are two
 types, so that mypy finds where one stands for the other. `Window.around` and `Window.box` convert.
 """
 
@@ -20,6 +20,8 @@ from catstream.errors import BoxError
 #: Numbers of a rectangle in a message; one that is made here is not checked.
 _Coordinate = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 _Side = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
+
+_CONTEXT = 1.25  # width of a window in widths of its box: with its outline, an object is located better than with 1
 
 
 class _Rectangle(NamedTuple):
@@ -172,20 +174,20 @@ class Window(_Rectangle):
 
     Examples
     --------
-    >>> window = Window.around(Box(10, 20, 40, 80), context=1.25)
+    >>> window = Window.around(Box(10, 20, 40, 80))
     >>> window
     Window(x=5.0, y=10.0, w=50.0, h=100.0)
-    >>> window.box(context=1.25)
+    >>> window.box()
     Box(x=10.0, y=20.0, w=40.0, h=80.0)
     """
 
     __slots__ = ()
 
     @classmethod
-    def around(cls, box: Box, context: float) -> Self:
-        """The window of a box, `context` times as wide and high, with the same centre."""
-        return cls(*box).scaled(context)
+    def around(cls, box: Box) -> Self:
+        """The window of a box, 1.25 times as wide and high, with the same centre."""
+        return cls(*box).scaled(_CONTEXT)
 
-    def box(self, context: float) -> Box:
+    def box(self) -> Box:
         """The box of a window: the inverse of `around`."""
-        return Box(*self.scaled(1 / context))
+        return Box(*self.scaled(1 / _CONTEXT))

@@ -133,8 +133,6 @@ class RunSettings(_Group):
                           that starts slowly.
     read_timeout_seconds  Time without a frame after which a camera or a stream reconnects. Raise it if the camera sends
                           a frame less often.
-    poll_seconds          Time between two requests of a still picture at an http:// address. Set it to the rate at
-                          which the camera updates its picture.
     hwaccel               Hardware decoder of video, by FFmpeg's name, for example cuda or qsv (empty: none). Set it if
                           decoding takes a large part of the processor time.
     skip_damaged          Skip damaged parts of a video file. Turn it on if a run ends with an error at such a part.
@@ -157,7 +155,6 @@ class RunSettings(_Group):
     image_rate: float = _setting(25.0, ge=1e-9, le=1000)
     open_timeout_seconds: float = _setting(10.0, ge=0.1, le=3600, resumable=True)
     read_timeout_seconds: float = _setting(5.0, ge=0.1, le=3600, resumable=True)
-    poll_seconds: float = _setting(1.0, ge=0.01, le=3600, resumable=True)
     hwaccel: str = _setting("")
     skip_damaged: bool = _setting(False)
     resize: bool = _setting(False)
@@ -173,17 +170,12 @@ class CoresetSettings(_Group):
     size             n in the paper: rows of a node of a coreset tree. Raise it for an object with many appearances;
                      time and memory grow with it.
     share            n as a share of the video's frames, as in the paper (0: coreset.size is used).
-    reduction        Reduction of rows: the coreset tree of the paper (svd), or one sketch of n rows
-                     (frequent-directions). Change it for constant memory.
-    sample_interval  Frames between two samples on which a model is trained; fewer while the trees are small.
     """
 
     group = "coreset"
 
     size: int = _setting(64, ge=2, le=4096)
     share: float = _setting(0.0, ge=0, le=0.5, expert=True)
-    reduction: Literal["svd", "frequent-directions"] = _setting("svd")
-    sample_interval: int = _setting(8, ge=1, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,22 +184,18 @@ class SearchSettings(_Group):
 
     mode           Search near the predicted position, and in the whole frame if the score is low (local); or always in
                    the whole frame, as in the paper (full).
-    context        Size of the window as a multiple of the object's box.
     area           Side of the local search area as a multiple of the window's. Raise it for fast objects; time grows
                    with its square.
     full_interval  Frames between two searches of the whole frame while the local score is between belief.weak_score and
                    belief.confident_score, or the object is not trusted. Lower it for objects that jump, raise it to
                    save time.
-    motion_frames  Frames in a block of centres from which EM learns the parameters of the Kalman filter.
     """
 
     group = "search"
 
     mode: Literal["local", "full"] = _setting("local", expert=True)
-    context: float = _setting(1.25, ge=1, le=4, expert=True)
     area: float = _setting(2.5, ge=1.5, le=6)
     full_interval: int = _setting(10, ge=1)
-    motion_frames: int = _setting(64, ge=8, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,8 +208,6 @@ class BeliefSettings(_Group):
                         size. Raise it if a lost object returns at the wrong position.
     trusted_score       Score from which an object that was redetected elsewhere is used for training again. Raise it if
                         the model learns similar objects.
-    redetection_margin  Difference of score by which a window elsewhere in the frame must exceed the local one.
-    min_similarity      Minimum similarity to the object of a saved model of its first detection.
     """
 
     group = "belief"
@@ -229,8 +215,6 @@ class BeliefSettings(_Group):
     weak_score: float = _setting(0.4)
     confident_score: float = _setting(0.45)
     trusted_score: float = _setting(0.75)
-    redetection_margin: float = _setting(0.4, expert=True)
-    min_similarity: float = _setting(0.5, expert=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,9 +229,8 @@ class TrainingSettings(_Group):
                        colour.
     copies             Affine copies of the object in each frame (paper: 4 for n = 5 % of the video). Raise it for an
                        object that rotates or is seen in few frames.
-    mirrored_copies    Number of these copies that are flipped left to right.
-    other_backgrounds  Share of the first frame's affine copies that are put on another background.
-    near_misses        Windows beside the object in each frame, with a label between 0 and 1.
+    augment            Flip a copy in each frame left to right, and put most copies of the first frame on another
+                       background. Turn it off if the object never turns or its background never changes.
     hard_negatives     Background windows with the highest scores, from a search of the whole frame. Raise it if the
                        tracker switches to similar objects.
     interval           Train on one of this number of frames whose score is high (1: on all). Raise it for speed, lower
@@ -260,9 +243,7 @@ class TrainingSettings(_Group):
     classifier: Literal["joint", "least-squares", "one-class"] = _setting("joint", expert=True)
     colours: bool = _setting(True)
     copies: int = _setting(3, ge=0, le=64)
-    mirrored_copies: int = _setting(1, ge=0, expert=True)
-    other_backgrounds: float = _setting(0.9, ge=0, le=1, expert=True)
-    near_misses: int = _setting(6, ge=0, le=256, expert=True)
+    augment: bool = _setting(True)
     hard_negatives: int = _setting(10, ge=0)
     interval: int = _setting(2, ge=1, le=1024)
 
@@ -273,17 +254,14 @@ class ExtentSettings(_Group):
 
     size_count    Sizes that a search may try, an odd number. Raise it for an object that changes its size quickly; 1
                   keeps the size.
-    aspect_count  Aspect ratios that a search may try, an odd number (1: it never changes).
-    prior         Weight of (log f)^2, for a size or aspect ratio of f times that of the initial box.
-    weight        Weight of the extent head beside the appearance score (0: size and aspect heads are off, too).
+    learned     Learn the size and the aspect ratio from windows of wrong ones, and prefer those of the initial box.
+                Turn it off for more speed if the object keeps its shape.
     """
 
     group = "extent"
 
     size_count: int = _setting(7, ge=1, le=15)
-    aspect_count: int = _setting(5, ge=1, le=15, expert=True)
-    prior: float = _setting(0.5, ge=0, expert=True)
-    weight: float = _setting(1.0, ge=0, expert=True)
+    learned: bool = _setting(True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -475,11 +453,9 @@ _PAPER: dict[str, Value] = {
     "training.classifier": "one-class",
     "search.mode": "full",
     "training.bootstrap": "scm",
-    "extent.weight": 0.0,
-    "extent.prior": 0.0,
+    "extent.learned": False,
     "training.colours": False,
-    "training.other_backgrounds": 0.0,
-    "training.mirrored_copies": 0,
+    "training.augment": False,
     "training.interval": 1,
     "belief.weak_score": 0.3,
     "belief.trusted_score": 0.0,

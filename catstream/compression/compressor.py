@@ -15,11 +15,16 @@ import numpy as np
 from catstream.base.arrays import Bool, Float32
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.compression.tree import REDUCTIONS, CoresetTree, pack_trees, unpack_trees
+from catstream.compression.tree import CoresetTree, pack_trees, unpack_trees
 from catstream.errors import SettingsError
 from catstream.messages.heads import APPEARANCE, TREES, Tree
 from catstream.messages.kinds import DetectorState, ObjectFeatures, Sample, TrainingRows
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
+
+#: Frames between two samples on which a model is trained, fewer while the trees are small; 5 track no better.
+SAMPLE_INTERVAL = 8
+#: Frames in a block of centres from which EM learns the parameters of the Kalman filter: enough for its covariances.
+MOTION_FRAMES = 64
 
 _RIGHT = 0.5  # label of a window that is neither too large nor too small, too wide or too high
 _GROWTH = 9 / 8  # factor of the number of leaves from which a sample is due before its interval is over
@@ -45,7 +50,7 @@ class Compressor:
                 "call Settings.for_length first, or set coreset.size"
             )
         self.settings, self.name = settings, name
-        self.trees = {name: REDUCTIONS[settings.coreset.reduction](settings.coreset.size) for name in TREES}
+        self.trees = {name: CoresetTree(settings.coreset.size) for name in TREES}
         self.began, self.frame = 0, -1
         self.box: Box | None = None
         self.detector: DetectorState | None = None
@@ -177,7 +182,7 @@ class Compressor:
     def _follow(self, box: Box | None) -> None:
         """Append the centre of a box. Samples contain complete blocks, so that motion is trained once per block."""
         self._path.append(box.centre if box else (np.nan, np.nan))
-        if len(self._path) == self.settings.search.motion_frames:
+        if len(self._path) == MOTION_FRAMES:
             self.centres = np.array(self._path)
             self._path = []
 
@@ -187,7 +192,7 @@ class Compressor:
             return False
         leaves = self.leaves
         last_frame = self.last_sample.frame if self.last_sample is not None else math.inf
-        is_interval_over = self.frame - last_frame >= self.settings.coreset.sample_interval
+        is_interval_over = self.frame - last_frame >= SAMPLE_INTERVAL
         return leaves > self._sampled_leaves and (is_interval_over or leaves >= _GROWTH * self._sampled_leaves)
 
 

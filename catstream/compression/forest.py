@@ -158,11 +158,6 @@ class Forest:
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError, msgspec.DecodeError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
         trees = [tree for compressor in self.compressors.values() for tree in compressor.trees.values()]
-        if others := {tree.reduction for tree in trees} - {settings.coreset.reduction}:
-            raise SettingsError(
-                f"{path} holds trees of coreset.reduction={max(others)}, the settings say "
-                f"{settings.coreset.reduction}: continue with the same settings"
-            )
         if sizes := {tree.size for tree in trees} - {settings.coreset.size}:
             raise SettingsError(
                 f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "

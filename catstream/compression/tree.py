@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import nullcontext
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -36,17 +36,11 @@ class CoresetTree:
     ----------
     size : number of rows of a node, n in the paper
 
-    Attributes
-    ----------
-    reduction : name of this kind of tree in the setting `coreset.reduction`
-
     >>> tree = CoresetTree(size=4)
     >>> tree.insert(np.eye(13, 5, dtype=np.float32))
     >>> [node.level for node in tree.nodes], len(tree.pending), tree.rows_seen
     ([1, 0], 1, 13)
     """
-
-    reduction: ClassVar[str] = "svd"
 
     def __init__(self, size: int) -> None:
         if size < 1:
@@ -136,10 +130,9 @@ class CoresetTree:
     @one_thread()
     def merged(self, other: CoresetTree) -> Self:
         """A new tree of both streams, with the bound of one tree into which all rows were inserted."""
-        if other.reduction != self.reduction:
+        if type(other) is not type(self):
             raise ProtocolError(
-                f"a tree of coreset.reduction={self.reduction} cannot merge one of {other.reduction}: "
-                f"build both as {type(self).__name__}"
+                f"a {type(self).__name__} cannot merge a {type(other).__name__}: build both as {type(self).__name__}"
             )
         if other.size != self.size:
             raise ProtocolError(
@@ -182,13 +175,13 @@ class CoresetTree:
             arrays[f"rows.{i}"] = node.rows
             arrays[f"sum.{i}"] = node.sum
         nodes = [{"level": node.level, "count": node.count, "energy": node.energy.hex()} for node in self.nodes]
-        return arrays, {"reduction": self.reduction, "size": self.size, "nodes": nodes}
+        return arrays, {"size": self.size, "nodes": nodes}
 
-    @staticmethod
-    def from_state(arrays: Arrays, metadata: Metadata) -> CoresetTree:
-        """Restore a tree, of its own class, from its `state`; ProtocolError if it is something else."""
+    @classmethod
+    def from_state(cls, arrays: Arrays, metadata: Metadata) -> Self:
+        """Restore a tree of this class from its `state`; ProtocolError if it is something else."""
         try:
-            tree = REDUCTIONS[metadata["reduction"]](int(metadata["size"]))
+            tree = cls(int(metadata["size"]))
             for i, node in enumerate(metadata["nodes"]):
                 level, count, energy = int(node["level"]), int(node["count"]), float.fromhex(node["energy"])
                 tree.nodes.append(Node(level, arrays[f"rows.{i}"], count, arrays[f"sum.{i}"], energy))
@@ -266,8 +259,6 @@ class FrequentDirections(CoresetTree):
     ([12], 1, 13)
     """
 
-    reduction = "frequent-directions"
-
     def _to_merge(self, *_: Node) -> bool:
         return True
 
@@ -279,10 +270,6 @@ class FrequentDirections(CoresetTree):
     def _is_count(self, count: int, level: int) -> bool:
         leaves, rest = divmod(count, self.size)
         return not rest and leaves.bit_length() == level + 1
-
-
-#: The class of a tree, by the value of the setting `coreset.reduction`.
-REDUCTIONS: dict[str, type[CoresetTree]] = {kind.reduction: kind for kind in (CoresetTree, FrequentDirections)}
 
 
 def pack_trees(trees: Mapping[str, CoresetTree]) -> tuple[Arrays, Metadata]:

@@ -63,7 +63,7 @@ class Detector:
     @property
     def box(self) -> Box | None:
         """The last box of the object, in pixels; None before the first frame."""
-        return self.state.window.box(self.settings.search.context) if self.state else None
+        return self.state.window.box() if self.state else None
 
     def init(
         self, frame: Pyramid, seq: int, time: float, box: Box, together: Mapping[str, int] = MappingProxyType({})
@@ -77,7 +77,7 @@ class Detector:
         """
         scm = None
         box = Box(*map(float, box)).validated(*frame.size)
-        window = Window.around(box, self.settings.search.context)
+        window = Window.around(box)
         seed = (self.settings.run.seed, seq - 1)
         if self.settings.training.bootstrap == "scm":
             from catstream.paper.scm import SparseCollaborativeModel  # compiles a kernel of its own
@@ -101,7 +101,7 @@ class Detector:
                 f"the model has {len(model.weights)} weights, the features of a window are {ROW_LENGTH}: "
                 "train it again with this version of catstream"
             )
-        window = Window.around(box, self.settings.search.context)
+        window = Window.around(box)
         self.state = DetectorState(frame, "lost", window, window, None)
         self.model, self.similarity, self._scm = replace(model, began=frame), similarity, None
         self.newest_version = max(self.newest_version, model.version)
@@ -110,7 +110,7 @@ class Detector:
         """Search the object in the next frame. The state then has the predicted window."""
         if self._scm is not None:
             score, box = self._scm.follow(frame.image)
-            return Detection(score, Window.around(box, self.settings.search.context).with_centre_in(*frame.size))
+            return Detection(score, Window.around(box).with_centre_in(*frame.size))
         self.state, detection = search_step(self._context(frame, seq), self._current_state())
         return detection
 
@@ -155,7 +155,7 @@ class Detector:
         BoxError if there is no object yet, or as `init` does.
         """
         state = self._current_state()
-        window = Window.around(Box(*map(float, box)).validated(*frame.size), self.settings.search.context)
+        window = Window.around(Box(*map(float, box)).validated(*frame.size))
         self.state = belief.update_motion(
             replace(
                 belief.predict_window(state),
@@ -197,7 +197,7 @@ class Detector:
         """The track and the features of a frame; no box is reported if the level of belief forbids it."""
         state, version = self._current_state(), self.model.version
         reported = _policy(state, self.settings).report
-        box = state.window.box(self.settings.search.context) if reported else None
+        box = state.window.box() if reported else None
         label: State = "absent" if not reported else "present" if version else "bootstrapping"
         began = state.first_frame
         doubtful = state.level in ("weak", "redetected")

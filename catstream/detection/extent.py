@@ -19,6 +19,10 @@ _SIZE_STEP, _ASPECT_STEP = 0.04, 0.08  # relative change from one size or aspect
 #: The same as a difference of logarithms.
 SIZE_CHANGE, ASPECT_CHANGE = math.log(1 + _SIZE_STEP), math.log(1 + _ASPECT_STEP)
 
+#: Steps of aspect ratio, either way, that a search may try: it changes slowly, and a fifth of a change is applied.
+ASPECT_STEPS = 2
+_PRIOR = 0.5  # weight of (log f)^2, for a size or an aspect ratio of f times the first one; 0.3 tracks worse
+
 _SIZE_RATE, _ASPECT_RATE = 0.7, 0.2  # share of a change, as a logarithm, that is applied in one frame
 _PENALTY = 0.3  # weight of |log f|, for a change by the factor f
 _LABEL_STEPS = 16  # steps between the labels 0 and 1 of the size and the aspect head
@@ -51,11 +55,11 @@ def smooth(before: Window, window: Window, *, resize: bool) -> Window:
 
 
 def trials(window: Window, settings: ExtentSettings) -> list[list[Trial]]:
-    """Windows of wrong sizes, then windows of wrong aspect ratios; only of what is searched, none if `weight` is 0."""
-    if not settings.weight:
+    """Windows of wrong sizes, then of wrong aspect ratios; only of what is searched, none unless they are learned."""
+    if not settings.learned:
         return []
-    sizes = [Trial(window.scaled(size(k)), larger=k) for k in _steps(settings.size_count)]
-    aspects = [Trial(window.scaled(*stretch(k)), wider=k) for k in _steps(settings.aspect_count)]
+    sizes = [Trial(window.scaled(size(k)), larger=k) for k in _steps(settings.size_count // 2)]
+    aspects = [Trial(window.scaled(*stretch(k)), wider=k) for k in _steps(ASPECT_STEPS)]
     return [kind for kind in (sizes, aspects) if kind]
 
 
@@ -83,9 +87,14 @@ def cost(change: float, deviation: float = 0.0, prior: float = 0.0) -> float:
     return _PENALTY * abs(change) + prior * (change + deviation) ** 2
 
 
-def _steps(count: int) -> list[int]:
-    """The steps of `count` sizes or aspect ratios, smallest or narrowest first, without 0."""
-    return [k for k in range(-(count // 2), count // 2 + 1) if k]
+def prior(settings: ExtentSettings) -> float:
+    """Weight of the squared logarithm of the size, or the aspect ratio, relative to the first window."""
+    return _PRIOR if settings.learned else 0.0
+
+
+def _steps(most: int) -> list[int]:
+    """The steps of sizes or aspect ratios up to `most` either way, smallest or narrowest first, without 0."""
+    return [k for k in range(-most, most + 1) if k]
 
 
 def size(step: float) -> float:

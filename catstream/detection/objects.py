@@ -73,9 +73,7 @@ class Detectors:
         return {
             other: state.first_frame
             for other, state in states.items()
-            if state is not None
-            and state.level != "lost"
-            and _overlap(box, state.window.box(self.settings.search.context))
+            if state is not None and state.level != "lost" and _overlap(box, state.window.box())
         }
 
     def _catch_up(self, detector: Detector, result: Result, time: float, later: Iterable[Pyramid]) -> Result:
@@ -121,10 +119,10 @@ class Detectors:
         detectors = {name: detector for name, detector in self.detectors.items() if name not in results}
         before = {name: detector.state for name, detector in self.detectors.items() if detector.state is not None}
         for name in detectors.keys() & before.keys():
-            detectors[name].state = _without_separated(before[name], before, self.settings.search.context)
+            detectors[name].state = _without_separated(before[name], before)
         detections = {name: detector.search(frame, self.seq) for name, detector in detectors.items()}
         states = {name: detector.state for name, detector in detectors.items() if detector.state is not None}
-        detections = assign(detections, states, self.settings.search.context)
+        detections = assign(detections, states)
         for name, detector in detectors.items():
             results[name] = detector.update(detections[name], frame, self.seq, time)
         names = [*self.detectors, *(name for name in results if name not in self.detectors)]
@@ -144,14 +142,12 @@ class Detectors:
             detector.adopt(model)
 
 
-def assign(
-    detections: Mapping[str, Detection], states: Mapping[str, DetectorState], context: float
-) -> dict[str, Detection]:
+def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorState]) -> dict[str, Detection]:
     """Resolve conflicts: give a position to one object, to the one whose score would fall most without it.
 
     An object that loses its position gets the best other window near it; its score is 0 if there is none. Objects that
     are `together` may be at the same position, and an object that is still sought occupies none. Without a conflict, a
-    detection is unchanged. The windows are `context` times as large as the boxes of the objects.
+    detection is unchanged.
 
     An object is uncertain if it was not "confident" in the last frame, or is redetected. Most likely it is absent or
     occluded, and a part of another object resembles it. So it also loses a position of which more than a third is in
@@ -159,7 +155,7 @@ def assign(
     one only if the score of that is clearly higher.
     """
     names = [name for name, state in states.items() if not state.is_sought]
-    boxes = {name: detections[name].window.box(context) for name in names}
+    boxes = {name: detections[name].window.box() for name in names}
     scores = {name: detections[name].score for name in names}
     uncertain = {name for name in names if states[name].level != "confident" or detections[name].redetected}
     certain = {  # and not clearly outscored at its position
@@ -188,7 +184,7 @@ def assign(
 
     def elsewhere(name: str, positions: Mapping[str, Box]) -> Detection:
         occupied = [positions[other] for other in exclusive[name] if other in positions]
-        return _best_elsewhere(detections[name], occupied, context, name in uncertain)
+        return _best_elsewhere(detections[name], occupied, name in uncertain)
 
     conflicts = [name for name in names if in_conflict(name, boxes)]
     loss = {name: scores[name] - elsewhere(name, boxes).score for name in conflicts}
@@ -199,7 +195,7 @@ def assign(
             # Neither at an assigned position, nor at one that a later object may be assigned.
             result[name] = elsewhere(name, boxes | assigned)
         if result[name].score > 0:
-            assigned[name] = result[name].window.box(context)
+            assigned[name] = result[name].window.box()
         boxes.pop(name)
     return result
 
@@ -210,16 +206,16 @@ def _are_together(states: Mapping[str, DetectorState], name: str, other: str) ->
     return first.together.get(other) == second.first_frame or second.together.get(name) == first.first_frame
 
 
-def _without_separated(state: DetectorState, states: Mapping[str, DetectorState], context: float) -> DetectorState:
+def _without_separated(state: DetectorState, states: Mapping[str, DetectorState]) -> DetectorState:
     """The state of an object without the objects that it was together with, and that are confidently apart by now."""
     if not state.together:
         return state
-    box = state.window.box(context)
+    box = state.window.box()
     together = {
         name: first
         for name, first in state.together.items()
         if name in states
-        and (not state.level == states[name].level == "confident" or box.overlap(states[name].window.box(context)))
+        and (not state.level == states[name].level == "confident" or box.overlap(states[name].window.box()))
     }
     return replace(state, together=together)
 
@@ -234,7 +230,7 @@ def _conflict(box: Box, other: Box, uncertain: bool = False) -> bool:
     return box.overlap(other) > _SAME_POSITION or (uncertain and box.share_in(other) > _PART)
 
 
-def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, uncertain: bool) -> Detection:
+def _best_elsewhere(detection: Detection, occupied: list[Box], uncertain: bool) -> Detection:
     """The best window near a detection that is at none of the occupied positions."""
     if (around := detection.around) is not None:
         for index in np.argsort(-around.scores, axis=None, kind="stable"):
@@ -242,7 +238,7 @@ def _best_elsewhere(detection: Detection, occupied: list[Box], context: float, u
             if (score := float(around.scores[row, column])) <= 0:
                 break
             window = around.window(row, column)
-            if not any(_conflict(window.box(context), other, uncertain) for other in occupied):
+            if not any(_conflict(window.box(), other, uncertain) for other in occupied):
                 # Elsewhere in the frame, it is redetected there too: its object is not trusted.
                 return replace(detection, score=score, window=window)
     return replace(detection, score=0.0, redetected=False)

@@ -15,7 +15,7 @@ import numpy as np
 from catstream.base.box import Window
 from catstream.detection import belief, extent
 from catstream.detection.context import FrameContext
-from catstream.detection.similarity import Similarity
+from catstream.detection.similarity import MIN_SIMILARITY, Similarity
 from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Region
 from catstream.features.score_map import ScoreMap, vertex
@@ -222,7 +222,7 @@ def _search_all_sizes(
     rival_map = max(others, key=lambda part: float(part.scores.max()))
     rival_score = max(float(rival_map.scores.max()), 0.0)
     lead = best.score - rival_score
-    if best_similarity < context.settings.belief.min_similarity or lead < _MIN_LEAD:
+    if best_similarity < MIN_SIMILARITY or lead < _MIN_LEAD:
         return best, False
     rival_similarity = similarity(rival_map.cells.row(*rival_map.argmax())) if rival_score else 0.0
     return best, lead >= _LEAD_OVER_SIMILAR or rival_similarity < best_similarity / 2
@@ -236,7 +236,7 @@ def _search_near(context: FrameContext, window: Window, first: Window | None) ->
 def fit_extent(context: FrameContext, detection: Detection, first: Window | None) -> Detection:
     """Move a detection by at most a cell, to the size and then the aspect ratio with the highest value.
 
-    The value is the score, plus `extent.weight` times the value of the extent head, less the cost of the change, and
+    The value is the score, plus the value of the extent head, less the cost of the change, and
     less the cost of the error that the size head or the aspect head predicts. The prior favours the size and the aspect
     ratio of the `first` window.
     """
@@ -252,7 +252,7 @@ def _fit_size(context: FrameContext, detection: Detection, first: Window) -> Det
         scores = context.scores_around(detection.window.scaled(extent.size(step)), _FINE_SIDE)
         best = Detection(*scores.best())
         fit = _extent_value(context, scores.cells.row(1, 1), SIZE)
-        cost = extent.cost(step * extent.SIZE_CHANGE, growth, context.settings.extent.prior)
+        cost = extent.cost(step * extent.SIZE_CHANGE, growth, extent.prior(context.settings.extent))
         return best.score + fit - cost, best
 
     best, _, offset = _climb(evaluate, context.settings.extent.size_count // 2)
@@ -266,22 +266,22 @@ def _fit_aspect(context: FrameContext, detection: Detection, first: Window) -> D
     def evaluate(step: int) -> tuple[float, Detection]:
         scores = context.scores_around(window.scaled(*extent.stretch(step)), WINDOW)
         fit = _extent_value(context, scores.cells.row(0, 0), ASPECT)
-        cost = extent.cost(step * extent.ASPECT_CHANGE, widening, context.settings.extent.prior)
+        cost = extent.cost(step * extent.ASPECT_CHANGE, widening, extent.prior(context.settings.extent))
         return float(scores.scores[0, 0]) + fit - cost, detection
 
-    _, step, offset = _climb(evaluate, context.settings.extent.aspect_count // 2)
+    _, step, offset = _climb(evaluate, extent.ASPECT_STEPS)
     return replace(detection, window=window.scaled(*extent.stretch(step + offset)))
 
 
 def _extent_value(context: FrameContext, row: np.ndarray, name: str) -> float:
-    """The weighted value of the extent head, less the cost of the error that the head `name` predicts.
+    """The value of the extent head, less the cost of the error that the head `name` predicts.
 
-    It is 0 if `extent.weight` is 0, whether the model has the heads or not: a saved model may have them.
+    It is 0 if `extent.learned` is off, whether the model has the heads or not: a saved model may have them.
     """
-    model, weight = context.model, context.settings.extent.weight
-    if not weight:
+    model = context.model
+    if not context.settings.extent.learned:
         return 0.0
-    value = weight * float(row @ model.heads[EXTENT]) if EXTENT in model.heads else 0.0
+    value = float(row @ model.heads[EXTENT]) if EXTENT in model.heads else 0.0
     if name in model.heads and name in model.biases:
         value -= extent.offset_cost(row, model.heads[name], model.biases[name])
     return value

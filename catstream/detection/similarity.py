@@ -11,6 +11,9 @@ from typing import Self
 
 import numpy as np
 
+#: Minimum similarity of the first detection of a saved model's object: 87 % of such windows pass, 1 % of others.
+MIN_SIMILARITY = 0.5
+
 _DIRECTIONS = 12  # dimension of the subspace
 
 

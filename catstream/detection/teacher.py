@@ -20,7 +20,7 @@ from catstream.base.settings import Settings, TrainingSettings
 from catstream.detection import extent
 from catstream.detection.context import FrameContext
 from catstream.detection.search import due_part
-from catstream.detection.similarity import Similarity
+from catstream.detection.similarity import MIN_SIMILARITY, Similarity
 from catstream.errors import BoxError
 from catstream.features.cells import window_rows
 from catstream.features.layout import CELL, COLOURS, MARGIN, WINDOW
@@ -33,6 +33,7 @@ from catstream.numerics import ridge
 #: Training rows by group, as in `Features`; a group without rows is left out.
 Training = dict[str, TrainingRows]
 
+_NEAR_MISSES = 6  # windows beside the object in each frame; 12 gain nothing and cost time
 _NEAR = 2  # distance in cells up to which a window is a near miss, not background
 _MIN_DISTANCE = 0.9  # of a near miss, in cells: a nearer window shows the object as well as its own does
 _NEAR_SIGMA = 0.9  # standard deviation of the Gaussian label of a near miss, in cells
@@ -47,6 +48,8 @@ _MAX_OVERLAP = 0.2  # IoU of a hard negative with the object's window
 
 _PATCH = (WINDOW + 2 * MARGIN) * CELL  # side of a copy with its margin, in pixels
 _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies: a factor, a share of the box, radians
+_MIRRORED = 1  # of a frame's copies that are flipped, as an object that turns may look
+_MOVED = 0.9  # share of the first frame's copies on another background, which no model is to learn; 0.5 gains less
 _MIN_OFFSET, _MAX_OFFSET = 0.3, 1.0  # distance of another background, in windows
 _OPAQUE, _TRANSPARENT = (
     0.8,
@@ -68,8 +71,7 @@ def first_training(
     if options.bootstrap == "scm":
         rows = _appearance(frame, window, around, rng, options, hardest=0)
     else:
-        context, moved = settings.search.context, options.other_backgrounds
-        copies = affine_copies(frame, window, count, rng, context=context, moved=moved)
+        copies = affine_copies(frame, window, count, rng, moved=_moved_share(options))
         rows = _rows(copies, 1, _OBJECT_WEIGHT, options)
         rows += _surroundings(around, window, count, 0, rng, options)
     training = _first_extents(frame, window, rng, settings)
@@ -116,7 +118,7 @@ def training_of_background(context: FrameContext, window: Window, similarity: Si
     settings = context.settings
     scores = context.scores_of_frame(window)
     rows = _hardest(scores, window, settings.training.hard_negatives, settings.belief.weak_score)
-    dissimilar = rows[[similarity(row) < settings.belief.min_similarity for row in rows]]
+    dissimilar = rows[[similarity(row) < MIN_SIMILARITY for row in rows]]
     return {APPEARANCE: _rows(dissimilar, 0, 1, settings.training)} if len(dissimilar) else {}
 
 
@@ -181,7 +183,6 @@ def affine_copies(
     count: int,
     rng: np.random.Generator,
     *,
-    context: float = 1.0,
     moved: float = 0.0,
     mirrored: int = 0,
 ) -> np.ndarray:
@@ -190,7 +191,7 @@ def affine_copies(
     All copies of a frame have the same background in the corners of the window, which is not the object: the share
     `moved` of the copies is put on another background of the frame. An object that turns shows another side, which is
     often the mirror image: the last `mirrored` copies are flipped left to right. Returns float32 (count, d); the first
-    row is that of the window itself, which is `context` times as large as the object's box.
+    row is that of the window itself.
     """
     changes = rng.normal(size=(count, 4))
     if count:
@@ -199,9 +200,14 @@ def affine_copies(
     for number, (scale, right, down, turn) in enumerate(changes):
         copy = _shifted(window, right, down).scaled(math.exp(_SCALE * scale))
         offset = _random_offset(window, rng) if _is_moved(number, moved) else None
-        patch = _patch(frame, copy, _TURN * turn, copy.box(context), offset)
+        patch = _patch(frame, copy, _TURN * turn, copy.box(), offset)
         patches.append(patch[:, :, ::-1] if number >= max(count - mirrored, 1) else patch)
     return window_rows(patches)
+
+
+def _moved_share(options: TrainingSettings) -> float:
+    """The share of the first frame's copies that are put on another background."""
+    return _MOVED if options.augment else 0.0
 
 
 def _is_moved(number: int, share: float) -> bool:
@@ -262,7 +268,7 @@ def _appearance(
     hardest: int,
 ) -> TrainingRows:
     """Rows of the object, of affine copies of it, of near misses and of background, `hardest` of it by score."""
-    own = affine_copies(frame, window, 1 + options.copies, rng, mirrored=options.mirrored_copies)
+    own = affine_copies(frame, window, 1 + options.copies, rng, mirrored=_MIRRORED if options.augment else 0)
     rows = _rows(own, 1, _OBJECT_WEIGHT / len(own), options)
     return rows + _surroundings(around, window, _BACKGROUND, hardest, rng, options)
 
@@ -278,7 +284,7 @@ def _surroundings(
     is_background = np.maximum.outer(down, across) > _NEAR + 0.5
     near, far = np.flatnonzero(~is_background), np.flatnonzero(is_background)  # indices of windows, row by row
     places, labels = [], []
-    for index in near[rng.integers(len(near), size=options.near_misses)] if len(near) else ():
+    for index in near[rng.integers(len(near), size=_NEAR_MISSES)] if len(near) else ():
         place = divmod(int(index), columns)
         distance = math.hypot(down[place[0]], across[place[1]])
         if distance > _MIN_DISTANCE:
@@ -319,10 +325,10 @@ def _first_cuts(
     for number in range(math.ceil(settings.coreset.size / len(trials))):
         right, down, turn = rng.normal(size=3) if number else np.zeros(3)
         copy = _shifted(window, right, down)
-        offset = _random_offset(window, rng) if _is_moved(number, settings.training.other_backgrounds) else None
+        offset = _random_offset(window, rng) if _is_moved(number, _moved_share(settings.training)) else None
         for trial in trials:
             cut = trial.window.centred(*copy.centre)
-            yield trial, _patch(frame, cut, _TURN * turn, copy.box(settings.search.context), offset)
+            yield trial, _patch(frame, cut, _TURN * turn, copy.box(), offset)
 
 
 def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, options: TrainingSettings) -> TrainingRows:

@@ -108,14 +108,12 @@ class _Template:
 
     @classmethod
     def of(cls, saved: SavedModel) -> Self:
-        return cls(
-            saved.model, saved.similarity(), Window.around(saved.box, saved.settings.search.context), saved.settings
-        )
+        return cls(saved.model, saved.similarity(), Window.around(saved.box), saved.settings)
 
     def match(self, scores: ScoreMap, row: int, column: int, window: Window) -> Match:
         """The match of a window whose features are at (row, column) of a map of appearance scores."""
         score = min(1.0, float(scores.scores[row, column])) * self.similarity(scores.cells.row(row, column))
-        return Match(window, window.box(self.settings.search.context), score)
+        return Match(window, window.box(), score)
 
 
 class Scan:

@@ -37,7 +37,7 @@ from catstream.messages.storage import Arrays, Metadata, pack, unpack
 _KIND = "saved model 4"  # kind of file, and the version of its contents
 
 #: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
-_SAME = ("coreset.size", "coreset.reduction", "search.context", "training.colours", "training.classifier")
+_SAME = ("coreset.size", "training.colours", "training.classifier")
 
 #: Similarity of two models, below which a merge is rejected, and below which it gives a warning: see decision 54.
 _UNLIKE, _DOUBTFUL = 0.25, 0.5

@@ -97,7 +97,7 @@ class Start:
     states: dict[str, DetectorState]
 
 
-def resume_at(position: Position, after: int | None, desired: DesiredState, context: float, *, live: bool) -> Start:
+def resume_at(position: Position, after: int | None, desired: DesiredState, *, live: bool) -> Start:
     """Where a detector continues: after the last frame that both the compressor and the owner have.
 
     Frames of a live source cannot be read again: the stream continues after the last one that was learned from.
@@ -110,7 +110,6 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, cont
     ----------
     position : answer of the compressor, with the states after message `after`
     after : number of the last message that the owner of the run has, None without an owner
-    context : size of a window, in boxes of its object
     """
     after = position.processed if live or after is None else after
     seq, repeats = min(after, position.processed), max(after, position.processed)
@@ -121,7 +120,7 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, cont
     for name, item in earlier.items():
         if name not in states:
             state = None if item.model else position.states.get(name)
-            box = item.box if state is None else state.window.box(context)
+            box = item.box if state is None else state.window.box()
             desired = desired.with_object(name, replace(item, box=box, begins=seq + 1))
     return Start(seq, repeats, desired, states)
 

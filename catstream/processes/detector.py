@@ -120,7 +120,7 @@ class DetectorLoop:
             self._serve()
             if process.ending.reason:
                 return False
-        start = resume_at(position, after, commands.desired, process.settings.search.context, live=self._live)
+        start = resume_at(position, after, commands.desired, live=self._live)
         self.detectors.seq = self.lag.processed = start.seq
         self.beginnings.resume(start, models)
         self.models.early = {name: model for name, model in models.items() if name not in start.states}

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from av.container import InputContainer
 
 _IDLE_SECONDS = 0.1
+_POLL_SECONDS = 1.0  # between two requests of a still picture, which cameras update about as often
 _QUIET_SECONDS = 600.0  # between two log lines with the same reason
 _LONGEST_SEGMENT, _LONGEST_PLAYLIST = 20.0, 60.0  # seconds; of a segment, HLS recommends 6
 _SLOW = "check the camera; if it is slow, raise run.open_timeout_seconds or run.read_timeout_seconds"
@@ -105,7 +106,7 @@ class LiveSource(Source):
         reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected."""
         silent = monotonic() - self._last_frame_time
         # FFmpeg has no timeout for a device that hangs, so a long silence counts as a loss, too.
-        limits = self._settings.open_timeout_seconds, self._settings.read_timeout_seconds, self._settings.poll_seconds
+        limits = self._settings.open_timeout_seconds, self._settings.read_timeout_seconds, _POLL_SECONDS
         lost = silent if self._problem or silent > sum(limits) else 0.0
         return {"skipped": self.skipped, "reconnects": self.reconnects, "lost_seconds": lost}
 
@@ -169,7 +170,7 @@ class LiveSource(Source):
                 continue
             with self._condition:
                 if attempt.begin == "poll":
-                    wait = begin + self._settings.poll_seconds - monotonic()
+                    wait = begin + _POLL_SECONDS - monotonic()
                 else:
                     wait = attempt.backoff * random.uniform(0.5, 1)
                     self._report_loss(loss.reason)

@@ -59,7 +59,7 @@ WAYS = {
         ("run.lockstep", 7, "bool"),
         ("training.classifier", "wrong", "joint | least-squares | one-class"),
         ("training.classifier", "\udcff", "joint | least-squares | one-class"),
-        ("training.near_misses", 257, "int >= 0, <= 256"),
+        ("training.copies", 65, "int >= 0, <= 64"),
     ],
 )
 def test_an_invalid_value_is_rejected_with_the_values_that_the_setting_accepts(way, name, value, takes):
@@ -115,11 +115,11 @@ def test_a_program_gives_values_of_their_type(value):
 
 
 def test_a_number_of_any_kind_is_stored_as_one_of_python():
-    settings = Settings(coreset={"size": np.int64(32)}, search={"area": np.float32(2.5), "context": 2})
+    settings = Settings(coreset={"size": np.int64(32)}, search={"area": np.float32(2.5), "full_interval": 2})
     assert Settings(run={"lockstep": np.True_}).run.lockstep is True
-    numbers = settings.coreset.size, settings.search.area, settings.search.context
-    assert [type(number) for number in numbers] == [int, float, float]
-    assert settings == Settings(coreset={"size": 32}, search={"area": 2.5, "context": 2.0})
+    numbers = settings.coreset.size, settings.search.area, settings.search.full_interval
+    assert [type(number) for number in numbers] == [int, float, int]
+    assert settings == Settings(coreset={"size": 32}, search={"area": 2.5, "full_interval": 2})
 
 
 def test_groups_may_be_written_in_one_way_or_the_other():

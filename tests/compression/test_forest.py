@@ -10,9 +10,10 @@ from numpy.testing import assert_allclose, assert_equal
 
 from catstream.base.box import Box, Window
 from catstream.base.settings import Settings
+from catstream.compression import compressor
 from catstream.compression.checkpoint_store import CheckpointStore
 from catstream.compression.forest import Forest
-from catstream.compression.tree import REDUCTIONS, CoresetTree
+from catstream.compression.tree import CoresetTree
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
 from catstream.messages.heads import APPEARANCE, EXTENT, TREES
@@ -25,10 +26,11 @@ WIDTH = 20
 OFFSETS = np.array([[0.5, 0.5], [0.25, 0.5], [0.5, 0.75]], np.float32)
 
 
-@pytest.fixture(params=REDUCTIONS)
-def settings(request: pytest.FixtureRequest) -> Settings:
-    coreset = {"size": 8, "sample_interval": 4, "reduction": request.param}
-    return Settings(coreset=coreset, search={"motion_frames": 10})
+@pytest.fixture
+def settings(monkeypatch: pytest.MonkeyPatch) -> Settings:
+    monkeypatch.setattr(compressor, "SAMPLE_INTERVAL", 4)
+    monkeypatch.setattr(compressor, "MOTION_FRAMES", 10)
+    return Settings(coreset={"size": 8})
 
 
 @pytest.fixture
@@ -136,8 +138,8 @@ def test_versions_count_up_and_samples_keep_their_distance(settings, messages):
     samples = take(Forest(settings), messages, 400)
     assert [sample.version for sample in samples] == list(range(1, len(samples) + 1))
     apart = np.diff([sample.frame for sample in samples])
-    assert apart[0] < settings.coreset.sample_interval, "sooner while the trees are small"
-    assert (apart[len(apart) // 2 :] >= settings.coreset.sample_interval).all()
+    assert apart[0] < compressor.SAMPLE_INTERVAL, "sooner while the trees are small"
+    assert (apart[len(apart) // 2 :] >= compressor.SAMPLE_INTERVAL).all()
 
 
 def test_a_sample_is_made_only_if_a_leaf_is_new(settings, messages):
@@ -151,10 +153,10 @@ def test_a_sample_is_made_only_if_a_leaf_is_new(settings, messages):
 def test_centres_are_sent_in_whole_blocks_with_nan_for_absent_objects(settings, messages):
     samples = take(Forest(settings), messages, 60)
     for sample in samples:
-        blocks = (sample.frame + 1) // settings.search.motion_frames
-        assert sample.centres.shape == ((settings.search.motion_frames if blocks else 0), 2)
+        blocks = (sample.frame + 1) // compressor.MOTION_FRAMES
+        assert sample.centres.shape == ((compressor.MOTION_FRAMES if blocks else 0), 2)
         for offset, centre in enumerate(sample.centres):
-            frame = (blocks - 1) * settings.search.motion_frames + offset
+            frame = (blocks - 1) * compressor.MOTION_FRAMES + offset
             assert_allclose(centre, (frame + 10, 25) if frame % 5 else (np.nan, np.nan))
 
 
@@ -231,17 +233,12 @@ def test_a_file_of_another_kind_or_version_is_rejected_with_one_line(settings, k
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [("size", "same settings"), ("reduction", r"holds trees of coreset.reduction=.*same settings")],
-)
-def test_a_state_of_other_trees_is_rejected_and_not_reported_as_damage(settings, messages, other, message, tmp_path):
+def test_a_state_of_trees_of_another_size_is_rejected_and_not_reported_as_damage(settings, messages, tmp_path):
     store, forest = CheckpointStore(tmp_path), Forest(settings)
     take(forest, messages, 37)
     store.save(forest)
-    (reduction,) = REDUCTIONS.keys() - {settings.coreset.reduction}
-    with pytest.raises(SettingsError, match=message):
-        store.load(settings.replace({f"coreset.{other}": {"size": 16, "reduction": reduction}[other]}))
+    with pytest.raises(SettingsError, match="same settings"):
+        store.load(settings.replace({"coreset.size": 16}))
     assert not store.trouble
 
 

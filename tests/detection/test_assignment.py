@@ -18,11 +18,9 @@ from catstream.features.pyramid import Pyramid
 from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import DetectorState, Model
 
-CONTEXT = 1.25
-
 
 def state(x, first_frame=0):
-    window = Window.around(Box(x, 50, 40, 40), CONTEXT)
+    window = Window.around(Box(x, 50, 40, 40))
     return DetectorState(first_frame, "confident", window, window, window)
 
 
@@ -32,20 +30,20 @@ APART = {"anna": state(20), "ben": state(200)}
 
 
 def detection(score, x, around=None):
-    return Detection(score, Window.around(Box(x, 50, 40, 40), CONTEXT), around)
+    return Detection(score, Window.around(Box(x, 50, 40, 40)), around)
 
 
 def test_detections_at_different_places_stay_the_same():
     detections = {"anna": detection(0.9, 100), "ben": detection(0.8, 120)}
-    assert assign(detections, APART, CONTEXT) == detections
-    assert assign({}, {}, CONTEXT) == {}
+    assert assign(detections, APART) == detections
+    assert assign({}, {}) == {}
 
 
 @pytest.mark.parametrize("order", [("anna", "ben"), ("ben", "anna")])
 def test_of_two_objects_at_one_place_the_one_with_the_higher_score_keeps_it(order):
     both = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     detections = {name: both[name] for name in order}
-    result = assign(detections, APART, CONTEXT)
+    result = assign(detections, APART)
     assert result["anna"] is detections["anna"]
     assert result["ben"].score == 0
     assert list(result) == list(order)
@@ -56,7 +54,7 @@ def test_of_three_objects_in_a_row_two_that_are_apart_keep_their_places():
     states = {name: state(100 * i) for i, name in enumerate(("left", "right", "middle"))}
     for middle, kept in ((0.7, {"left", "right"}), (0.95, {"middle"})):
         detections = {"left": detection(0.9, 100), "right": detection(0.8, 124), "middle": detection(middle, 112)}
-        result = assign(detections, states, CONTEXT)
+        result = assign(detections, states)
         assert {name for name, each in result.items() if each.score > 0} == kept
 
 
@@ -71,8 +69,8 @@ def test_no_two_objects_ever_have_one_place(objects, random):
 
     detections = {str(i): detection(score, x, around(x)) for i, (score, x, _) in enumerate(objects)}
     states = {str(i): replace(state(100 * i), level=level) for i, (_, _, level) in enumerate(objects)}
-    result = assign(detections, states, CONTEXT)
-    boxes = [each.window.box(CONTEXT) for each in result.values() if each.score > 0]
+    result = assign(detections, states)
+    boxes = [each.window.box() for each in result.values() if each.score > 0]
     assert boxes
     assert all(one.overlap(other) <= 0.5 for one, other in combinations(boxes, 2))
 
@@ -80,10 +78,10 @@ def test_no_two_objects_ever_have_one_place(objects, random):
 def test_objects_that_are_together_may_stay_at_one_place():
     detections = {"anna": detection(0.9, 100), "ben": detection(0.8, 104)}
     later = state(110, first_frame=7)
-    assert assign(detections, APART | {"ben": replace(later, together={"anna": 0})}, CONTEXT) == detections
-    assert assign(detections, APART | {"ben": later}, CONTEXT)["ben"].score == 0
+    assert assign(detections, APART | {"ben": replace(later, together={"anna": 0})}) == detections
+    assert assign(detections, APART | {"ben": later})["ben"].score == 0
     of_another_anna = replace(later, together={"anna": 3})
-    assert assign(detections, APART | {"ben": of_another_anna}, CONTEXT)["ben"].score == 0
+    assert assign(detections, APART | {"ben": of_another_anna})["ben"].score == 0
 
 
 @pytest.mark.parametrize(("side", "score"), [(40, 0.7), (40, 0.9), (15, 0.9)])
@@ -92,9 +90,9 @@ def test_objects_that_are_together_may_stay_at_one_place():
     [("confident", False, True), ("confident", True, False), *[(level, False, False) for level in UNCERTAIN]],
 )
 def test_an_uncertain_object_gets_no_part_of_the_place_of_another(side, score, level, redetected, kept):
-    part = Window.around(Box(122, 60, side, side), CONTEXT)
+    part = Window.around(Box(122, 60, side, side))
     detections = {"anna": detection(0.8, 100), "ben": Detection(score, part, redetected=redetected)}
-    result = assign(detections, APART | {"ben": replace(APART["ben"], level=level)}, CONTEXT)
+    result = assign(detections, APART | {"ben": replace(APART["ben"], level=level)})
     assert result["anna"] is detections["anna"]
     assert (result["ben"].score > 0) is kept
 
@@ -109,19 +107,19 @@ def test_an_uncertain_object_displaces_a_certain_one_only_with_a_clearly_higher_
         return ScoreMap(None, scores, (x - 25.0, 45.0), (5.0, 5.0))
 
     detections = {"anna": detection(0.7, 100, around(100, 0.65)), "ben": detection(score, 104, around(104, 0.1))}
-    result = assign(detections, APART | {"ben": replace(APART["ben"], level="redetected")}, CONTEXT)
+    result = assign(detections, APART | {"ben": replace(APART["ben"], level="redetected")})
     assert result[winner] is detections[winner]
     assert [name for name in detections if result[name] is detections[name]] == [winner]
 
 
 def test_an_object_that_loses_its_place_takes_the_best_other_window_near_it(rng):
     frame = Pyramid(rng.integers(0, 256, (200, 300, 3), np.uint8))
-    window = Window.around(Box(100, 50, 40, 40), CONTEXT)
+    window = Window.around(Box(100, 50, 40, 40))
     row = ScoreMap.around(frame, window, WINDOW, None).cells.row(0, 0)
     detection_of_ben = local_search(FrameContext(frame, Model(1, 0, row, 0.0), Settings()), window)
     detection_of_ben = replace(detection_of_ben, redetected=True)
-    result = assign({"anna": Detection(1e9, detection_of_ben.window), "ben": detection_of_ben}, APART, CONTEXT)["ben"]
+    result = assign({"anna": Detection(1e9, detection_of_ben.window), "ben": detection_of_ben}, APART)["ben"]
     assert 0 < result.score < detection_of_ben.score
-    assert result.window.box(CONTEXT).overlap(detection_of_ben.window.box(CONTEXT)) <= 0.5
+    assert result.window.box().overlap(detection_of_ben.window.box()) <= 0.5
     assert result.around is detection_of_ben.around
     assert result.redetected, "it is elsewhere in the frame, so its object is not trusted"

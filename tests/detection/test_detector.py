@@ -10,7 +10,7 @@ from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.detection.detector import Detector
 from catstream.detection.objects import Detectors
-from catstream.detection.similarity import Similarity
+from catstream.detection.similarity import MIN_SIMILARITY, Similarity
 from catstream.errors import BoxError, ProtocolError
 from catstream.features.layout import ROW_LENGTH
 from catstream.features.pyramid import Pyramid
@@ -54,9 +54,9 @@ def started(scene, settings=()):
     return detector
 
 
-@pytest.mark.parametrize("moved", [0.0, 0.9])
-def test_the_first_frame_teaches_a_leaf_of_each_tree(scene, moved):
-    detector = Follower({"training.other_backgrounds": moved})
+@pytest.mark.parametrize("augment", [False, True])
+def test_the_first_frame_teaches_a_leaf_of_each_tree(scene, augment):
+    detector = Follower({"training.augment": augment})
     track, features = detector.start(scene((60, 50)), START, time=2.5)
     assert (track.seq, track.frame, track.state, track.time) == (1, 0, "bootstrapping", 2.5)
     assert track.box == pytest.approx(START)
@@ -285,7 +285,7 @@ def test_while_an_object_is_sought_the_background_of_the_scene_is_learned(two, l
     rows = [rows for each in features for rows in each.training.values()]
     assert rows
     assert all(not each.labels.any() for each in rows)
-    assert all(similarity(row) < Settings().belief.min_similarity for each in rows for row in each.rows)
+    assert all(similarity(row) < MIN_SIMILARITY for each in rows for row in each.rows)
 
 
 def test_a_detection_in_another_place_in_each_frame_is_not_the_object(scene, learned, similarity):

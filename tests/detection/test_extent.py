@@ -32,8 +32,9 @@ def draw(texture):
 
 
 @pytest.mark.parametrize(("w", "h"), [(84, 60), (60, 84), (84, 84)], ids=["wider", "higher", "larger"])
-def test_the_box_follows_an_object_that_gets(draw, w, h):
-    tracker, frames = Tracker(Settings(extent={"prior": 0})), 80
+def test_the_box_follows_an_object_that_gets(draw, w, h, monkeypatch):
+    monkeypatch.setattr(extent, "_PRIOR", 0.0)
+    tracker, frames = Tracker(), 80
     tracker.init(*draw(60, 60))
     for share in np.linspace(0, 1, frames):
         image, truth = draw(round(60 + share * (w - 60)), round(60 + share * (h - 60)))
@@ -53,7 +54,7 @@ def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
 @pytest.mark.parametrize("steps", [-2, -1, 1, 2])
 def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(draw, steps):
     image, box = draw(60, 60)
-    frame, window = Pyramid(image), Window.around(box, Settings().search.context)
+    frame, window = Pyramid(image), Window.around(box)
     _, training = teacher.first_training(frame, window, np.random.default_rng(0), Settings())
     rows = training[EXTENT]
     regression = ridge.Regression(np.column_stack([rows.rows, np.ones(len(rows), np.float32)]))

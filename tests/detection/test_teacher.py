@@ -16,7 +16,12 @@ from catstream.messages.heads import APPEARANCE, EXTENT
 from catstream.messages.kinds import Model
 
 OBJECT = Window(120, 80, 64, 64)
-SETTINGS = Settings(training={"near_misses": 200})
+SETTINGS = Settings()
+
+
+@pytest.fixture(autouse=True)
+def many_near_misses(monkeypatch):
+    monkeypatch.setattr(teacher, "_NEAR_MISSES", 200)
 
 
 @pytest.fixture
@@ -85,20 +90,20 @@ def test_an_object_at_the_edge_of_the_search_area_is_learned_from_too(frame, mod
 
 
 def test_a_wrong_size_or_aspect_ratio_is_labelled_with_its_steps_and_their_gaussian(frame, model):
-    settings = SETTINGS.replace({"extent.size_count": 5, "extent.aspect_count": 3})
+    settings = SETTINGS.replace({"extent.size_count": 5})
     training = teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)
     own = Cells.within(frame.around(OBJECT, WINDOW)).row(0, 0)
     extents = training[EXTENT]
     np.testing.assert_array_equal(extents.rows[0], own)
     np.testing.assert_array_equal(training[APPEARANCE].rows[0], own)
-    assert extents.labels == pytest.approx([1, *np.exp([-2, -0.5, -0.5, -2]), *np.exp([-0.5, -0.5])])
+    assert extents.labels == pytest.approx([1, *np.exp([-2, -0.5, -0.5, -2] * 2)])
     assert all(np.abs(row - own).max() > 0.01 for row in extents.rows[1:])
-    for column, steps in enumerate(([0, -2, -1, 1, 2, 0, 0], [0, 0, 0, 0, 0, -1, 1])):
+    for column, steps in enumerate(([0, -2, -1, 1, 2, 0, 0, 0, 0], [0, 0, 0, 0, 0, -2, -1, 1, 2])):
         assert extents.offsets[:, column] == pytest.approx([0.5 + k / 16 for k in steps])
 
 
-def test_without_a_weight_of_the_extent_head_it_has_no_rows(frame, model):
-    settings = SETTINGS.replace({"extent.weight": 0})
+def test_without_learning_the_extent_there_are_no_rows_of_it(frame, model):
+    settings = SETTINGS.replace({"extent.learned": False})
     assert set(teacher.training_at(FrameContext(frame, model, settings, 3), OBJECT)) == {APPEARANCE}
 
 
@@ -141,8 +146,8 @@ def test_a_share_of_them_is_put_on_another_background(rng, moved, changed):
     image = np.full((200, 240, 3), 60, np.uint8)
     image[:, 128:] = 250  # beside the box
     image[60:100, 76:116] = rng.integers(0, 256, (40, 40, 3), np.uint8)
-    plain = copies(image, PLACE, 9, context=1.25)
-    rows = copies(image, PLACE, 9, context=1.25, moved=moved)
+    plain = copies(image, PLACE, 9)
+    rows = copies(image, PLACE, 9, moved=moved)
     differ = np.abs(rows - plain).max(axis=1) > 0.5
     assert not differ[0]
     assert differ.sum() <= changed
@@ -152,7 +157,7 @@ def test_a_share_of_them_is_put_on_another_background(rng, moved, changed):
 def test_on_another_background_the_object_keeps_its_centre(rng):
     image = rng.integers(0, 256, (200, 240, 3), np.uint8)
     image[40:120, 56:136] = 60
-    plain, moved = (copies(image, PLACE, 2, context=1.25, moved=share)[1].copy() for share in (0.0, 1.0))
+    plain, moved = (copies(image, PLACE, 2, moved=share)[1].copy() for share in (0.0, 1.0))
     grids = [row[: 8 * 8 * 34].reshape(8, 8, 34) for row in (plain, moved)]
     np.testing.assert_allclose(grids[0][3:5, 3:5], grids[1][3:5, 3:5], atol=1e-3)
 

@@ -74,7 +74,7 @@ def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
     desired, processed, after, versions, known, live
 ):
     position = Position(processed, processed, versions=versions, states=dict.fromkeys(known, STATE))
-    start = resume_at(position, after, desired, 1.5, live=live)
+    start = resume_at(position, after, desired, live=live)
     assert start.seq <= processed, "the compressor has all messages before"
     assert start.repeats >= processed, "a command begins no object in a message that the compressor drops as a repeat"
     assert sorted(start.desired.objects) == sorted(desired.objects), "no object is lost"
@@ -95,16 +95,16 @@ def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
 def test_without_a_model_a_restart_tracks_from_the_first_frame_of_an_object_again():
     desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
     position = Position(0, 8, states={"anna": STATE})
-    start = resume_at(position, 6, desired, 1.5, live=False)
+    start = resume_at(position, 6, desired, live=False)
     assert (start.seq, start.repeats, start.desired, start.states) == (2, 8, desired, {})
 
 
 def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last():
     desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
     position = Position(8, 8, versions={"anna": 2}, states={"anna": STATE, "ben": STATE})
-    start = resume_at(position, 8, desired, 1.5, live=False)
+    start = resume_at(position, 8, desired, live=False)
     assert start.states == {"anna": STATE}
-    assert start.desired.objects["ben"] == DesiredObject(PLACE.box(1.5), 9)
+    assert start.desired.objects["ben"] == DesiredObject(PLACE.box(), 9)
 
 
 @given(VERSIONS, VERSIONS, DESIRED)

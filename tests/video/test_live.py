@@ -283,7 +283,8 @@ def test_mjpeg_is_read_whatever_its_parts_say(served, caplog, part):
 
 @pytest.mark.parametrize("states_length", [True, False])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
-def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, states_length):
+def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, states_length, monkeypatch):
+    monkeypatch.setattr(live, "_POLL_SECONDS", 0.05)
     fetched = []
 
     def send(request):
@@ -295,7 +296,7 @@ def test_a_still_picture_is_fetched_again_and_again(served, caplog, suffix, stat
         request.end_headers()
         request.wfile.write(picture)
 
-    with open_source(f"{served(send)}/now{suffix}", poll_seconds=0.05) as source:
+    with open_source(f"{served(send)}/now{suffix}") as source:
         seen = [number_of(next(source).image) for _ in range(5)]
         assert (source.reconnects, source.counters["lost_seconds"]) == (0, 0)
     assert seen == sorted(set(seen))
