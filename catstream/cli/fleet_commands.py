@@ -110,13 +110,14 @@ def up(running: Fleet, view: HostPort | None, token: str | None) -> None:
 
 def _serve(fleet: Fleet, view: HostPort, token: str | None, stack: ExitStack) -> None:
     """Serve the page of a fleet that ends with this command until the stack is left."""
-    from catstream.web.app import fleet_site
     from catstream.web.server import Server
+    from catstream.web.wall import Wall
 
     if not fleet.is_owner:
         raise click.UsageError("--view needs a fleet that ends with this command: use catstream fleet view")
-    site = fleet_site(Address(fleet=fleet.name))
-    server = Server(site, host=view.host, port=view.port, token=token, attempts=view.attempts)
+    server = Server(
+        Wall(Address(fleet=fleet.name)), host=view.host, port=view.port, token=token, attempts=view.attempts
+    )
     stack.enter_context(server.in_background())
     for url in server.urls:
         click.echo(f"page: {url}")

@@ -16,6 +16,7 @@ from catstream.errors import ServiceError
 
 if TYPE_CHECKING:
     from catstream.web.app import Site
+    from catstream.web.wall import Wall
 
 #: The port of the page if none is given.
 PORT = 8000
@@ -145,7 +146,7 @@ def view(address: Address, listen: HostPort, token: str | None) -> None:
 def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
     """Watch all streams of a fleet in a browser.
 
-    The page is a table of the streams, those in trouble first, and of the
+    The page is a wall of pictures, those in trouble first, and a table of the
     nodes. Each stream links to its own page, which is that of catstream view.
     If the fleet does not answer, the page keeps its last state and waits.
     Ctrl-C ends the server; the fleet continues. Token and encryption are as
@@ -156,12 +157,12 @@ def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
       catstream fleet view
       catstream fleet view --fleet head.example.org:5690 --keys my-keys
     """
-    from catstream.web.app import fleet_site
+    from catstream.web.wall import Wall
 
-    _serve(fleet_site(address), listen, token)
+    _serve(Wall(address), listen, token)
 
 
-def _serve(site: Site, listen: HostPort, token: str | None) -> None:
+def _serve(site: Site | Wall, listen: HostPort, token: str | None) -> None:
     """Print the links of a site, and serve it until Ctrl-C or SIGTERM."""
     from catstream.web.server import Server
 

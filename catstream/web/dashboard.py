@@ -1,23 +1,19 @@
-"""The state of a page: of a pipeline, computed from its messages, and of a fleet. It uses no socket and no clock."""
+"""The state of the page of a pipeline, computed from its messages. It uses no socket and no clock."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import takewhile
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import (
     End,
-    FleetStatus,
     Health,
     Model,
-    NodeStatus,
     Preview,
     State,
-    StreamStatus,
     Track,
     run_state,
 )
@@ -26,7 +22,7 @@ from catstream.video.drawing import Colours
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
-#: Phase of a pipeline or a fleet: no message yet, running, silent for some seconds, ended.
+#: Phase of a pipeline: no message yet, running, silent for some seconds, ended.
 Phase = Literal["waiting", "running", "silent", "ended"]
 
 POINT_SECONDS = 0.25  #: between two points of the charts
@@ -40,37 +36,6 @@ _SHOWN_OF_A_PICTURE = ("frame", "time", "width", "height", "boxes")
 #: A point of the charts: time, frames per second, and of each object its score, model latency, model version, and
 #: whether it is present.
 _Point = tuple[float, float, dict[str, tuple[float, float | None, int, bool]]]
-
-
-class Parts:
-    """The state of a page: functions that return JSON values, sent to each open page, in this order, if they changed.
-
-    The argument of each is the number of its changes since the page has received it.
-    """
-
-    def __init__(self, parts: Mapping[str, Callable[[int], object]]) -> None:
-        self._parts = parts
-        self._revisions: Counter[str] = Counter()
-        self.phase: Phase = "waiting"
-        self.reason = ""  #: of the end or the silence
-        self._mark_changed(*parts)
-
-    def updates(self, revisions: dict[str, int]) -> dict[str, object]:
-        """Return the parts that have changed since the last call with these revisions; they are empty at first."""
-        news = {name: self._revisions[name] - revisions.get(name, 0) for name in self._parts}
-        revisions.update(self._revisions)
-        return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
-
-    def mark_silent(self, reason: str, now: float) -> None:  # noqa: ARG002  # a fleet keeps its age
-        """Record that nothing arrives, at the time `now` in seconds of a monotonic clock."""
-        if self.phase == "running":
-            self.phase = "silent"
-        if self.phase != "ended":
-            self.reason = reason
-        self._mark_changed("status")
-
-    def _mark_changed(self, *parts: str) -> None:
-        self._revisions.update(parts)
 
 
 @dataclass(slots=True)
@@ -96,7 +61,7 @@ class TrackedObject:
     model_latency: float | None = None
 
 
-class Dashboard(Parts):
+class Dashboard:
     """Receives messages, and returns the updates for each open page.
 
     It shows one pipeline. It keeps the last picture and figures until the first message of another pipeline arrives;
@@ -104,16 +69,17 @@ class Dashboard(Parts):
     """
 
     def __init__(self) -> None:
-        super().__init__(
-            {
-                "pipeline": lambda _: self._revisions["pipeline"],  # the number of pipelines so far; clears a page
-                "status": self._status_part,
-                "tracks": self._tracks_part,
-                "picture": self._picture_part,
-                "points": lambda new: list(self._points)[-new:],
-                "trees": self._trees_part,
-            }
-        )
+        #: Functions that return JSON values, sent to each open page, in this order, if they changed. The argument of
+        #: each is the number of its changes since the page has received it.
+        self._parts = {
+            "pipeline": lambda _: self._revisions["pipeline"],  # the number of pipelines so far; clears a page
+            "status": self._status_part,
+            "tracks": self._tracks_part,
+            "picture": self._picture_part,
+            "points": lambda new: list(self._points)[-new:],
+            "trees": self._trees_part,
+        }
+        self._revisions = Counter(self._parts.keys())
         self.endpoint = self._attached = ""
         self._run = ""  # id of the run that is shown
         self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive
@@ -122,7 +88,8 @@ class Dashboard(Parts):
     def _reset(self) -> None:
         """Drop all state of the previous pipeline."""
         self.phase: Phase = "waiting"
-        self.reason = self.source = ""
+        self.reason = ""  #: of the end or the silence
+        self.source = ""
         self.objects: dict[str, TrackedObject] = {}  #: in the order in which they began
         self.colours = Colours()
         self.health: dict[str, Health] = {}  #: the last report of each process
@@ -134,6 +101,23 @@ class Dashboard(Parts):
         self._tracks: dict[int, dict[str, Track]] = {}  # by frame and object
         self._frame: tuple[int, float] | None = None  # number and time of the newest frame
         self._seq = 0  # of the newest track
+
+    def updates(self, revisions: dict[str, int]) -> dict[str, object]:
+        """Return the parts that have changed since the last call with these revisions; they are empty at first."""
+        news = {name: self._revisions[name] - revisions.get(name, 0) for name in self._parts}
+        revisions.update(self._revisions)
+        return {name: part(news[name]) for name, part in self._parts.items() if news[name]}
+
+    def mark_silent(self, reason: str) -> None:
+        """Record that nothing arrives."""
+        if self.phase == "running":
+            self.phase = "silent"
+        if self.phase != "ended":
+            self.reason = reason
+        self._mark_changed("status")
+
+    def _mark_changed(self, *parts: str) -> None:
+        self._revisions.update(parts)
 
     def attach(self, endpoint: str) -> None:
         """Expect messages from this endpoint from now on; the state is kept until the first one arrives."""
@@ -312,44 +296,3 @@ def _remember(recent: dict[Key, Value], key: Key, value: Value, most: int) -> No
     recent[key] = value
     if len(recent) > most:
         del recent[next(iter(recent))]
-
-
-class FleetDashboard(Parts):
-    """Receives the status of a fleet, and returns the updates for each open page: all streams and nodes, once a second.
-
-    It keeps the last status while the fleet does not answer.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(
-            {
-                "status": lambda _: {
-                    "name": self.status.name, "phase": self.phase, "reason": self.reason, "age": int(self.age),
-                },
-                "streams": lambda _: {  # JSON objects of a browser have numbers first
-                    name: _public(stream)
-                    | {"models": list(stream.models.items()), "present": list(stream.present.items())}
-                    for name, stream in self.status.streams.items()
-                },
-                "nodes": lambda _: {name: _public(node) for name, node in self.status.nodes.items()},
-            }
-        )  # fmt: skip
-        self.status = FleetStatus("", 0.0)
-        self.age = self._arrived = 0.0  # seconds since the last status arrived, 0 while the fleet answers
-
-    def take(self, status: FleetStatus, now: float) -> None:
-        """Process a status that arrived at the time `now`, in seconds of a monotonic clock."""
-        self.status, self.phase, self.reason, self.age, self._arrived = status, "running", "", 0.0, now
-        self._mark_changed(*self._parts)
-
-    def mark_silent(self, reason: str, now: float) -> None:
-        """Record that the fleet did not answer at the time `now`."""
-        super().mark_silent(reason, now)
-        if self.phase == "silent":
-            self.age = now - self._arrived
-
-
-def _public(status: StreamStatus | NodeStatus) -> dict[str, Any]:
-    """Return what the page shows of a stream or a node: neither the address nor a key of a pipeline."""
-    hidden = ("name", "endpoint", "server", "token")
-    return {field.name: getattr(status, field.name) for field in fields(status) if field.name not in hidden}

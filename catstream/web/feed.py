@@ -1,4 +1,4 @@
-"""Keeps the state of a page up to date: a thread reads the messages of a pipeline, or asks the registry of a fleet.
+"""Keeps the state of a page up to date: a thread reads the messages of a pipeline.
 
 The thread reads with the public client API, and passes each message to the event loop of the server, which alone uses
 the dashboard.
@@ -9,23 +9,18 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from math import inf
 from time import monotonic
 from typing import Any, cast
 
-from starlette.exceptions import HTTPException
-
 from catstream.client.address import Address
 from catstream.client.control import Control
-from catstream.client.registry import Registry
 from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
-from catstream.messages.kinds import Answer, End, StreamStatus
-from catstream.web.dashboard import Dashboard, FleetDashboard, Parts
+from catstream.messages.kinds import Answer, End
+from catstream.web.dashboard import Dashboard
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
@@ -35,36 +30,26 @@ SILENCE_SECONDS = 4.0  #: without a health report, after which a process is sile
 DRAIN_SECONDS = 2.0  #: for the last messages to arrive after the end
 PAUSE_SECONDS = 0.5  #: before a pipeline is looked up again
 READ_SECONDS = 0.03  #: between two looks at the other channels than that of the tracks, which are waited for
-PERIOD_SECONDS = 1.0  #: between two questions to the registry
-REGISTRY_SECONDS = 2.0  #: limit for its answer
-IDLE_SECONDS = 60.0  #: after which the feed of a stream that nobody looks at is closed
+STOP_SECONDS = 2.0  #: for the thread to end
 PICTURE_SECONDS = 5.0  #: after a request for a picture, for which pictures are received
 
-_MAX_FEEDS = 32  # of streams of a fleet, each with a thread
 
+class PipelineFeed:
+    """Receives the messages of a pipeline from `start` to `stop`, and reconnects after each end, silence or restart.
 
-class Feed(ABC):
-    """Keeps a dashboard up to date from `start` to `stop`, and counts the open pages."""
+    Previews, which cost the pipeline processor time, are received only while a page is open, or a wall asks for
+    pictures. The address is resolved at each connection.
+    """
 
-    dashboard: Parts
-    _pause: float  # seconds between two calls of `_feed`
-
-    def __init__(self) -> None:
+    def __init__(self, address: Address) -> None:
+        self._address = address
+        self._endpoint: Endpoint | None = None  # of the current connection, with its keys
+        self._has_end = threading.Event()
         self.viewers = 0  #: open pages
-        self.used = monotonic()  #: time of the last request to the page
+        self.pictured = -inf  #: time of the last request for a picture
+        self.dashboard = Dashboard()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
-
-    @abstractmethod
-    def problem_of(self, stream: str = "") -> str:
-        """Why no frames are tracked, of a stream of a fleet if one is named, or why the fleet is not seen; else empty.
-
-        Without the name of a stream, it names no address: anybody may ask for it.
-        """
-
-    @abstractmethod
-    def pipeline(self, stream: str) -> PipelineFeed:
-        """Return the feed of a stream; this one, if it is that of a pipeline."""
 
     @contextmanager
     def viewed(self) -> Iterator[None]:
@@ -87,58 +72,17 @@ class Feed(ABC):
     def stop(self) -> None:
         """End the thread, and wait for it, but not for long."""
         self.end()
-        self._thread.join(REGISTRY_SECONDS)
+        self._thread.join(STOP_SECONDS)
 
-    def _run(self) -> None:
-        """Feed the dashboard until `stop`; each error is shown on the page, and then it continues."""
-        while not self._stopped.is_set():
-            try:
-                self._feed()
-            except CatstreamError as error:
-                self._call(self.dashboard.mark_silent, str(error), monotonic())
-            except Exception as error:  # an unexpected error must not end the feed silently
-                _log.exception("The page lost what it shows, and tries again.")
-                self._call(self.dashboard.mark_silent, f"{type(error).__name__}: {error}", monotonic())
-            self._stopped.wait(self._pause)
-
-    def _call(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Call a function in the event loop, which may have ended."""
-        with suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(function, *arguments)
-
-    @abstractmethod
-    def _feed(self) -> None:
-        """Feed the dashboard, until the connection is lost or the answer is complete."""
-
-
-class PipelineFeed(Feed):
-    """Receives the messages of a pipeline, and reconnects after each end, silence or restart.
-
-    Previews, which cost the pipeline processor time, are received only while a page is open, or a wall asks for
-    pictures. The address is resolved at each connection.
-    """
-
-    dashboard: Dashboard
-    _pause = PAUSE_SECONDS
-
-    def __init__(self, address: Address) -> None:
-        super().__init__()
-        self._address = address
-        self._endpoint: Endpoint | None = None  # of the current connection, with its keys
-        self._has_end = threading.Event()
-        self.pictured = -inf  #: time of the last request for a picture
-        self.dashboard = Dashboard()
-
-    def problem_of(self, stream: str = "") -> str:  # noqa: ARG002  # there is one
+    @property
+    def problem(self) -> str:
+        """Why no frames are tracked; empty if they are. It names no address: anybody may ask for it."""
         since, last = monotonic() - SILENCE_SECONDS, self.dashboard.last_reports
         silent = [name for name in CHANNELS["health"].senders if name not in last or last[name] < since]
         state, words = self.dashboard.state
         if silent and state != "ended":
             return f"no health report from: {', '.join(silent)}"
         return "" if state == "running" else words
-
-    def pipeline(self, stream: str) -> PipelineFeed:  # noqa: ARG002  # there is one
-        return self
 
     def wait_for_end(self) -> None:
         """Wait until the end of the pipeline has arrived, but not for long; called before the server is stopped."""
@@ -149,7 +93,25 @@ class PipelineFeed(Feed):
         with Control(self._endpoint or self._address.resolve()) as pipeline:
             return pipeline.execute(**command)
 
+    def _run(self) -> None:
+        """Feed the dashboard until `stop`; each error is shown on the page, and then it continues."""
+        while not self._stopped.is_set():
+            try:
+                self._feed()
+            except CatstreamError as error:
+                self._call(self.dashboard.mark_silent, str(error))
+            except Exception as error:  # an unexpected error must not end the feed silently
+                _log.exception("The page lost what it shows, and tries again.")
+                self._call(self.dashboard.mark_silent, f"{type(error).__name__}: {error}")
+            self._stopped.wait(PAUSE_SECONDS)
+
+    def _call(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call a function in the event loop, which may have ended."""
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function, *arguments)
+
     def _feed(self) -> None:
+        """Feed the dashboard until the connection is lost."""
         self._endpoint = self._address.resolve()
         self._call(self.dashboard.attach, str(self._endpoint))
         subscriptions: dict[str, Subscription[Any]] = {}
@@ -205,72 +167,3 @@ def _next(messages: Subscription[Any]) -> object | None:
             return cast(object, message)
         return messages.end
     return None
-
-
-class FleetFeed(Feed):
-    """Asks the registry of a fleet once a second for all streams and nodes, and opens the feeds of single streams.
-
-    The address names the fleet and no stream; the fleet may start later.
-    """
-
-    dashboard: FleetDashboard
-    _pause = PERIOD_SECONDS
-
-    def __init__(self, address: Address) -> None:
-        super().__init__()
-        self._address = address
-        self._registry: Registry | None = None
-        self._streams: dict[str, PipelineFeed] = {}
-        self.has_asked = threading.Event()  #: set once the registry has answered for the first time, or has not
-        self.dashboard = FleetDashboard()
-
-    def problem_of(self, stream: str = "") -> str:
-        if self.dashboard.phase != "running":
-            return "the fleet does not answer"
-        if not stream:
-            return ""
-        status = self._status_of(stream)
-        return "" if status.state == "running" else ": ".join(filter(None, (status.state, status.trouble)))
-
-    def pipeline(self, stream: str) -> PipelineFeed:
-        """Return the feed of a stream, opened by the first request to its page."""
-        self._status_of(stream)
-        if stream not in self._streams:
-            if len(self._streams) >= _MAX_FEEDS:
-                self.close_unused(0.0)
-            if len(self._streams) >= _MAX_FEEDS:
-                raise HTTPException(503, "too many pages of streams are open already\n")
-            self._streams[stream] = PipelineFeed(replace(self._address, stream=stream))
-            self._streams[stream].start()
-        self._streams[stream].used = monotonic()
-        return self._streams[stream]
-
-    def _status_of(self, stream: str) -> StreamStatus:
-        if stream not in self.dashboard.status.streams:
-            raise HTTPException(404, f"this fleet has no stream {stream!r}\n")
-        return self.dashboard.status.streams[stream]
-
-    def close_unused(self, seconds: float = IDLE_SECONDS) -> None:
-        """End the feeds that nobody looks at, and to which the last request was so many seconds ago."""
-        for name, feed in list(self._streams.items()):
-            if not feed.viewers and monotonic() - feed.used >= seconds:
-                self._streams.pop(name).end()
-
-    def stop(self) -> None:
-        self.close_unused(0.0)
-        super().stop()
-
-    def _run(self) -> None:
-        super()._run()
-        if self._registry is not None:
-            self._registry.close()
-
-    def _feed(self) -> None:
-        self._call(self.close_unused)
-        try:
-            if self._registry is None:
-                self._registry = self._address.registry
-                self._registry.timeout = REGISTRY_SECONDS
-            self._call(self.dashboard.take, self._registry.streams(), monotonic())
-        finally:
-            self.has_asked.set()

@@ -7,32 +7,33 @@ Each metric of a pipeline names its source, without user and password.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from time import time
 
 from prometheus_client import CollectorRegistry, Gauge, generate_latest
+from starlette.responses import Response
 
-from catstream.messages.kinds import NodeStatus, StreamStatus
-from catstream.web.feed import Feed, FleetFeed, PipelineFeed
+from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
+from catstream.web.feed import PipelineFeed
 
 #: A sample: name, value and labels.
-_Sample = tuple[str, float, dict[str, str]]
+Sample = tuple[str, float, dict[str, str]]
 
 
-def text(feed: Feed) -> bytes:
-    samples = _of_fleet(feed) if isinstance(feed, FleetFeed) else _of_pipeline(feed.pipeline(""))
+def response(samples: Iterable[Sample]) -> Response:
     registry, metrics = CollectorRegistry(), dict[str, Gauge]()
-    for name, value, labels in [("viewers", feed.viewers, {}), *samples]:
+    for name, value, labels in samples:
         if name not in metrics:
             metrics[name] = Gauge(f"catstream_{name}", name.replace("_", " "), list(labels), registry=registry)
         (metrics[name].labels(**labels) if labels else metrics[name]).set(value)
-    return generate_latest(registry)
+    return Response(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
-def _of_pipeline(feed: PipelineFeed) -> Iterator[_Sample]:
+def of_pipeline(feed: PipelineFeed) -> Iterator[Sample]:
     """The samples of a pipeline; only `up` and `state` while it does not run."""
     dashboard = feed.dashboard
+    yield "viewers", feed.viewers, {}
     running, of = dashboard.phase == "running", {"source": dashboard.source}
     yield "up", running, of
     yield "state", 1, of | {"state": dashboard.state[0]}
@@ -50,11 +51,12 @@ def _of_pipeline(feed: PipelineFeed) -> Iterator[_Sample]:
                 yield f"{process}_{counter}", value, of | {"object": name}
 
 
-def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
-    """The samples of a fleet: each number that it says of a stream or a node; only `fleet_up` if it does not answer."""
-    running, status = feed.dashboard.phase == "running", feed.dashboard.status
-    yield "fleet_up", running, {}
-    for stream in status.streams.values() if running else ():
+def of_fleet(status: FleetStatus | None) -> Iterator[Sample]:
+    """The samples of a fleet: each number of its streams and nodes; only `fleet_up` if it does not answer."""
+    yield "fleet_up", status is not None, {}
+    if status is None:
+        return
+    for stream in status.streams.values():
         labels = {"stream": stream.name, "node": stream.node}
         yield from _of_status("stream", stream, labels)
         yield "stream_trouble", bool(stream.trouble), labels
@@ -62,11 +64,11 @@ def _of_fleet(feed: FleetFeed) -> Iterator[_Sample]:
             yield "stream_model_version", version, labels | {"object": name}
         for name, is_present in stream.present.items():
             yield "fleet_objects_present", is_present, {"stream": stream.name, "object": name}
-    for node in status.nodes.values() if running else ():
+    for node in status.nodes.values():
         yield from _of_status("node", node, {"node": node.name})
 
 
-def _of_status(kind: str, status: StreamStatus | NodeStatus, labels: dict[str, str]) -> Iterator[_Sample]:
+def _of_status(kind: str, status: StreamStatus | NodeStatus, labels: dict[str, str]) -> Iterator[Sample]:
     yield f"{kind}_state", 1, labels | {"state": status.state}
     for field in fields(status):
         if field.name != "token" and isinstance(value := getattr(status, field.name), int | float):  # of the store

@@ -24,6 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from catstream.errors import ServiceError
 from catstream.web.annotator import AnnotationSite
 from catstream.web.app import Site
+from catstream.web.wall import Wall
 
 _LOGIN_PAGE = Path(__file__).with_name("page") / "login.html"
 _PUBLIC_PATHS = ("/healthz", "/readyz", "/page/")  # they reveal only whether the pipeline tracks, or why not
@@ -62,7 +63,7 @@ class Server:
 
     def __init__(
         self,
-        site: Site | AnnotationSite,
+        site: Site | Wall | AnnotationSite,
         *,
         host: str = "127.0.0.1",
         port: int = 8000,

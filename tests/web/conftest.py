@@ -14,8 +14,9 @@ import pytest
 from catstream.base.box import Box
 from catstream.client.address import Address
 from catstream.messages.kinds import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
-from catstream.web.app import fleet_site, pipeline_site
+from catstream.web.app import pipeline_site
 from catstream.web.server import Server
+from catstream.web.wall import Wall
 from catstream.wire.channels import HEALTH, PREVIEWS
 from catstream.wire.newest import Publisher
 
@@ -113,7 +114,7 @@ def manager(fleet, managing):
 @pytest.fixture
 def serve_fleet(serve_site, fleet, manager):  # noqa: ARG001  # it answers
     """Starts pages of the fleet: a client of each of them."""
-    return lambda **options: serve_site(fleet_site(Address(fleet=fleet.address, keys=fleet.keys_of_client)), **options)
+    return lambda **options: serve_site(Wall(Address(fleet=fleet.address, keys=fleet.keys_of_client)), **options)
 
 
 @pytest.fixture

@@ -1,8 +1,7 @@
-"""The dashboards: what a page is told of the messages of a pipeline, or of the status of a fleet."""
+"""The dashboard: what a page is told of the messages of a pipeline."""
 
 from __future__ import annotations
 
-import json
 from time import monotonic
 
 import pytest
@@ -13,7 +12,7 @@ from catstream.client.address import Address
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import End, Health
 from catstream.video.drawing import PALETTE
-from catstream.web.dashboard import Dashboard, FleetDashboard
+from catstream.web.dashboard import Dashboard
 from catstream.web.feed import SILENCE_SECONDS, PipelineFeed
 
 
@@ -58,11 +57,11 @@ def test_silence_and_the_end_are_different_phases(dashboard, facts):
     told = {}
     dashboard.take(Health("detector", 1.0, {"sent": 1.0}), 0.0)
     assert dashboard.updates(told)["status"]["phase"] == "running"
-    dashboard.mark_silent("nothing came", 5.0)
+    dashboard.mark_silent("nothing came")
     assert dashboard.updates(told)["status"]["phase"] == "silent"
     dashboard.take(facts.track(0), 10.0)
     dashboard.take(End(1, "the source has ended"), 11.0)
-    dashboard.mark_silent("nothing came", 15.0)
+    dashboard.mark_silent("nothing came")
     status = dashboard.updates(told)["status"]
     assert (status["phase"], status["reason"]) == ("ended", "the source has ended")
 
@@ -95,7 +94,7 @@ def test_while_no_frames_are_tracked_the_page_says_why_and_shows_no_positions(da
 
 def test_a_pipeline_that_tracks_is_ready_until_a_process_is_silent_for_some_seconds():
     feed, everyone = PipelineFeed(Address("run")), "no health report from: detector, compressor, trainer"
-    assert feed.problem_of() == everyone
+    assert feed.problem == everyone
     for ago, names, more, problem in (
         (SILENCE_SECONDS + 1.0, ("detector", "compressor", "trainer"), {}, everyone),
         (0.0, ("compressor", "trainer"), {}, "no health report from: detector"),
@@ -104,9 +103,9 @@ def test_a_pipeline_that_tracks_is_ready_until_a_process_is_silent_for_some_seco
     ):
         for name in names:
             feed.dashboard.take(Health(name, 1.0, {"sent": 1.0, **more}), monotonic() - ago)
-        assert feed.problem_of() == problem
+        assert feed.problem == problem
     feed.dashboard.take(End(1, "cannot read /home/me/secret.mp4", failed=True), monotonic())
-    assert feed.problem_of() == "ended", "who has no token is told no name of a file"
+    assert feed.problem == "ended", "who has no token is told no name of a file"
 
 
 def test_the_last_messages_of_a_run_do_not_belong_to_the_next_one(dashboard, facts):
@@ -126,7 +125,7 @@ def test_the_trees_and_skipped_frames_of_the_last_reports_stay_after_the_end(das
     dashboard.take(Health("detector", 1.0, {"sent": 1.0, "skipped": 40.0}), 0.0)
     dashboard.take(End(1, "the source has ended"), 10.0)
     dashboard.take(learning({"object_leaves": 3.0, "rows": 200.0}), 10.1)
-    dashboard.mark_silent("no pipeline is running", 15.0)
+    dashboard.mark_silent("no pipeline is running")
     parts = dashboard.updates({})
     trees = parts["trees"]["objects"][""]
     assert (trees["leaves"], trees["rows"]) == ([3.0, *[0.0] * (len(TREES) - 1)], 200.0)
@@ -264,44 +263,3 @@ def test_the_tracked_objects_are_shown_and_no_others_once_the_reports_have_arriv
     for report in (*reports, facts.tracking(float(seq), *alive)):
         dashboard.take(report, float(seq))
     assert set(dashboard.objects) == set(alive)
-
-
-@pytest.fixture
-def of_fleet():
-    return FleetDashboard()
-
-
-def told(of_fleet, seen):
-    """The updates as a browser gets them."""
-    return json.loads(json.dumps(of_fleet.updates(seen)))
-
-
-def test_a_page_is_told_of_all_streams_and_nodes_once_for_each_status(of_fleet, fleet):
-    seen = {}
-    assert "streams" in told(of_fleet, seen), "a new page is told which page it is, before the first status"
-    fleet.node("north-1", labels={"site": "north"})
-    fleet.stream("cam-7", endpoint="/tmp/secret-place", server="a public key", models={"ben": 3, "2024": 1, "anna": 2})
-    fleet.stream("cam-8", "failed", trouble="no source")
-    of_fleet.take(fleet.status(), 0.0)
-    first = told(of_fleet, seen)
-    assert (list(first["streams"]), first["streams"]["cam-8"]["trouble"]) == (["cam-7", "cam-8"], "no source")
-    assert first["streams"]["cam-7"]["models"] == [["ben", 3], ["2024", 1], ["anna", 2]], "as they began"
-    assert first["nodes"]["north-1"]["labels"] == {"site": "north"}
-    assert "secret-place" not in str(first)
-    assert "public key" not in str(first)
-    assert told(of_fleet, seen) == {}
-
-
-def test_the_last_status_is_kept_with_its_age_while_the_fleet_does_not_answer(of_fleet, fleet):
-    seen, fleet.name = {}, "site"
-    of_fleet.mark_silent("no fleet of yours is running", 5.0)
-    status = {"name": "", "phase": "waiting", "reason": "no fleet of yours is running", "age": 0}
-    assert told(of_fleet, seen)["status"] == status
-    fleet.stream("cam-7")
-    of_fleet.take(fleet.status(), 10.0)
-    of_fleet.updates(seen)
-    of_fleet.mark_silent("no answer", 17.5)
-    assert told(of_fleet, seen) == {"status": {"name": "site", "phase": "silent", "reason": "no answer", "age": 7}}
-    assert "cam-7" in of_fleet.updates({})["streams"]
-    of_fleet.take(fleet.status(), 18.0)
-    assert told(of_fleet, seen)["status"] == {"name": "site", "phase": "running", "reason": "", "age": 0}

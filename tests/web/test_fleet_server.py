@@ -10,36 +10,26 @@ import pytest
 from starlette.exceptions import HTTPException
 
 from catstream.client.address import Address
-from catstream.web import feed
-from catstream.web.feed import FleetFeed
+from catstream.web import wall
+from catstream.web.wall import Wall
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import clients, create, public_key, synchronise
 
 TOKEN = "correct-horse-battery"
-PATHS = ["/", "/events", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
+PATHS = ["/", "/status", "/metrics", "/streams/cam-7/", "/streams/cam-7/events"]
 
 
-@pytest.fixture
-def page(serve_fleet):
-    return serve_fleet()
-
-
-def first_update(page, path="/events"):
-    with page.stream("GET", path) as events:
-        for line in events.iter_lines():
-            if line.startswith("data: "):
-                return json.loads(line.removeprefix("data: "))
-    raise AssertionError("the stream ended")
-
-
-def shown(page, until):
-    """The first update of a page once the registry has answered."""
-    return until(lambda: (told := first_update(page)).get("streams") and told)
+def status_of(page):
+    return page.get("/status").json()
 
 
 def source(page):
     """The source that the page of the stream shows."""
-    return first_update(page, "/streams/cam-7/events").get("status", {}).get("source")
+    with page.stream("GET", "/streams/cam-7/events") as events:
+        for line in events.iter_lines():
+            if line.startswith("data: "):
+                return json.loads(line.removeprefix("data: ")).get("status", {}).get("source")
+    raise AssertionError("the stream ended")
 
 
 @pytest.fixture
@@ -66,9 +56,9 @@ def test_without_the_token_nothing_of_the_fleet_is_shown(fleet, serve_fleet, unt
             assert answer.status_code == 200
 
 
-def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, folder, until):
+def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, serve_fleet, camera, folder, until):
     fleet.stream("cam-7", endpoint=str(folder))
-    shown(page, until)
+    page = serve_fleet()
     index = page.get("/streams/cam-7", follow_redirects=True)
     assert index.url.path == "/streams/cam-7/"
     for file in re.findall(r'(?:src|href)="(page/[^"]+)"', index.text):
@@ -77,22 +67,23 @@ def test_the_page_of_a_stream_is_below_that_of_the_fleet(fleet, page, camera, fo
     assert page.get("/streams/cam-8/").status_code == 404
 
 
-def test_the_newest_picture_of_a_stream_is_received_only_while_somebody_asks(fleet, page, camera, folder, until):
+def test_the_newest_picture_of_a_stream_is_received_only_while_somebody_asks(fleet, serve_fleet, camera, folder, until):
     fleet.stream("cam-7", endpoint=str(folder))
-    shown(page, until)
+    page = serve_fleet()
     picture = until(lambda: (got := page.get("/streams/cam-7/picture.jpg")).status_code == 200 and got, camera)
     assert picture.headers["content-type"] == "image/jpeg"
     assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), cv2.IMREAD_COLOR).shape[1] == 640
     assert page.get("/streams/cam-8/picture.jpg").status_code == 404
 
 
-def test_the_page_of_a_stream_follows_it_to_another_node(fleet, page, camera_at, folder, until, monkeypatch):
+def test_the_page_of_a_stream_follows_it_to_another_node(fleet, serve_fleet, camera_at, folder, until, monkeypatch):
     monkeypatch.setattr("catstream.web.feed.SILENCE_SECONDS", 1.0)
+    fleet.stream("cam-7")
+    page = serve_fleet()
     for node in ("north", "south"):
         (folder / node).mkdir()
         fleet.stream("cam-7", node=node, endpoint=str(folder / node))
         turn = camera_at(Endpoint.parse(str(folder / node)), source=f"walk.mp4 at {node}")
-        shown(page, until)
         until(lambda node=node: source(page) == f"walk.mp4 at {node}", turn)
 
 
@@ -102,17 +93,15 @@ def test_a_stream_with_a_key_of_its_own_is_shown_with_the_keys_of_the_client(
     endpoint = Endpoint.parse(fleet.listen, str(keyed))
     fleet.stream("cam-7", endpoint=fleet.listen, server=public_key(keyed))
     page, turn = serve_fleet(), camera_at(endpoint)
-    shown(page, until)
     until(lambda: source(page) == "walk.mp4", turn)
 
 
 def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams(
     fleet, manager, serve_fleet, until, monkeypatch
 ):
-    monkeypatch.setattr(feed, "REGISTRY_SECONDS", 1.0)
+    monkeypatch.setattr(wall, "REGISTRY_SECONDS", 1.0)
     fleet.stream("cam-7")
     page = serve_fleet()
-    shown(page, until)
     assert page.get("/readyz").status_code == 200
     assert 'stream="cam-7"' in page.get("/metrics").text
     manager.close()
@@ -121,30 +110,50 @@ def test_a_fleet_that_does_not_answer_is_not_ready_and_has_no_metrics_of_streams
     metrics = page.get("/metrics").text
     assert "\ncatstream_fleet_up 0.0\n" in metrics
     assert "cam-7" not in metrics
-    told = first_update(page)
-    assert (told["status"]["phase"], list(told["streams"])) == ("silent", ["cam-7"])
+    told = status_of(page)
+    assert "no answer from the fleet" in told["problem"]
+    assert [stream["name"] for stream in told["streams"]] == ["cam-7"], "the last state stays"
+
+
+def test_the_page_shows_neither_the_address_nor_the_key_of_a_pipeline(fleet, serve_fleet):
+    fleet.stream("cam-7", endpoint="/tmp/secret-place", server="a-public-key", token=7, models={"anna": 2})
+    fleet.node("north-1", labels={"site": "north"})
+    told = status_of(serve_fleet())
+    assert (told["problem"], told["nodes"][0]["labels"]) == ("", {"site": "north"})
+    assert told["streams"][0]["models"] == {"anna": 2}
+    assert told["streams"][0].keys() & {"endpoint", "server", "token"} == set()
+
+
+def test_a_fleet_that_starts_later_is_waited_for(fleet, serve_site, managing, until):
+    page = serve_site(Wall(Address(fleet=fleet.address)))
+    told = status_of(page)
+    assert (told["age"], told["streams"]) == (None, [])
+    assert "no fleet" in told["problem"]
+    fleet.stream("cam-7")
+    with managing(fleet.status):
+        until(lambda: [stream["name"] for stream in status_of(page)["streams"]] == ["cam-7"])
 
 
 def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatch):
-    monkeypatch.setattr(feed, "_MAX_FEEDS", 2)
+    monkeypatch.setattr(wall, "_MAX_SITES", 2)
     for number in range(1, 5):
         fleet.stream(f"cam-{number}")
 
     async def use():
-        streams = FleetFeed(Address(fleet=fleet.address))
-        streams.dashboard.take(fleet.status(), 0.0)
-        first = streams.pipeline("cam-1")
-        with first.viewed():
-            assert streams.pipeline("cam-2") is not first
-            third = streams.pipeline("cam-3")  # in place of one that nobody looks at
-            assert streams.pipeline("cam-1") is first
-            with third.viewed(), pytest.raises(HTTPException, match="too many"):
-                streams.pipeline("cam-4")
-        streams.close_unused(60.0)
-        assert streams.pipeline("cam-1") is first, "it was used just now"
-        streams.close_unused(0.0)
-        assert streams.pipeline("cam-1") is not first
-        streams.close_unused(0.0)
+        pages = Wall(Address(fleet=fleet.address))
+        pages._status = fleet.status()
+        first = pages.site("cam-1")
+        with first.feed.viewed():
+            assert pages.site("cam-2") is not first
+            third = pages.site("cam-3")  # in place of one that nobody looks at
+            assert pages.site("cam-1") is first
+            with third.feed.viewed(), pytest.raises(HTTPException, match="too many"):
+                pages.site("cam-4")
+        pages._close_unused(60.0)
+        assert pages.site("cam-1") is first, "it was used just now"
+        pages._close_unused(0.0)
+        assert pages.site("cam-1") is not first
+        pages._close_unused(0.0)
 
     asyncio.run(use())
 
@@ -156,9 +165,9 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatc
         (
             "failed",
             "cannot open rtsp://10.0.0.7 (connection refused)",
-            (503, "failed: cannot open rtsp://10"),
+            (503, "failed, cannot open rtsp://10"),
         ),
-        ("lost", "its source has been lost for 12 s", (503, "lost: its source has been lost for 12 s\n")),
+        ("lost", "its source has been lost for 12 s", (503, "lost, its source has been lost for 12 s\n")),
         ("paused", "", (503, "paused\n")),
         ("starting", "", (503, "starting\n")),
     ],

@@ -8,7 +8,7 @@ import pytest
 from catstream.client.address import Address
 from catstream.messages.kinds import Health
 from catstream.web import prometheus
-from catstream.web.feed import FleetFeed, PipelineFeed
+from catstream.web.feed import PipelineFeed
 
 
 @pytest.fixture
@@ -16,11 +16,11 @@ def feed():
     return PipelineFeed(Address())
 
 
-def samples(feed):
+def samples(of):
     """The samples by metric: the labels and value of each."""
     found = {}
     lines = r"^(catstream_\w+)(?:\{(.*)\})? (.*)"
-    for name, labels, value in re.findall(lines, prometheus.text(feed).decode(), re.MULTILINE):
+    for name, labels, value in re.findall(lines, prometheus.response(of).body.decode(), re.MULTILINE):
         found.setdefault(name, []).append((labels, float(value)))
     return found
 
@@ -32,7 +32,7 @@ def test_each_counter_of_a_process_is_a_metric_with_the_object_as_its_label(feed
     feed.dashboard.take(report, 0.0)
     feed.dashboard.take(Health("compressor", 1.0, {"rows": 7.0, "stored": 4.0}, objects=learned), 0.0)
     feed.dashboard.take(Health("trainer", 1.0, {"rejected": 2.0}, objects={"": {"trained": 5.0}}), 0.0)
-    found = samples(feed)
+    found = samples(prometheus.of_pipeline(feed))
     of, anna, ben = (f'{name}source="rtsp://door/1"' for name in ("", 'object="anna",', 'object="ben",'))
     assert found["catstream_detector_sent"] == [(of, 6.0)]
     assert found["catstream_compressor_stored"] == [(of, 4.0)]
@@ -44,15 +44,15 @@ def test_each_counter_of_a_process_is_a_metric_with_the_object_as_its_label(feed
 
 def test_a_pipeline_that_does_not_run_has_no_old_values(feed, facts):
     feed.dashboard.take(facts.tracking(6.0, "anna"), 0.0)
-    assert "catstream_detector_score" in samples(feed)
-    feed.dashboard.mark_silent("nothing came", 5.0)
-    assert samples(feed) == {
+    assert "catstream_detector_score" in samples(prometheus.of_pipeline(feed))
+    feed.dashboard.mark_silent("nothing came")
+    assert samples(prometheus.of_pipeline(feed)) == {
         "catstream_up": [('source=""', 0.0)],
         "catstream_state": [('source="",state="silent"', 1.0)],
         "catstream_viewers": [("", 0.0)],
     }
     feed.dashboard.take(facts.track(7, name="anna"), 6.0)
-    assert samples(feed)["catstream_up"] == [('source=""', 1.0)]
+    assert samples(prometheus.of_pipeline(feed))["catstream_up"] == [('source=""', 1.0)]
 
 
 @pytest.mark.parametrize(
@@ -69,18 +69,16 @@ def test_the_state_is_a_metric_and_alerts_on_a_lost_source_or_a_pause_need_no_ot
     feed, counters, state, paused, lost
 ):
     feed.dashboard.take(Health("detector", 1.0, {"sent": 6.0, **counters}), 0.0)
-    found = samples(feed)
+    found = samples(prometheus.of_pipeline(feed))
     assert found["catstream_state"] == [(f'source="",state="{state}"', 1.0)]
     assert [found[f"catstream_{name}"][0][1] for name in ("paused", "source_lost_seconds")] == [paused, lost]
 
 
 def test_each_number_of_a_stream_and_a_node_is_a_metric_with_their_names_as_labels(fleet):
-    feed = FleetFeed(Address(fleet=fleet.address))
     fleet.stream("cam-7", node="north", models={"anna": 3}, frame=25, present={"anna": True, "ben": False})
     fleet.stream("cam-8", "failed", trouble="no source")
     fleet.node("north", cores=4.0)
-    feed.dashboard.take(fleet.status(), 0.0)
-    found = samples(feed)
+    found = samples(prometheus.of_fleet(fleet.status()))
     assert found["catstream_stream_frame"] == [('node="north",stream="cam-7"', 25.0), ('node="",stream="cam-8"', 0.0)]
     assert found["catstream_stream_state"][1] == ('node="",state="failed",stream="cam-8"', 1.0)
     assert [value for _, value in found["catstream_stream_trouble"]] == [0.0, 1.0]

@@ -1,15 +1,14 @@
-// Connects to the server, and passes its updates to the page of a stream or to that of a fleet.
+// Connects to the server, and passes its updates to the page.
 
 import { $, write } from "./dom.js";
-import { FleetPage } from "./fleet.js";
 import { StreamPage } from "./stream.js";
 
-let page = null; // made with the first update, which tells what there is
+let page = null; // made with the first update
 let events = null; // the connection to the server, null while the page is hidden
 const server = { closed: false, silent: null }; // whether it has announced its shutdown; time since which it does not answer
 
 function take({ closed, ...parts }) {
-  page ??= "streams" in parts ? new FleetPage(server) : new StreamPage(server);
+  page ??= new StreamPage(server);
   if (closed) server.closed = true;
   page.take(parts);
 }
