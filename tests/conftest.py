@@ -1,4 +1,17 @@
-"""What all tests share."""
+"""Fixtures of all tests; those that one folder needs are in its own conftest.py.
+
+They are layered, each on those before it:
+
+    data         rng, image, texture, scene: arrays; demo_video, walk, endless: files, rendered once for all workers
+    places       folder, endpoint, tcp, keys, disk: where the sockets, files and keys of one test are
+    peers        commanded, managing: a thread that answers as a detector, or as the registry of a fleet;
+                 camera, walker: an HTTP server in this process
+    the command  said, succeed, fail: in this process; catstream, program: in a process of its own, killed afterwards
+    time         until, turning: wait for a condition; no test passes or fails by the time that something takes
+
+Only `catstream`, `program` and a `catstream.Pipeline` in a test start processes. `own_places` and `one_core` apply to
+all tests: no other pipeline of this user is found, and BLAS adds in the same order as in a pipeline.
+"""
 
 import fcntl
 import io

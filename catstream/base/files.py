@@ -160,7 +160,7 @@ def is_locked(handle: int) -> bool:
 def _flock(handle: int, kind: str) -> bool:
     """Lock an open file or folder without waiting; returns False if another process has locked it.
 
-    A file system without locks, as some network drives, lets everybody lock, and so does a system without `fcntl`.
+    Without lock support (some network drives, systems without `fcntl`) locking always succeeds.
     """
     if fcntl is None:
         return True

@@ -224,7 +224,7 @@ class Subscription(Generic[Message]):
         return self.end is not None and monotonic() >= self._close_time
 
     def _take(self, deadline: float) -> Message | None:
-        """The next message if one has arrived, without waiting; what else is to be done before the next wait."""
+        """The next message if one has arrived, without waiting; also runs periodic housekeeping."""
         check_not_forked(self._generation)  # first: another thread of the original may have held the lock
         with self._turn:
             if self._closed:

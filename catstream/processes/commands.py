@@ -142,7 +142,7 @@ class Commands(AbstractContextManager["Commands"]):
             self.reject(command, reason)
 
     def store_and_answer(self, *answers: Answer) -> None:
-        """Store the desired state if it has changed, then send the answers; those say so if it could not be stored."""
+        """Store the desired state if it has changed, then reply; the reply carries the error if saving failed."""
         file, desired, problem = self._process.state / DESIRED, self.desired, ""
         if desired != self._stored:
             try:

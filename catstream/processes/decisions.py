@@ -126,9 +126,9 @@ def resume_at(position: Position, after: int | None, desired: DesiredState, *, l
 
 
 def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str, int]) -> bool:
-    """Return True if the models have arrived that were trained from the compressor's newest samples, by their versions.
+    """Return True once every model has the version of the compressor's newest sample.
 
-    Either of compressor and trainer may have been restarted too, and then repeats its last steps.
+    Compressor and trainer may have been restarted as well, and then repeat their last steps.
     """
     return all(arrived.get(name) == version for name, version in position.versions.items() if name in desired.objects)
 
@@ -136,11 +136,14 @@ def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str
 def awaited(
     due: int, processed: int, samples: Mapping[str, int], newest: Mapping[str, int]
 ) -> Literal["", "features", "models"]:
-    """The channel on which a detector waits before its next frame; empty if it need not wait.
+    """The channel on which a detector waits before its next frame; "" to continue at once.
 
-    `due` is the seq of the newest features that the models must include by now, and `processed` that of the newest ones
-    that the compressor has processed. `samples` are the versions of each object's newest sample of the features up to
-    `due`, and `newest` those of the newest models that have arrived, of each object that had begun by then.
+    Parameters
+    ----------
+    due : seq of the newest features that the models must include
+    processed : seq of the newest features that the compressor has processed
+    samples : version of each object's newest sample from the features up to `due`
+    newest : version of the newest model of each object that had begun before `due`
 
     >>> awaited(due=7, processed=6, samples={}, newest={"": 0})
     'features'

@@ -1,7 +1,7 @@
 """The process that tracks the objects in each frame with their newest models, and sends tracks and features.
 
-`main` is what happens to a frame, and `DetectorLoop` does it. Commands, the objects that begin, and what is sent have
-modules of their own; the decisions are pure functions in `catstream.processes.decisions` and
+`main` lists the steps for one frame; `DetectorLoop` implements them. Commands, new objects and outputs have modules of
+their own; the decisions are pure functions in `catstream.processes.decisions` and
 `catstream.processes.control_commands`.
 """
 
@@ -51,7 +51,7 @@ def main(process: Process) -> None:
         try:
             for frame in loop.frames(stack):
                 loop.turn()  # executes commands, serves late joiners, publishes the health
-                beginnings = loop.begin(frame)  # of objects; a file is held here while the run is paused
+                beginnings = loop.begin(frame)  # of objects; while paused, a file source blocks here
                 if not loop.skips(beginnings):
                     tracks, features = loop.track(frame, beginnings)
                     loop.outputs.send(tracks, features)  # waits for room

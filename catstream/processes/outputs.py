@@ -24,18 +24,18 @@ _FEATURES_END_SECONDS = 10.0  # limit for the end to be stored, once the process
 _RESULTS_END_SECONDS = 0.5  # the same for the owner of the run to receive the end
 _PREVIEW_SECONDS = 0.1  # shortest time between two pictures for subscribers
 _SIDE = 640  # longest side of a picture, in pixels
-_STORED_SECONDS = 5.0  # for which the frame of a picture is stored, as somebody may draw a box in it
+_STORED_SECONDS = 5.0  # that a preview's frame is stored, in case a client draws a box in it
 _STORED_BYTES = 256 << 20  # of these frames at most
 
 
 class Outputs(AbstractContextManager["Outputs"]):
     """The sockets that a detector sends on; a context manager.
 
-    Backpressure: `send` waits for room, in turns. The compressor has room until `run.unstored_frames` messages are not
-    stored, and the owner of the run until it has not read so many frames. Subscribers are never waited for.
+    Backpressure: `send` blocks while `run.unstored_frames` messages are not stored by the compressor, or not read by
+    the owner of the run. It never waits for subscribers.
 
-    turn     called again and again during a wait
-    replied  called after each reply of the compressor, as by `TrainingLag.reply`
+    turn     called repeatedly during a wait
+    replied  called after each reply of the compressor, such as `TrainingLag.reply`
     """
 
     def __init__(

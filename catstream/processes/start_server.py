@@ -263,7 +263,7 @@ def main(descriptor: int, program: int) -> None:
         elif has_ended in ready:
             os.read(has_ended, 4096)
             while running and (ended := os.waitpid(-1, os.WNOHANG))[0]:
-                with running.pop(ended[0]) as answers, suppress(OSError):  # nobody may wait for it
+                with running.pop(ended[0]) as answers, suppress(OSError):  # the client may have gone away
                     answers.send(b"%d" % os.waitstatus_to_exitcode(ended[1]))
         elif requests.fileno() in ready:
             data, descriptors, _, _ = socket.recv_fds(requests, _LONGEST, 3)

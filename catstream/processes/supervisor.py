@@ -88,7 +88,7 @@ class Child:
 
     process   None if it is to be started when it is `due`
     hung      whether it was killed because it made no progress
-    silent    seconds since its loop has last turned; or, once it has ended, since then
+    silent    seconds since the last iteration of its loop; once it has ended, since its end
     restarts  moments of its restarts
     """
 
@@ -118,9 +118,9 @@ class Child:
         self.process = start_server().start(self.name, self._job, log, memory, restarted=bool(self.restarts))
 
     def ending(self, code: int) -> str:
-        """How the process has ended: the signal or the exit code; and its last line, if that can be about the end.
+        """Describe how the process ended: the signal or the exit code.
 
-        What another process kills has not logged why; what aborts has.
+        The last line of its log is included only if it exited by itself or aborted: a killed process logs nothing.
         """
         if code == STOPPED_EARLY:
             return "another program asked it to end with a signal"
@@ -143,7 +143,7 @@ class Child:
         return "signal SIGKILL, not sent by catstream; out of memory?"
 
     def check(self, seconds: float) -> bool:
-        """Count the seconds without a turn of the loop; returns whether they are too many."""
+        """Return True if the loop has been stuck for longer than the watchdog limit."""
         turns, self._turns = self._turns, self.memory.watchdog.turns
         self.silent = self.silent + seconds if turns == self._turns and self.code is None else 0.0
         return self.silent > self.memory.watchdog.patience

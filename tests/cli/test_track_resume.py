@@ -17,7 +17,6 @@ from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import CHECKPOINTS
 from catstream.pipeline import Pipeline
-from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
 UNITS = Path(__file__).parents[2] / "services"
@@ -120,17 +119,6 @@ def test_rows_left_incomplete_by_a_power_failure_are_removed_and_written_again(k
         assert sum(1 for _ in film) == 32, "the video is drawn again, whole"
 
 
-def test_a_damaged_checkpoint_is_reported_and_the_previous_one_is_used(killed, whole_run, succeed):
-    kept, before = killed / "kept", len(frames(killed / "out"))
-    newest = max(checkpoints(kept))
-    damaged = bytearray(newest.read_bytes())
-    damaged[len(damaged) // 2] ^= 1
-    newest.write_bytes(damaged)
-    _, errors = succeed("track", "--resume", kept)
-    assert "damaged checkpoints: 1" in errors
-    assert_goes_on(killed / "out" / "demo.ndjson", before, whole_run / "out" / "demo.ndjson")
-
-
 def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, fail, tmp_path):
     kept, (source, box) = killed / "kept", video
     refusals = {
@@ -227,16 +215,6 @@ def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed,
     succeed("track", "--resume", killed / "kept")
     succeed("track", "--resume", killed / "kept", "--output", killed / "new")
     assert frames(killed / "new") == [*range(32)]
-
-
-def test_the_files_of_a_resumed_run_are_whole_before_it_receives_a_frame(killed, said, monkeypatch):
-    monkeypatch.setattr(Pipeline, "by_frame", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    logs = [killed / "out" / "demo.ndjson", killed / "out" / "demo.csv"]
-    before = [[frame.tracks for frame in Log(log).frames()] for log in logs]
-    for log in logs:
-        log.write_bytes(log.read_bytes() + b"32,1.0")
-    assert said("track", "--resume", killed / "kept")[0] == 130
-    assert [[frame.tracks for frame in Log(log).frames()] for log in logs] == before
 
 
 def test_a_resumed_run_drops_a_video_and_destinations_if_it_is_told_so(killed, succeed):

@@ -4,13 +4,10 @@ import os
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from catstream.base.settings import Settings
 from catstream.client.attach import control
-from catstream.errors import CommandRejectedError
-from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
@@ -76,28 +73,3 @@ def test_a_run_that_is_resumed_has_the_objects_that_it_had_and_each_frame_once(v
     assert [each["anna"].frame for each in tracks] == list(range(FRAMES))
     assert [frame for frame, each in enumerate(tracks) if "ben" in each] == list(range(last + 1))
     assert all(each.keys() >= {"anna", "carl"} for each in tracks)
-
-
-def test_objects_are_saved_forgotten_and_begun_by_name_while_paused(video, objects, tmp_path):
-    settings = SETTINGS.replace({"run.lockstep": True})  # the video does not end before the first model
-    with Pipeline(video[0], objects, settings) as pipeline, control(pipeline.endpoint, timeout=150) as steering:
-        frames = pipeline.by_frame()
-        tracks = [next(frames)]
-        while not tracks[-1]["ben"].model_version:
-            tracks.append(next(frames))
-        steering.pause()
-        saved = steering.save(tmp_path / "ben", "ben")
-        assert saved.object == SavedModel.load(tmp_path / "ben").object == "ben"
-        begin = steering.set_box(objects["anna"], np.str_("dora"))
-        assert begin.reason.startswith("the object dora begins at")
-        with pytest.raises(CommandRejectedError, match="ambiguous object"):
-            steering.forget()
-        for name in ("anna", "ben", "carl"):
-            steering.forget(name)
-        assert steering.forget().reason.endswith("no object is left, so the run waits for a box")
-        again = steering.set_box(objects["carl"], "carl")
-        steering.stop()
-        tracks += pipeline.by_frame()
-    assert (tracks[-2].keys(), tracks[-1].keys()) == ({*objects, "dora"}, {"carl"})
-    assert (len(tracks) - 2, len(tracks) - 1) == (begin.frame, again.frame)
-    assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(tracks), len(tracks))

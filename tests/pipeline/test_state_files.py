@@ -6,7 +6,6 @@ from itertools import islice
 
 import pytest
 
-from catstream.base.settings import Settings
 from catstream.errors import ServiceError
 from catstream.jobs.state import files, last_seq, restore
 from catstream.pipeline import Pipeline
@@ -37,12 +36,6 @@ def test_a_restored_state_is_at_the_same_position(state, tmp_path):
     assert {"job.safetensors", "desired_state.json"} < content.keys()
     assert files(tmp_path / "there") == content
     assert last_seq(tmp_path / "there") == 12
-
-
-def test_a_run_is_resumed_with_passed_settings_also_if_they_are_the_defaults(state):
-    assert Pipeline(resume=state).settings.run.lockstep
-    assert Pipeline(resume=state, settings={"run.lag_frames": 3}).settings.run.lockstep
-    assert Pipeline(resume=state, settings=Settings()).settings == Settings()
 
 
 @pytest.mark.parametrize("name", ["../other", "searched_models/../x", "/etc/passwd", "trees/1.safetensors.part"])

@@ -9,12 +9,7 @@ import pytest
 
 from catstream.base.settings import Settings
 from catstream.client.attach import control, subscribe
-from catstream.errors import (
-    CommandRejectedError,
-    ProtocolError,
-    ServiceError,
-    SettingsError,
-)
+from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
@@ -76,40 +71,7 @@ def saved(long_video, once):
     return once("saved", save) / "object.safetensors"
 
 
-def test_boxes_of_several_objects_begin_in_the_same_frame_or_none(video):
-    path, boxes = video
-    together = {"anna": boxes[0], "ben": (20, 150, 70, 60)}
-    with steered(path) as (pipeline, steering, _):
-        steering.pause()
-        with pytest.raises(CommandRejectedError, match=r"ben: .*outside"):
-            steering.set_boxes(together | {"ben": (4000, 10, 20, 20)})
-        answer = steering.set_boxes(together)
-        assert (answer.frame, answer.reason) == (0, "anna, ben begin in frame 0")
-        steering.stop()
-        tracks = list(pipeline)
-    assert [(track.object, track.frame, track.box) for track in tracks] == [
-        (name, 0, pytest.approx(box)) for name, box in together.items()
-    ]
-
-
-def test_the_first_frame_waits_for_a_box_and_in_a_pause_a_box_is_for_the_waiting_one(video):
-    path, boxes = video
-    with steered(path) as (pipeline, steering, _):
-        assert told(pipeline, lambda counters: counters["waiting"])["sent"] == 0
-        steering.pause()
-        assert steering.set_box(boxes[0]).frame == 0
-        assert steering.set_box(boxes[1]).frame == 1
-        told(pipeline, lambda counters: counters["paused"] and counters["sent"] == 2)
-        steering.resume()
-        tracks = list(pipeline)
-        assert pipeline.restarts == 0
-    assert [track.frame for track in tracks] == list(range(len(boxes)))
-    assert [track.box for track in tracks[:2]] == [pytest.approx(box) for box in boxes[:2]]
-    assert share_found(tracks, boxes) > 0.8
-    assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
-
-
-def test_another_object_replaces_the_first_from_its_frame_on_whichever_process_dies(long_video):
+def test_set_box_replaces_the_object_from_its_frame_on_if_processes_die(long_video):
     path, boxes = long_video
     with steered(path, PATCH) as (pipeline, steering, pool):
         tracks = with_model(pipeline)
@@ -131,7 +93,7 @@ def test_another_object_replaces_the_first_from_its_frame_on_whichever_process_d
     assert all(track.model_version == 0 or track.model_version > newest for track in after)
 
 
-def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video, tmp_path):
+def test_run_continues_with_its_original_boxes_if_the_desired_state_is_torn(video, tmp_path):
     path, boxes = video
     settings = SETTINGS.replace({"run.lockstep": True})  # the video does not end before the second model
     with Pipeline(path, boxes[0], settings, state=tmp_path / "kept") as pipeline:
@@ -146,21 +108,7 @@ def test_an_incomplete_file_of_commands_is_reported_and_the_run_continues(video,
     assert tracks[-1].frame == len(boxes) - 1
 
 
-def test_a_saved_model_finds_the_object_and_learning_continues_from_it(long_video, saved):
-    path, boxes = long_video
-    version = SavedModel.load(saved).model.version
-    soon = Settings(run={"lag_frames": 5})  # the part is shorter than the lag that the default allows
-    with Pipeline(path, settings=soon, model=saved, part=slice(40, None)) as pipeline:
-        tracks = list(pipeline)
-    assert tracks[0].model_version == version
-    assert "bootstrapping" not in {track.state for track in tracks}
-    assert share_found(tracks, boxes[40:]) > 0.8
-    versions = [track.model_version for track in tracks]
-    assert versions == sorted(versions)
-    assert versions[-1] > version
-
-
-def test_an_object_whose_box_is_of_a_past_picture_begins_where_it_has_moved_to(walker):
+def test_box_drawn_in_a_past_picture_is_tracked_up_to_now(walker):
     url, find = walker
     with (
         steered(url) as (pipeline, steering, _),
@@ -177,7 +125,7 @@ def test_an_object_whose_box_is_of_a_past_picture_begins_where_it_has_moved_to(w
         assert answer.reason.endswith("as the picture in which it was drawn is not stored any more")
 
 
-def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera):
+def test_paused_live_source_skips_frames(video, camera):
     path, boxes = video
     with open_source(path) as source:
         image = next(source).image
@@ -201,7 +149,7 @@ def test_of_a_live_source_frames_pass_by_while_nothing_is_followed(video, camera
     assert pipeline.totals["skipped"] > passed["skipped"]
 
 
-def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_path):
+def test_unusable_model_is_rejected_before_the_start(video, saved, tmp_path):
     path, boxes = video
     torn = tmp_path / "torn"
     torn.write_bytes(saved.read_bytes()[:-9])
@@ -216,7 +164,7 @@ def test_an_unusable_model_is_rejected_before_anything_starts(video, saved, tmp_
 
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor", "trainer")], ids=str)
-def test_an_object_is_searched_for_in_a_pipeline_as_in_one_process_whichever_dies(video, saved, victims):
+def test_search_gives_the_tracks_of_one_process_if_processes_die(video, saved, victims):
     path, settings = video[0], Settings(run={"lockstep": True})
     tracks = []
     with (
@@ -249,7 +197,7 @@ def test_an_object_is_searched_for_in_a_pipeline_as_in_one_process_whichever_die
     assert tracks[-1].box.overlap(video[1][-1]) > 0.5
 
 
-def test_an_object_that_is_searched_for_is_found_after_a_resume_without_the_file(video, saved, tmp_path):
+def test_search_continues_after_a_resume_without_the_file(video, saved, tmp_path):
     path, boxes = video
     copy = tmp_path / "anna.safetensors"
     copy.write_bytes(saved.read_bytes())
