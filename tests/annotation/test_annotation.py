@@ -30,22 +30,12 @@ def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_en
     _, truth = demo
     tracks = both_ends.tracks["anna"]
     assert all(track.box.overlap(box) > 0.5 for track, box in zip(tracks, truth, strict=True))
+    assert [(track.frame, track.object) for track in tracks] == [(frame, "anna") for frame in range(FRAMES)]
+    assert tracks[-1].time == both_ends.frames.times[-1] > 0
+    assert [(tracks[end].box, tracks[end].probability) for end in (0, -1)] == [(truth[0], 1), (truth[-1], 1)]
     assert both_ends.checked["anna"] == ["keyframe", *["checked"] * (FRAMES - 2), "keyframe"]
     assert both_ends.share_checked == 1
     assert both_ends.next_frame() is None
-
-
-def test_a_keyframe_keeps_its_box(demo, both_ends):
-    _, truth = demo
-    assert [both_ends.tracks["anna"][frame].box for frame in (0, -1)] == [truth[0], truth[-1]]
-    assert [both_ends.tracks["anna"][frame].probability for frame in (0, -1)] == [1, 1]
-
-
-def test_tracks_count_frames_and_have_their_times(both_ends):
-    tracks = both_ends.tracks["anna"]
-    assert [track.frame for track in tracks] == [*range(FRAMES)]
-    assert tracks[-1].time == both_ends.frames.times[-1] > 0
-    assert {track.object for track in tracks} == {"anna"}
 
 
 def test_after_one_box_the_rest_is_tracked_unchecked_and_the_last_frame_is_asked_for(demo):

@@ -5,10 +5,10 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from contextlib import closing, suppress
 from importlib import import_module
 from pathlib import Path
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -88,13 +88,6 @@ def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_se
     assert psutil.Process(server.pid).num_threads() == 1, "a fork copies only one"
 
 
-def test_a_current_folder_that_was_removed_is_no_obstacle(start, tmp_path, monkeypatch):
-    (tmp_path / "gone").mkdir()
-    monkeypatch.chdir(tmp_path / "gone")
-    (tmp_path / "gone").rmdir()
-    assert start()[1].watchdog.turns > 2
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 4), (signal.SIGKILL, -signal.SIGKILL)])
 def test_how_a_process_has_ended_is_known(start, until, number, code):
     process, *_ = start()
@@ -117,6 +110,7 @@ def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next
     running, server = psutil.Process(process.pid), start_server()
     os.kill(server.pid, signal.SIGKILL)
     assert until(process.poll) == -signal.SIGKILL
+    assert process.lost
     until(lambda: has_ended(running))
     again, *_ = start()
     assert psutil.Process(again.pid).ppid() == start_server().pid != server.pid
@@ -193,47 +187,6 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
         start_server()
 
 
-def test_a_process_has_its_name_and_its_stream_in_top_and_ps_but_no_password(start, folder, until):
-    job = Job("rtsp://me:secret@10.0.0.7/gate", endpoint=str(folder)).save(folder)
-    process, _, _ = start(job)
-    trainer = psutil.Process(process.pid)
-    until(lambda: trainer.cmdline()[0] == "catstream trainer rtsp://10.0.0.7/gate"[: len(trainer.cmdline()[0])])
-    assert Path(f"/proc/{process.pid}/comm").read_text() == "trainer:gate\n"
-    assert "secret" not in Path(f"/proc/{process.pid}/cmdline").read_text()
-
-
-@pytest.mark.parametrize(("source", "more"), [("rtsp://10.0.0.7/gate", 5), ("a.mp4", 0)])
-def test_training_has_a_lower_priority_than_detection_if_the_source_is_live(start, folder, until, source, more):
-    process, _, _ = start(Job(source, endpoint=str(folder)).save(folder))
-    trainer = psutil.Process(process.pid)
-    until(lambda: trainer.name() == f"trainer:{Path(source).name}")
-    assert trainer.nice() == min(psutil.Process().nice() + more, 19)
-
-
-@pytest.mark.parametrize(
-    ("kills", "cause"),
-    [
-        (0, "with the start server: signal SIGKILL, not sent by catstream; out of memory?"),
-        (1, "out of memory: the kernel"),
-    ],
-)
-def test_a_death_by_a_signal_that_catstream_did_not_send_names_the_cause(folder, tmp_path, monkeypatch, kills, cause):
-    counts = [0]
-    monkeypatch.setattr(supervisor, "oom_kills", lambda: counts[0])
-    monkeypatch.setattr(module, "_server", None)
-    with closing(Child("trainer", Job(endpoint=str(folder)).save(folder), tmp_path)) as child:
-        child.start(0)
-        assert child.process.pid
-        os.kill(start_server().pid if not kills else child.process.pid, signal.SIGKILL)
-        counts[0] += kills
-        while child.code is None:
-            time.sleep(0.01)
-        assert cause in child.ending(child.code)
-        child.hung = True
-        assert child.ending(child.code) == "killed after it made no progress"
-    module.close_start_server()
-
-
 def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
     with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
         file.write(b"detector: an earlier one\n")
@@ -247,30 +200,55 @@ def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_wai
         file.flush()
         assert log.new_lines() == ["two"]
         assert log.last_line() == "two"
-
-
-def test_a_line_that_is_longer_than_what_is_read_at_once_does_not_hide_the_next_one(tmp_path):
-    with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
-        file.write(b"detector: " + bytes(200_000) + b"\ndetector: the source is lost\n")
+        file.write(b"detector: " + bytes(200_000) + b"\ndetector: the source is lost\n")  # longer than is read at once
         file.flush()
         assert [line for _ in range(9) for line in log.new_lines()] == ["the source is lost"]
 
 
 @pytest.mark.parametrize(
-    ("code", "ending"),
+    ("code", "kills", "ending"),
     [
-        (-signal.SIGKILL, "signal SIGKILL, not sent by catstream; out of memory?"),
-        (-signal.SIGABRT, "signal SIGABRT: its last line"),
-        (-(signal.SIGRTMIN + 1), f"signal {signal.SIGRTMIN + 1}"),
-        (1, "exit code 1: its last line"),
-        (STOPPED_EARLY, "another program asked it to end with a signal"),
+        (-signal.SIGKILL, 0, "signal SIGKILL, not sent by catstream; out of memory?"),
+        (-signal.SIGKILL, 1, "out of memory: the kernel sent SIGKILL"),
+        (-signal.SIGABRT, 0, "signal SIGABRT: its last line"),
+        (-(signal.SIGRTMIN + 1), 0, f"signal {signal.SIGRTMIN + 1}"),
+        (1, 0, "exit code 1: its last line"),
+        (STOPPED_EARLY, 0, "another program asked it to end with a signal"),
     ],
 )
-def test_the_reason_of_a_death_has_the_signal_and_the_words_of_the_process(tmp_path, code, ending):
+def test_reason_of_a_death_has_the_signal_and_the_last_line_of_the_process(tmp_path, monkeypatch, code, kills, ending):
     child = Child("trainer", tmp_path, tmp_path)
+    monkeypatch.setattr(supervisor, "oom_kills", lambda: child._oom_kills + kills)
     with closing(child.log), (tmp_path / "trainer.log").open("ab") as file:
         file.write(b"trainer: its last line\n")
         file.flush()
         assert child.ending(code) == ending
         child.log.begin()
         assert child.ending(code) == ending.removesuffix(": its last line")
+
+
+def test_reason_of_a_death_is_that_of_the_start_server_or_the_watchdog(tmp_path):
+    child = Child("trainer", tmp_path, tmp_path)
+    with closing(child.log):
+        child.process = Mock(lost=True, server_code=-signal.SIGTERM)
+        assert child.ending(-signal.SIGKILL) == "with the start server: signal SIGTERM"
+        child.hung = True
+        assert child.ending(-signal.SIGKILL) == "killed after it made no progress"
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "line", "nicer"),
+    [
+        ("rtsp://me:secret@10.0.0.7/gate", "trainer:gate", "catstream trainer rtsp://10.0.0.7/gate", 5),
+        ("a.mp4", "trainer:a.mp4", "catstream trainer a.mp4", 0),
+    ],
+)
+def test_process_shows_its_stream_without_its_password_and_is_nicer_if_it_is_live(
+    start, folder, until, source, name, line, nicer
+):
+    process, _, _ = start(Job(source, endpoint=str(folder)).save(folder))
+    trainer = psutil.Process(process.pid)
+    until(lambda: trainer.cmdline()[0] == line[: len(trainer.cmdline()[0])])
+    assert Path(f"/proc/{process.pid}/comm").read_text() == f"{name}\n"
+    assert "secret" not in Path(f"/proc/{process.pid}/cmdline").read_text()
+    assert trainer.nice() == min(psutil.Process().nice() + nicer, 19)
