@@ -31,7 +31,7 @@ COMMANDS = {
     "sink": ("write", "Write the tracks of a running pipeline to files and elsewhere."),
     "export": ("export", "Convert the log of a run to other formats."),
     "report": ("report", "Write an HTML page about the tracks of a run."),
-    "status": ("attach", "Show the state of a running pipeline."),
+    "status": ("status", "Show the state of a running pipeline."),
     "set-box": ("attach", "Set the box of an object in a running pipeline."),
     "search": ("attach", "Search for the object of a saved model in a running pipeline."),
     "forget": ("attach", "Stop tracking an object in a running pipeline."),

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -19,18 +16,14 @@ import numpy as np
 from rich.console import Console
 
 from catstream.base.box import Box
-from catstream.base.clock import STEP_SECONDS, RunningClock
 from catstream.base.files import check_file
 from catstream.base.names import UNNAMED, check_name, split_name
-from catstream.base.text import counted
-from catstream.cli.common import complain, screen, table
 from catstream.cli.options import (
     FOLDER,
     PATH,
     NumberRange,
     combined,
     with_boxes,
-    with_json,
     with_keys,
     with_overwrite,
 )
@@ -38,10 +31,9 @@ from catstream.client.address import Address
 from catstream.client.attach import control, subscribe, wait_until_running
 from catstream.client.control import Control
 from catstream.client.subscription import Subscription
-from catstream.errors import ServiceError, SilenceError
+from catstream.errors import SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
-from catstream.messages.kinds import Health, run_state
 from catstream.wire.channels import CHANNELS, PUBLIC
 
 _SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
@@ -67,44 +59,17 @@ _with_fleet = click.option(
 with_fleet_address = combined("address", lambda fleet, keys: Address(fleet=fleet, keys=keys), _with_fleet, with_keys)
 
 
-def _address(endpoint: str, stream: str, fleet: str, keys: str, source: str = "") -> Address:
-    if endpoint and (stream or fleet):
-        raise click.UsageError("--endpoint (a pipeline) and --stream, --fleet (a stream) are mutually exclusive")
-    if source and (endpoint or stream):
-        raise click.UsageError("--source is mutually exclusive with --endpoint and --stream")
-    if fleet and not stream:
-        raise click.UsageError("--fleet requires --stream NAME")
-    return Address(stream=stream, fleet=fleet, keys=keys) if stream else Address.parse(endpoint, keys, source)
-
-
-_OPTIONS = (
+#: Adds the options that select a running pipeline or a stream of a fleet, as the argument `address`.
+with_address = combined(
+    "address",
+    lambda endpoint, keys: Address.parse(endpoint, keys),
     click.option(
         "--endpoint",
         callback=_not_empty,
         metavar="PLACE",
-        help="Endpoint of the pipeline; not needed if only one runs.",
+        help="Folder or address of the pipeline, or fleet://STREAM; not needed if only one runs.",
     ),
-    click.option("--stream", callback=_not_empty, metavar="NAME", help="A stream of a fleet, instead of --endpoint."),
-    _with_fleet,
     with_keys,
-)
-
-#: Adds the options that select a running pipeline or a stream of a fleet, as the argument `address`.
-with_address = combined(
-    "address", lambda endpoint, stream, fleet, keys: _address(endpoint, stream, fleet, keys), *_OPTIONS
-)
-
-#: The same, and `--source`.
-_with_address_or_source = combined(
-    "address",
-    _address,
-    *_OPTIONS,
-    click.option(
-        "--source",
-        callback=_not_empty,
-        metavar="SOURCE",
-        help="Select the pipeline by its source instead of --endpoint.",
-    ),
 )
 
 with_wait = click.option(
@@ -152,7 +117,7 @@ def watch(channel: str, address: Address, wait: float, name: str | None, as_json
       catstream watch tracks --json | jq .box
       catstream watch tracks --object anna
       catstream watch models --endpoint run --count 1 --json
-      catstream watch tracks --stream cam-7 --fleet head:5690 --keys anna
+      catstream watch tracks --endpoint fleet://head:5690/cam-7 --keys anna
     """
     received = 0
     address = address.with_endpoint()
@@ -209,174 +174,27 @@ def _line(value: Any) -> str:
     return "" if value is None else str(round(value, 4) if isinstance(value, float) else value)
 
 
-@click.command()
-@_with_address_or_source
-@with_json
-@click.option(
-    "--wait", default=3.0, show_default=True, type=NumberRange(0), help="Maximum seconds to wait for health reports."
-)
-def status(address: Address, as_json: bool, wait: float) -> None:
-    """Show the state of a running pipeline.
-
-    The state is running, waiting (for a box), paused, or lost (the source). The
-    exit status is 0 if all three processes sent a health report, else 1, so that
-    the command can be the health check of a container.
-
-    "learning" is the backlog: messages that the compressor has not received or
-    not stored; "rejected" counts invalid messages; "reports" is the age of the
-    last health report of each process.
-
-    \b
-    EXAMPLES
-      catstream status
-      catstream status --source walk.mp4
-      catstream status --endpoint run --json
-    """
-    address = address.with_endpoint()
-    reports = _collect_reports(address, wait)
-    summary = _summary(str(address), reports)
-    if as_json:
-        click.echo(json.dumps(summary))
-    elif reports:
-        click.echo(_format(summary))
-        if any(summary["objects"]):  # they have names
-            figures = ("state", "score", "model", "leaves")
-            objects = table("object", *figures, right=figures)
-            for name, cells in summary["objects"].items():
-                objects.add_row(name or "-", *("-" if cell is None else str(cell) for cell in cells.values()))
-            screen().print("", objects, sep="\n")
-    if silent := [name for name in _PROCESSES if name not in reports]:
-        problem = "" if reports else f": {address.resolve().hint()}"
-        complain(f"no health report at {address} within {wait:g} s from: {', '.join(silent)}{problem}")
-        sys.exit(1)
+def _control(address: Address, timeout: float) -> Control:
+    """Connect to a pipeline, and print its name."""
+    pipeline = control(address, timeout=timeout)
+    if pipeline.source:
+        click.echo(f"pipeline: {pipeline.source} at {pipeline.endpoint}", err=True)
+    return pipeline
 
 
-def _collect_reports(address: Address, seconds: float) -> dict[str, list[Health]]:
-    """Collect reports, oldest first, until there are two of the detector, for its rate, and one of the others."""
-    clock, reports = RunningClock(), dict[str, list[Health]]()
-    with subscribe(address, "health") as health:
-        while len(reports) < len(_PROCESSES) or len(reports["detector"]) < 2:
-            if (remaining := seconds - clock()) <= 0:
-                break
-            health.timeout = min(remaining, STEP_SECONDS)
-            with suppress(SilenceError):
-                if (report := next(health, None)) is None:
-                    break
-                reports.setdefault(report.process, []).append(report)
-    return reports
-
-
-def _summary(endpoint: str, reports: dict[str, list[Health]]) -> dict[str, Any]:
-    """Return the figures from the reports, None for those that are missing."""
-    newest = {name: history[-1] for name, history in reports.items()}
-    counters = {name: newest[name].counters if name in newest else {} for name in _PROCESSES}
-    objects = {name: newest[name].objects if name in newest else {} for name in _PROCESSES}
-    detector, history = counters["detector"], reports.get("detector", [])
-    seconds = history[-1].time - history[0].time if history else 0.0
-    rate = (history[-1].counters["sent"] - history[0].counters["sent"]) / seconds if seconds > 0 else None
-
-    def whole(process: str, *names: str) -> dict[str, int | None]:
-        own = counters[process]
-        return {name: int(own[name]) if name in own else None for name in names}
-
-    return {
-        "endpoint": endpoint,
-        "ok": len(reports) == len(_PROCESSES),
-        "state": newest["detector"].state if detector else None,
-        "objects": {
-            name: {
-                "state": ("present" if figures["present"] else "absent") if "present" in figures else None,
-                "score": round(figures["score"], 2) if "score" in figures else None,
-                "model_version": int(figures["model_version"]),
-                "leaves": int(objects["compressor"][name]["leaves"]) if name in objects["compressor"] else None,
-            }
-            for name, figures in objects["detector"].items()
-        },
-        "frames": whole("detector", "sent")["sent"],
-        "frames_per_second": None if rate is None else round(max(0.0, rate), 1),  # that of a restarted detector falls
-        "lag": int(detector["sent"] - detector["processed"]) if detector else None,
-        "not_stored": int(detector["sent"] - detector["stored"]) if detector else None,
-        **whole("detector", "model_version"),
-        **whole("compressor", "level", "leaves", "nodes", "bytes"),
-        **whole("detector", "skipped", "reconnects"),
-        "lost_seconds": detector.get("lost_seconds"),
-        "trouble": {name: report.trouble for name, report in newest.items() if report.trouble},
-        "rejected": {name: int(counters[name].get("rejected", 0)) for name in reports},
-        "processes": {
-            name: {"seconds_ago": round(max(0.0, time.time() - report.time), 2), "counters": report.counters}
-            for name, report in newest.items()
-        },
-    }
-
-
-def _format(summary: dict[str, Any]) -> str:
-    at = {name: "-" if value is None else value for name, value in summary.items()}
-    size = (summary["bytes"] or 0) / 1e6
-    lines = {
-        "pipeline": at["endpoint"],
-        "state": run_state(summary["processes"]["detector"]["counters"])[1] if summary["state"] else "-",
-        "frames": f"{at['frames']}, {at['frames_per_second']} a second",
-        "learning": f"{at['lag']} messages behind, {at['not_stored']} not stored",
-        "model": at["model_version"],
-    }
-    if summary["bytes"] is not None:  # None before the first box
-        lines["trees"] = f"{at['leaves']} leaves, {at['nodes']} nodes, level {at['level']}, {size:.1f} MB"
-    if summary["skipped"] is not None:  # None for a file
-        lines["source"] = f"{counted(summary['skipped'], 'frame')} skipped"
-        if summary["reconnects"] is not None:  # a demo is never lost
-            lines["source"] += f", {counted(summary['reconnects'], 'reconnect')}"
-    lines["rejected"] = counted(sum(summary["rejected"].values()), "message")
-    lines["reports"] = ", ".join(f"{name} {of['seconds_ago']:.1f} s ago" for name, of in summary["processes"].items())
-    if summary["trouble"]:
-        lines["trouble"] = "; ".join(f"{name}: {trouble}" for name, trouble in summary["trouble"].items())
-    return "\n".join(f"{name:10} {line}" for name, line in lines.items())
-
-
-@dataclass(frozen=True, slots=True)
-class _Target:
-    """The pipeline that a command is for, as given by the options."""
-
-    address: Address
-    timeout: float
-    yes: bool
-
-    @property
-    def is_named(self) -> bool:
-        return bool(str(self.address) or self.address.source)
-
-    def control(self) -> Control:
-        """Connect to the pipeline and print its name. At a terminal, ask for confirmation if it was not named."""
-        pipeline = control(self.address, timeout=self.timeout)
-        line = f"pipeline: {pipeline.source or 'a pipeline'} at {pipeline.endpoint}"
-        if str(self.address) and not pipeline.source:
-            pass  # there is nothing to say beside the endpoint
-        elif self.is_named or self.yes or not sys.stdin.isatty():
-            click.echo(line, err=True)
-        elif not click.confirm(f"{line}. Is this the right one?", default=True, err=True):
-            pipeline.close()
-            raise ServiceError("no command was sent: name the pipeline with --endpoint or --source")
-        return pipeline
-
-
-#: Adds the options that select a pipeline, as one argument `target`.
-_with_pipeline = combined(
-    "target",
-    _Target,
-    _with_address_or_source,
-    click.option(
-        "--timeout", default=5.0, show_default=True, type=NumberRange(0), help="Seconds to wait for an answer."
-    ),
-    click.option("--yes", is_flag=True, help="Do not ask for confirmation."),
+_with_timeout = click.option(
+    "--timeout", default=5.0, show_default=True, type=NumberRange(0), help="Seconds to wait for an answer."
 )
 
 
 def _with_control(command: Callable[..., str]) -> Callable[..., None]:
-    """Add the same options; the command gets a `Control`, and its return value is printed."""
+    """Add the options that select a pipeline; the command gets a `Control`, and its return value is printed."""
 
-    @_with_pipeline
+    @with_address
+    @_with_timeout
     @wraps(command)
-    def wrapped(target: _Target, **options: object) -> None:
-        with target.control() as pipeline:
+    def wrapped(address: Address, timeout: float, **options: object) -> None:
+        with _control(address, timeout) as pipeline:
             click.echo(command(pipeline, **options))
 
     return wrapped
@@ -475,8 +293,9 @@ def resume(pipeline: Control) -> str:
 @click.option("--object", "name", default=UNNAMED, metavar="NAME", help="Name of the object; default: the only one.")
 @click.option("--state", type=FOLDER, metavar="FOLDER", help="State folder of a run, which may have ended.")
 @with_overwrite
-@_with_pipeline
-def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: bool) -> None:
+@with_address
+@_with_timeout
+def save(address: Address, timeout: float, file: Path, state: Path | None, name: str, overwrite: bool) -> None:
     """Save the model and the coreset trees of an object to FILE.
 
     `catstream track SOURCE --model FILE` finds the object and continues its
@@ -491,12 +310,10 @@ def save(target: _Target, file: Path, state: Path | None, name: str, overwrite: 
     """
     check_file(file, overwrite=overwrite)
     if state is None:
-        with target.control() as pipeline:
+        with _control(address, timeout) as pipeline:
             version = pipeline.save(file, name).version
-    elif target.is_named:
-        raise click.UsageError(
-            "--state (the folder of a run) is mutually exclusive with --endpoint, --stream and --source"
-        )
+    elif str(address):
+        raise click.UsageError("--state (the folder of a run) and --endpoint are mutually exclusive")
     else:
         content = learned(state, Job.load(state).settings, check_name(name))
         content.save(file)

@@ -24,20 +24,18 @@ _SCHEME = "fleet://"
 class Address:
     """A running pipeline, or a stream of a fleet, wherever it runs; and the keys to connect with.
 
-    endpoint  of the pipeline; empty for the only one that runs, or for the one with this source
-    source    that the pipeline tracks, as it was given to the pipeline, or its file name
+    endpoint  of the pipeline; empty for the only one that runs
     stream    name of the stream; empty for a pipeline
     fleet     of the stream: HOST:PORT of its registry, or its name; empty for the only one of this user
     keys      folder of the keys of this client; empty if there are none
 
     >>> Address.parse("fleet://head:5690/cam-7")
-    Address(endpoint='', source='', stream='cam-7', fleet='head:5690', keys='')
+    Address(endpoint='', stream='cam-7', fleet='head:5690', keys='')
     >>> str(Address(stream="cam-7", fleet="site")), str(Address.parse("run"))
     ('fleet://site/cam-7', 'run')
     """
 
     endpoint: str = ""
-    source: str = ""
     stream: str = ""
     fleet: str = ""
     keys: str = ""
@@ -48,13 +46,13 @@ class Address:
         return f"{_SCHEME}{self.fleet}/{self.stream}" if self.fleet else f"{_SCHEME}{self.stream}"
 
     @classmethod
-    def parse(cls, text: str | os.PathLike[str] | Address, keys: str = "", source: str = "") -> Address:
+    def parse(cls, text: str | os.PathLike[str] | Address, keys: str = "") -> Address:
         """Parse an endpoint or the address of a stream; ServiceError if it is neither."""
         if isinstance(text, Address):
             return text
         text = os.fspath(text)
         if not text.startswith(_SCHEME):
-            return cls(text, source, keys=keys)
+            return cls(text, keys=keys)
         fleet, _, stream = text.removeprefix(_SCHEME).rpartition("/")
         if not stream or "/" in fleet or (":" in stream and not fleet):
             raise ServiceError(
@@ -85,7 +83,7 @@ class Address:
             with self.registry as registry:
                 return registry.running(self.stream)
         if not self.endpoint:
-            return find(self.source)
+            return find()
         endpoint = Endpoint.parse(self.endpoint, self.keys)
         endpoint.check_access()
         return endpoint

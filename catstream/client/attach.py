@@ -78,7 +78,6 @@ def control(
     *,
     timeout: float = ANSWER_SECONDS,
     keys: str = "",
-    source: str = "",
 ) -> Control:
     """Connect to a running pipeline to send commands.
 
@@ -91,8 +90,6 @@ def control(
         Seconds to wait for the answer to a command.
     keys : str
         Folder of the keys of this client, if the pipeline requires keys; their role must be "control".
-    source : str
-        Source that the pipeline tracks, for example "walk.mp4", instead of its endpoint.
 
     Raises
     ------
@@ -100,7 +97,7 @@ def control(
         If `endpoint` is empty and not exactly one pipeline runs, if the fleet has no such stream or it runs nowhere, or
         if the keys cannot be read.
     """
-    address = Address.parse(address, keys, source)
+    address = Address.parse(address, keys)
     if address.stream:
         return StreamControl(address.registry, address.stream, timeout=timeout)
     return Control(address.resolve(), timeout=timeout)

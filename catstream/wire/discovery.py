@@ -16,7 +16,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from catstream.base.addresses import without_password
 from catstream.base.files import descriptor, is_locked, lock, writing
 from catstream.base.forks import forked, generation
 from catstream.errors import ServiceError
@@ -130,24 +129,18 @@ def _endpoints(note: str, *, strict: bool = False) -> Iterator[tuple[Endpoint, s
                     raise
 
 
-def find(source: str = "") -> Endpoint:
-    """The endpoint of the user's only running pipeline, or of the one with this source.
+def find() -> Endpoint:
+    """The endpoint of the user's only running pipeline; its keys are in its note.
 
-    The keys of this user's pipelines are in their notes. The source is as it was given to the pipeline, or its file
-    name. ServiceError if there is none, or more than one.
+    ServiceError if there is none, or more than one.
     """
     endpoints = running()
     if not endpoints:
         list(_endpoints(_NOTE, strict=True))  # raises the error of a pipeline whose keys cannot be read
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or pass its --endpoint")
-    source = without_password(source)  # as it is in the note
-    matches = [endpoint for endpoint in endpoints if not source or _has_source(endpoint, source)]
-    if len(matches) == 1:
-        return matches[0]
-    if not matches:
-        raise ServiceError(f"no pipeline of yours tracks {source!r}: running{_listed(endpoints)}")
-    what = f"track {source!r}" if source else "are running"
-    raise ServiceError(f"{len(matches)} pipelines {what}: select one (--endpoint){_listed(matches)}")
+    if len(endpoints) > 1:
+        raise ServiceError(f"{len(endpoints)} pipelines are running: select one (--endpoint){_listed(endpoints)}")
+    return endpoints[0]
 
 
 def _listed(endpoints: list[Endpoint]) -> str:
@@ -161,11 +154,6 @@ def source_at(endpoint: Endpoint) -> str:
         return endpoint.source
     text = str(endpoint.folder.absolute()) if endpoint.folder is not None else str(endpoint)
     return next((other.source for other in running() if str(other) == text), "")
-
-
-def _has_source(endpoint: Endpoint, source: str) -> bool:
-    """Return True if a pipeline has this source: the same text, the same file, or a file of that name."""
-    return endpoint.source in (source, str(Path(source).absolute())) or Path(endpoint.source).name == source
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from catstream.cli.attach import _format, _summary
+from catstream.cli.status import Status
 from catstream.client.attach import control
 from catstream.features.layout import ROW_LENGTH
 from catstream.messages.kinds import End, Health, Track
@@ -86,12 +86,6 @@ def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
     assert [json.loads(line)["object"] for line in output.splitlines()] == objects
 
 
-def test_a_line_has_the_fields_that_are_not_empty(two_objects, said):
-    _, output, _ = said("watch", "tracks", "--endpoint", two_objects)
-    line = "frame 0  time 0.1  state absent  score 0.0  model_version 0"
-    assert [each.partition("  began")[0] for each in output.splitlines()[:2]] == [f"{line}  object anna", line]
-
-
 def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
     code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
     model = json.loads(output)
@@ -99,13 +93,6 @@ def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting
     assert model["weights"].keys() == {"dtype", "shape", "norm"}
     assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [ROW_LENGTH])
     assert (code, errors) == (0, "1 models, 0 missed\n")
-
-
-@pytest.mark.parametrize(("channel", "word"), [("samples", "  levels "), ("health", "  counters (")])
-def test_each_message_is_one_line(resting, succeed, channel, word):
-    output, _ = succeed("watch", channel, "--count", 1, "--endpoint", resting.endpoint)
-    (line,) = output.splitlines()
-    assert word in line
 
 
 def test_watch_says_why_nothing_arrives(resting, catstream):
@@ -149,14 +136,12 @@ def test_status_shows_all_processes(resting, said, until):
 def test_status_has_a_json_form(resting, succeed, until):
     def at_rest():
         output, _ = succeed("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
-        return (found := json.loads(output))["frames_per_second"] == 0 and found["leaves"] and found
+        return (found := json.loads(output))["frames_per_second"] == 0 and found
 
     found = until(at_rest)  # nobody takes its tracks
     assert found["ok"]
-    assert found["frames"] >= 1
-    assert found["model_version"] >= 1
-    assert found["leaves"] >= 4, "one in each tree"
     assert found["processes"].keys() == set(NAMES)
+    assert found["processes"]["detector"]["counters"]["sent"] >= 1
 
 
 def test_status_fails_and_names_a_silent_process(resting, said):
@@ -170,18 +155,16 @@ def test_status_fails_and_names_a_silent_process(resting, said):
     assert errors == f"catstream: no health report at {resting.endpoint} within 3 s from: trainer\n"
 
 
-def test_the_lines_of_status_that_depend_on_the_source_and_the_trees():
-    counters = {"sent": 9.0, "processed": 9.0, "stored": 9.0, "skipped": 2.0}
-    reports = {
-        "detector": [Health("detector", 1.0, counters)],
-        "compressor": [Health("compressor", 1.0, {"frames": 1.0})],
-    }
-    lines = _format(_summary("run", reports)).splitlines()
-    assert "source     2 frames skipped" in lines, "a demo never reconnects"
-    assert not [line for line in lines if line.startswith("trees")], "there are none before the first box"
+def test_lines_of_status_depend_on_the_source_and_the_trees():
+    counters = {"sent": 9.0, "processed": 9.0, "stored": 9.0, "skipped": 2.0, "model_version": 3.0}
+    status = Status("run", processes={"detector": Health("detector", 1.0, counters)})
+    status.processes["compressor"] = Health("compressor", 1.0, {"frames": 1.0})
+    lines = dict(status.lines())
+    assert lines["source"] == "2 frames skipped", "a demo never reconnects"
+    assert "trees" not in lines, "there are none before the first box"
     counters["reconnects"] = counters["skipped"] = 1.0
     trees = {"leaves": 7.0, "nodes": 5.0, "level": 1.0, "bytes": 4.6e6}
-    reports["compressor"] = [Health("compressor", 1.0, trees)]
-    lines = _format(_summary("run", reports)).splitlines()
-    assert "source     1 frame skipped, 1 reconnect" in lines
-    assert "trees      7 leaves, 5 nodes, level 1, 4.6 MB" in lines
+    status.processes["compressor"] = Health("compressor", 1.0, trees)
+    lines = dict(status.lines())
+    assert lines["source"] == "1 frame skipped, 1 reconnect"
+    assert lines["trees"] == "7 leaves, 5 nodes, level 1, 4.6 MB"

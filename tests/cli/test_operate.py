@@ -91,7 +91,7 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert steer("set-box", f"anna={box}")[0] == 0
     code, answer = steer("set-box", "ben=20,150,70,60")
     assert (code, answer.startswith("the object ben begins at 20,150,70,60 in frame")) == (0, True)
-    assert until(status)["objects"].keys() == {"anna", "ben"}
+    until(lambda: status()["processes"]["detector"]["objects"].keys() == {"anna", "ben"})
     table = said("status", "--endpoint", tmp_path / "run", "--wait", 60)[1].splitlines()
     assert table[-3].split() == ["object", "state", "score", "model", "leaves"]
     assert {line.split()[0] for line in table[-2:]} == {"anna", "ben"}

@@ -22,7 +22,7 @@ def test_a_malformed_address_of_a_stream_is_an_error(text):
 
 @pytest.mark.parametrize("text", ["", "run", "tcp://127.0.0.1:5700"])
 def test_any_other_text_is_the_endpoint_of_a_pipeline(text):
-    assert Address.parse(text, "keys", "walk.mp4") == Address(text, "walk.mp4", keys="keys")
+    assert Address.parse(text, "keys") == Address(text, keys="keys")
 
 
 def test_an_empty_address_is_the_only_pipeline_also_when_another_one_starts():
@@ -30,7 +30,6 @@ def test_an_empty_address_is_the_only_pipeline_also_when_another_one_starts():
         address = Address().with_endpoint()
         with private_folder() as folder, reserve_endpoint("", folder, source="run.mp4"):
             assert address.resolve() == only
-            assert Address(source="walk.mp4").resolve() == only
             with pytest.raises(ServiceError, match="2 pipelines are running"):
                 Address().resolve()
     assert address.with_endpoint() is address
