@@ -16,7 +16,7 @@ measure() { # NAME SCRIPT [OPTION...]: benchmarks/results/NAME.json
 
 measure startup "$python" benchmarks/startup.py --runs 3
 measure resume "$python" benchmarks/resume.py --moments 8
-measure loadtest "$catstream" loadtest --streams 2 --duration 20
+"$python" benchmarks/provenance.py benchmarks/results/loadtest.json "$catstream" loadtest --streams 2 --duration 20
 measure speed "$python" benchmarks/speed.py --frames 600 \
     --sequences TLD_01_david TLD_06_car OTB_Woman TLD_10_panda
 "$python" benchmarks/page.py

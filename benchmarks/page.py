@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from textwrap import fill
 from typing import Any
 
 from plots import dots, lines
 from sequences import CHECK, TUNED
 from table import Cell
-
-from catstream.evaluation.accuracy import COUNTS
 
 _ROOT = Path(__file__).parents[1]
 IMAGES = _ROOT / "docs" / "images"
@@ -28,6 +26,7 @@ BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- /results -->)", re.DOTA
 _NAMES = {"csrt": "CSRT", "kcf": "KCF", "mil": "MIL", "nano": "NanoTrackV2", "nano-v3": "NanoTrackV3"}
 _ACCURACY = ("accuracy-peers", "accuracy-networks", "accuracy")
 _PEERS = "Beside OpenCV's trackers"  # titles of tables in the record of speed.py
+_COUNTS = ("absent", "noticed", "present", "false")  # of a sequence: see accuracy.Row
 _SIZES = "Frames/s against the size of the image"
 
 
@@ -71,7 +70,6 @@ def accuracy(records: Records) -> str:
     means = {name: _means({video: each[video] for video in new}) for name, each in trackers.items()}
     times = {name: row["times that of catstream"] for name, row in cost.items()}
     return _block(
-        records,
         f"""**Of the trackers that learn from one box, without pretrained weights, it is the most accurate: AUC
         {means["catstream"][0]:.3f} on new sequences, CSRT {means["csrt"][0]:.3f} at
         {times["csrt"]:.1f} times the processor time.** NanoTrackV3, a network trained on many videos, has
@@ -87,10 +85,6 @@ def accuracy(records: Records) -> str:
             )
             for name in sorted(trackers, key=lambda name: -means[name][0])
         ],
-        "accuracy",
-        "accuracy-networks",
-        "accuracy-peers",
-        "peers",
     )
 
 
@@ -120,14 +114,11 @@ def boxes(records: Records) -> str:
         for group, names in groups.items()
     ]
     return _block(
-        records,
         f"""**Little on average: over four boxes that differ by at most 2 %, the AUC is {rows[0][3]:.3f} in place of
         {rows[0][1]:.3f}.** On new sequences it is lower than on those of the choice of the defaults: expect
         {rows[2][3]:.2f} to {rows[2][1]:.2f}.""",
         ("sequences", "AUC, true box", "success", "AUC, mean of four boxes", "success"),
         rows,
-        "accuracy",
-        "accuracy-jitter",
     )
 
 
@@ -137,7 +128,7 @@ def absence(records: Records) -> str:
         for name, absent, noticed, present, false in _absence(records)
     ]
     heads = ("sequence, four runs", "frames without it", "absence noticed", "frames with it", "falsely absent")
-    return _block(records, f"**Not always: {_noticed(records)}**", heads, rows, "accuracy-jitter")
+    return _block(f"**Not always: {_noticed(records)}**", heads, rows)
 
 
 def speed(records: Records) -> str:
@@ -149,13 +140,11 @@ def speed(records: Records) -> str:
         *((f"`catstream track`, {size} pixels", None, sizes[size]["local"]) for size in _SHOWN_SIZES),
     ]
     return _block(
-        records,
         f"""**{three["the rest"]:.0f} frames/s with `catstream track` on {records["speed"]["machine"]["cores"]} cores,
         {one["the rest"]:.0f} with a `Tracker` on one; at 1920x1080 pixels
         {sizes["1920x1080"]["local"]:.0f}.**""",
         ("frames/s", "first 150 frames", "the rest"),
         rows,
-        "speed",
     )
 
 
@@ -164,12 +153,9 @@ _SHOWN_SIZES = ("640x480", "1920x1080", "3840x2160")
 
 def startup(records: Records) -> str:
     times = {kernels: row["first track, s"] for kernels, row in records.rows("startup").items()}
-    return _block(
-        records,
-        f"""**In {times["warm"]:.1f} s; the first time, when kernels are compiled, in {times["cold"]:.0f} s.**""",
-        ("kernels", "first track, s", "the slowest of three", "first learned model, s"),
-        [(name, *list(row.values())[2:]) for name, row in records.rows("startup").items()],
-        "startup",
+    return _paragraph(
+        f"""**The first track arrives in {times["warm"]:.1f} s; the first time, when kernels are compiled, in
+        {times["cold"]:.0f} s** (medians of three)."""
     )
 
 
@@ -188,7 +174,6 @@ def long(records: Records) -> str:
     growth = records.rows("long_videos-50000", 1)
     ratios, memory = ([row[column] for row in growth.values()] for column in ("ratio", "MB at the end"))
     return _block(
-        records,
         f"""**Yes, except where it loses the object (panda): the processor time of a frame in the last tenth of 50,000
         frames is {min(ratios):.2f} to {max(ratios):.2f} of that in the first tenth, the memory of all processes at most
         {max(memory):.0f} MB.**""",
@@ -197,8 +182,6 @@ def long(records: Records) -> str:
             [name.removesuffix(", n = 64"), *list(row.values())[1:3], *list(row.values())[4:]]
             for name, row in growth.items()
         ],
-        "long_videos",
-        "long_videos-50000",
     )
 
 
@@ -215,24 +198,19 @@ def paper(records: Records) -> str:
         return [f"{min(values):.3f} to {max(values):.3f}" for _, *values in (row.values() for row in rows)]
 
     defaults = records.rows("tld-defaults")["defaults"]["mean"]
-    car = records.rows("long_videos")
     rows: list[Sequence[Cell]] = [
         ("on TLD", tld["cat25"]["paper: mean of ten"], tld["cat25"]["mean"], defaults),
         ("trained on all nodes of the tree", *trees("hierarchy")),
         ("trained on its root", *trees("root")),
         ("trained on a coreset", *sampled("coreset")),
         ("trained on a random sample of the same size", *sampled("random")),
-        ("on 100,000 frames", car["paper: CAT, n = 2500"]["100000"], None, car["TLD_06_car, n = 64"]["100000"]),
     ]
-    used = ("tld", "tld-defaults", "root_or_hierarchy", "root_or_hierarchy-ours", "sampling", "sampling-ours")
     return _block(
-        records,
         """**Two are not.** Training on all nodes of the tree is better than on its root with the defaults, but not with
         the paper's settings. A coreset is better than a random sample with the paper's settings, but not with the
         defaults.""",
         ("success", "printed in the paper", "the paper's settings", "the defaults"),
         rows,
-        *used,
     )
 
 
@@ -240,33 +218,24 @@ def training(records: Records) -> str:
     columns = ("points", "all points, ms", "coreset, n = 64, ms")
     rows = [[row[column] for column in columns] for row in records.rows("time_complexity").values()]
     points, everything, coreset = zip(*rows, strict=True)
+    rows = [rows[0], rows[len(rows) // 2], rows[-1]]
     return _block(
-        records,
         f"""**Yes: from {points[0]} to {points[-1]:,} points, one training on a coreset takes {min(coreset):.1f} to
         {max(coreset):.1f} ms, on all points {everything[0]:.0f} to {everything[-1]:,.0f} ms.**""",
         columns,
         rows,
-        "time_complexity",
     )
 
 
 def load(records: Records) -> str:
     record = records["loadtest"]
     streams, track, model = record["streams"], record["latency"]["track"], record["latency"]["model"]
-    rate, cores = (sum(stream[kind] for stream in streams) for kind in ("frames_per_second", "cores"))
-    return _block(
-        records,
+    cores = sum(stream["cores"] for stream in streams)
+    return _paragraph(
         f"""**At least {len(streams)} of 640x480 pixels at {record["plan"]["rate"]:.0f} frames/s, with {cores:.1f} of
-        {record["machine"]["cores"]} cores.** `catstream loadtest` finds the number for a machine.""",
-        ("cameras", "frames/s of each", "track after, median", "99 %", "learned after, median"),
-        [
-            (
-                len(streams),
-                rate / len(streams),
-                *(f"{1000 * time:.0f} ms" for time in (track["p50"], track["p99"], model["p50"])),
-            )
-        ],
-        "loadtest",
+        {record["machine"]["cores"]} cores.** The track of a frame arrives after {1000 * track["p50"]:.0f} ms (median;
+        99 % {1000 * track["p99"]:.0f} ms), the model trained on it after {1000 * model["p50"]:.0f} ms. `catstream
+        loadtest` measures other loads."""
     )
 
 
@@ -281,14 +250,11 @@ def faults(records: Records) -> str:
     name = f"all processes killed, {killed['killed']} times"
     rows.append((name, killed["rows lost"], killed["s to a new row"], longest, None, None))
     return _block(
-        records,
         f"""**No row is lost, and the run continues within {max(row[5] for row in recovery):.1f} s, or within
         {longest:.1f} s after all processes were killed.** Faults are kill -9, SIGSTOP, a full disk and a clock that
         jumps.""",
         ("run", "lost", "s to recover, median", "slowest", "success without faults", "with"),
         rows,
-        "chaos",
-        "resume",
     )
 
 
@@ -296,16 +262,15 @@ def fleet(records: Records) -> str:
     rows, noticed = records.rows("fleet_faults"), records.rows("fleet_faults", 1)
     (films,) = records.rows("fleet_faults", 2).values()
     return _block(
-        records,
         f"""**In {rows["all"]["p50 s"]:.0f} s (median), at most {rows["all"]["slowest s"]:.0f} s; no row was lost or
         doubled, and the trees of {films["trees the same"]} videos are those without faults, bit for bit.** Most of the
-        time passes until Ray has noticed the fault.""",
-        ("fault", "times", "s to recover, median", "slowest", "since Ray noticed it, median"),
+        time passes until Ray notices the fault.""",
+        ("fault", "times", "s to recover, median", "slowest", "after Ray noticed"),
         [
-            (name, row["times"], row["p50 s"], row["slowest s"], noticed[name]["p50 s"] if name in noticed else None)
+            (name, row["times"], row["p50 s"], row["slowest s"], noticed[name]["p50 s"])
             for name, row in rows.items()
+            if name in noticed
         ],
-        "fleet_faults",
     )
 
 
@@ -313,12 +278,10 @@ def found(records: Records) -> str:
     real, rendered = records.rows("instance"), records.rows("instance", 2)
     recall = "recall at 1 false alarm in 100"
     return _block(
-        records,
         f"""**Mostly: in {real["catstream"][recall]:.0%} of the frames with the object, at one false alarm in 100
         frames.** Template matching and ORB know the first frame only, as does the second row.""",
         ("method", "mean AP, public sequences", recall, "AP, rendered, as in the paper"),
         [(name, row["mean AP"], row[recall], rendered[name]["AP"]) for name, row in real.items()],
-        "instance",
     )
 
 
@@ -327,34 +290,24 @@ def annotation(records: Records) -> str:
     frames = records.sequences("accuracy")
     rows: list[Sequence[Cell]] = []
     for group, names in (("the check list", complete.keys() & CHECK), ("the others", complete.keys() - CHECK)):
-        for boxes in (1, 2, 4, 6, 8):
+        for boxes in (2, 4, 8):
             each = [row for row in measured if row["name"] in names and row["boxes"] == boxes]
             checked = {row["name"]: row["checked"] * frames[row["name"]]["frames"] - boxes for row in each}
             precise = {row["name"]: row["precision"] for row in each if row["precision"] is not None}
             right = sum(checked[name] * share for name, share in precise.items())
-            pooled = right / sum(checked[name] for name in precise) if precise else None
+            pooled = right / sum(checked[name] for name in precise)
             others = (fmean(row[share] for row in each) for share in ("interpolation", "forward"))
-            success, precision = _with_error([row["success"] for row in each]), _with_error(precise.values())
             share = fmean(row["checked"] for row in each)
-            rows.append((f"{len(names)} of {group}", boxes, success, share, pooled, precision, *others))
+            success = fmean(row["success"] for row in each)
+            rows.append((f"{len(names)} of {group}", boxes, success, share, pooled, *others))
     done = {boxes: sum((count or 9) <= boxes for count in complete.values()) for boxes in (2, 4, 8)}
     until = fmean(count for count in complete.values() if count)
     return _block(
-        records,
         f"""**Two are enough for {done[2]} of {len(complete)} sequences, four for {done[4]}, eight for {done[8]},
         which need {until:.1f} on average:** then at least 95 % of the frames are right, and expected to be.""",
-        (
-            *("sequences", "boxes", "success", "checked", "of these, right", "mean over sequences"),
-            *("interpolation", "forwards only"),
-        ),
+        ("sequences", "boxes", "success", "checked", "of these, right", "interpolation", "forwards only"),
         rows,
-        "keyframes",
     )
-
-
-def _with_error(values: Collection[float]) -> str:
-    """Return a mean with its standard error."""
-    return f"{fmean(values):.3f} ± {stdev(values) / len(values) ** 0.5:.3f}" if len(values) > 1 else ""
 
 
 def hostile(records: Records) -> str:
@@ -362,7 +315,7 @@ def hostile(records: Records) -> str:
     inputs, crashes, hangs = (sum(row[column] for row in rows) for column in ("inputs", "crashes", "hangs"))
     answer = f"""**No: {len(rows)} decoders of messages and files had {inputs:,} hostile inputs, with {crashes} crashes,
         {hangs} hangs and at most {max(row["MB more"] for row in rows):.0f} MB more memory.**"""
-    return _block(records, answer, (), (), "fuzz")
+    return _paragraph(answer)
 
 
 def stream(records: Records) -> str:
@@ -373,7 +326,7 @@ def stream(records: Records) -> str:
         error = f"+{share:.1%}" if share > 1e-3 else f"{share:.0e}" if share > 1e-8 else "0"
         cells.setdefault(name, []).append(f"{error}, {seconds:.1f} s, {memory:.0f} MB")
     heads = ("", *dict.fromkeys(f"d = {d:,}, {rows:,} rows" for _, d, rows, *_ in table))
-    return _block(records, "", heads, [(name, *row) for name, row in cells.items()], "sketch")
+    return _block("", heads, [(name, *row) for name, row in cells.items()])
 
 
 def summary(records: Records) -> str:
@@ -411,9 +364,9 @@ def _means(rows: dict[str, dict[str, Any]]) -> tuple[float, float]:
 def _absence(records: Records) -> list[tuple[Any, ...]]:
     """Return the counts of frames of each sequence with absence, and of all sequences."""
     rows = records.sequences("accuracy-jitter")
-    total = (sum(row[count] for row in rows.values()) for count in COUNTS)
+    total = (sum(row[count] for row in rows.values()) for count in _COUNTS)
     return [
-        *((name, *(row[count] for count in COUNTS)) for name, row in rows.items() if row["absent"]),
+        *((name, *(row[count] for count in _COUNTS)) for name, row in rows.items() if row["absent"]),
         (f"all {len(rows)}", *total),
     ]
 
@@ -426,16 +379,12 @@ def _noticed(records: Records) -> str:
     )
 
 
-def _block(records: Records, answer: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *names: str) -> str:
-    """Return an answer, a table, and the commands that measured it, folded."""
-    parts = [_paragraph(answer)] if answer else []
-    if heads:
-        cells = zip(*map(_column, zip(*rows, strict=True)), strict=True)
-        lines = (heads, ["---", *["---:"] * (len(heads) - 1)], *cells)
-        parts.append("\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines))
-    commands = "\n".join(line for name in names for line in _command(records[name]))
-    parts.append(f'<details markdown="1"><summary>Commands</summary>\n\n```console\n{commands}\n```\n\n</details>')
-    return "\n\n".join(parts)
+def _block(answer: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+    """Return an answer and a table."""
+    cells = zip(*map(_column, zip(*rows, strict=True)), strict=True)
+    lines = (heads, ["---", *["---:"] * (len(heads) - 1)], *cells)
+    table = "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
+    return f"{_paragraph(answer)}\n\n{table}" if answer else table
 
 
 def _column(cells: Sequence[Cell]) -> Sequence[str]:
@@ -444,14 +393,6 @@ def _column(cells: Sequence[Cell]) -> Sequence[str]:
     decimals = 0 if most >= 100 else 1 if most >= 10 else 2 if most > 1 else 3
     forms = {float: f"{{:.{decimals}f}}", int: "{:,}", str: "{}"}
     return ["" if cell is None else forms[type(cell)].format(cell) for cell in cells]
-
-
-def _command(record: Any) -> Iterable[str]:
-    """Return the command that wrote a record, and its provenance as a comment."""
-    machine, settings = record["machine"], record["settings"]
-    made = [record["date"], f"commit {record['commit']}", f"{machine['cores']} cores of {machine['processor']}"]
-    made += [f"{len(settings)} settings differ from the defaults"] if len(settings) > 2 else settings
-    return f"# {', '.join(made)}", f"$ {record['command']}"
 
 
 def _paragraph(text: str) -> str:

@@ -1,7 +1,7 @@
 """Processor time of a frame, without decoding, of catstream and of OpenCV's trackers in turns.
 
 Other work on the machine changes it less than the time. CSRT and KCF need pip install "catstream[peers]", NanoTrack
-its model files: see docs/how-to/evaluate.md.
+its model files: see README.md.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from statistics import fmean, median
 from time import process_time
 
 from accuracy import available
+from opencv_trackers import Peer
 from sequences import named
 from table import Table, benchmark, command
 
 from catstream.base.settings import Settings
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.peers import Peer
 from catstream.tracker import Tracker
 
 TRACKERS = ("catstream", "csrt", "kcf", "mil", "nano", "nano-v3")

@@ -18,9 +18,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from accuracy import available, shortened
+from accuracy import TrackerRun, available, follow_from, run_all, shortened
 from journey import Journey, travel
 from sequences import named, rendered
+from starts import FIRST
 from table import Table, benchmark, command
 
 from catstream.base.box import Box
@@ -29,8 +30,6 @@ from catstream.base.settings import Settings
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
 from catstream.evaluation.datasets import Sequence
-from catstream.evaluation.onepass import evaluate, follow
-from catstream.evaluation.runs import EvaluationRun
 from catstream.features.pyramid import Pyramid
 from catstream.training.trainer import Trainer
 
@@ -72,7 +71,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     sequences = [one for one in shortened(options) if {one.name, "all"} & {*options.sequences}]
     journeys = [sequence_in_pipeline(sequence) for sequence in sequences]
     trackers, missing = available(TRACKERS)
-    runs = evaluate(sequences, trackers, Settings())
+    runs = run_all(sequences, trackers, Settings())
     own = [run for run in runs if run.tracker == "catstream"]
     yield beside_peers(sequences, journeys, runs, missing)
     yield frame_times(own, journeys, cases, frames)
@@ -114,7 +113,7 @@ def own_program(options: argparse.Namespace) -> Table:
     )
 
 
-def beside_peers(sequences: list[Sequence], journeys: list[Journey], runs: list[EvaluationRun], missing: str) -> Table:
+def beside_peers(sequences: list[Sequence], journeys: list[Journey], runs: list[TrackerRun], missing: str) -> Table:
     """Compare all trackers on one core, and the pipeline and CSRT on all cores; the first frames and the later ones."""
     found = {
         f"{tracker}, one core": together(run.seconds[1:] for run in runs if run.tracker == tracker)
@@ -123,7 +122,9 @@ def beside_peers(sequences: list[Sequence], journeys: list[Journey], runs: list[
     found["catstream, three processes"] = pipeline = together(journey.milliseconds / 1000 for journey in journeys)
     if any(run.tracker == "csrt" for run in runs):
         cv2.setNumThreads(os.cpu_count() or 1)
-        found["csrt, all cores"] = together(follow("csrt", Settings(), sequence).seconds[1:] for sequence in sequences)
+        found["csrt, all cores"] = together(
+            follow_from("csrt", Settings(), sequence, FIRST, None).seconds[1:] for sequence in sequences
+        )
         cv2.setNumThreads(1)
     own = found["catstream, one core"]
     rows = [(name, *rates, last(own) / last(rates), last(pipeline) / last(rates)) for name, rates in found.items()]
@@ -152,7 +153,7 @@ def together(times: Iterable[np.ndarray]) -> tuple[float, float | None]:
 
 
 def frame_times(
-    runs: list[EvaluationRun], journeys: list[Journey], cases: Iterable[tuple[tuple[int, int], bool]], frames: int
+    runs: list[TrackerRun], journeys: list[Journey], cases: Iterable[tuple[tuple[int, int], bool]], frames: int
 ) -> Table:
     """Return frames per second, and the median, the 99th percentile and the maximum of the time of a frame.
 
@@ -174,7 +175,9 @@ def frame_times(
         name = f"{width}x{height}" + (f", box of {TINY}x{TINY}" if tiny else "")
         sequence = demo((width, height), frames, tiny)
         journey = demo_in_pipeline(frames, (width, height), tiny, Settings())
-        rows.append((name, "one", *spread(1000 * follow("catstream", Settings(), sequence).seconds[1:])))
+        rows.append(
+            (name, "one", *spread(1000 * follow_from("catstream", Settings(), sequence, FIRST, None).seconds[1:]))
+        )
         rows.append((name, "three", *spread(journey.milliseconds)))
     columns = ("video", "processes", "frames/s", "p50, ms", "p99, ms", "slowest, ms", "slowest, medians")
     note = f"""{len(runs)} sequences; the rendered video has {frames} frames

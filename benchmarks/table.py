@@ -15,15 +15,15 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
+from provenance import ROOT, provenance
+
 from catstream.base.settings import Settings
 from catstream.base.threads import one_thread
 from catstream.errors import CatstreamError
-from catstream.reports.provenance import provenance
 
-_ROOT = Path(__file__).parents[1]
 _DATA = Path(os.environ.get("TRACKING_DATA", "data"))
 #: Options with paths of this machine.
-_PLACES = ("--json", "--data", "--output", "--strips", "--attributes", "--models", "--peer-models")
+_PLACES = ("--json", "--data", "--strips", "--models")
 
 Cell = str | int | float | None
 
@@ -89,7 +89,7 @@ def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Sett
     Parameters
     ----------
     tables : what was measured
-    options : of `command`
+    options : of `command`; the figures in its attribute `record`, if `tables` sets it, are written beside the tables
     settings : those that hold for all tables, None for the defaults
     """
     shown = []
@@ -102,7 +102,8 @@ def publish(tables: Iterable[Table], options: argparse.Namespace, settings: Sett
     except CatstreamError as error:
         sys.exit(f"{Path(sys.argv[0]).name}: {error}")
     if options.json is not None:
-        figures = {**provenance(settings or Settings(), list(_words())), "tables": shown}
+        made = provenance((settings or Settings()).changed(), list(_words()))
+        figures = {**made, **getattr(options, "record", {}), "tables": shown}
         options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
@@ -142,7 +143,7 @@ def _cell(cell: Cell) -> str:
 def _words() -> Iterator[str]:
     """Return the command of this process as typed in the checkout, without the options in `_PLACES`."""
     program = Path(sys.argv[0]).resolve()
-    yield from ("python", program.relative_to(_ROOT).as_posix() if _ROOT in program.parents else program.name)
+    yield from ("python", program.relative_to(ROOT).as_posix() if ROOT in program.parents else program.name)
     words: Iterator[Any] = iter(sys.argv[1:])
     for word in words:
         if word in _PLACES:

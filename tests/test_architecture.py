@@ -43,8 +43,6 @@ IMPORTERS = {
         "catstream/paper",
         "catstream/video",
         "catstream/base/threads.py",
-        *("catstream/evaluation/peers.py", "catstream/evaluation/nanotrack.py"),
-        "catstream/reports/provenance.py",  # its version
         "catstream/processes/detector.py",
         "catstream/sinks/events.py",
     ],
@@ -62,7 +60,7 @@ IMPORTERS = {
     "paho": ["catstream/sinks/mqtt_sink.py"],
     "msgpack": ["catstream/wire/codec.py"],
     "msgspec": ["catstream"],
-    "threadpoolctl": ["catstream/base/threads.py", "catstream/reports/provenance.py"],
+    "threadpoolctl": ["catstream/base/threads.py"],
     "psutil": ["catstream/loadtest/latency.py"],
     "jinja2": ["catstream/reports/report.py"],
     "click": ["catstream/cli"],

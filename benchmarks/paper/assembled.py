@@ -10,7 +10,8 @@ from time import perf_counter
 from unittest.mock import patch
 
 import numpy as np
-from accuracy import starts_of
+from accuracy import TrackerRun, starts_of
+from starts import Start
 
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
@@ -20,8 +21,7 @@ from catstream.base.workers import SPAWN
 from catstream.compression.compressor import Compressor
 from catstream.compression.tree import CoresetTree
 from catstream.detection.objects import Detectors
-from catstream.evaluation.datasets import Sequence, Start
-from catstream.evaluation.runs import EvaluationRun
+from catstream.evaluation.datasets import Sequence
 from catstream.features.pyramid import Pyramid
 from catstream.paper.scm import SparseCollaborativeModel
 from catstream.training.trainer import Trainer
@@ -43,11 +43,11 @@ class Recipe:
 
 def follow_all(
     options: argparse.Namespace, sequences: list[Sequence], recipes: dict[str, Recipe]
-) -> dict[str, list[EvaluationRun]]:
+) -> dict[str, list[TrackerRun]]:
     """Run each recipe over all sequences and starts; return the runs in the same order for each."""
     starts, jobs = starts_of(options), 1 if options.quick else options.jobs
     tasks = [(recipes, sequence, start) for sequence in sequences for start in starts(sequence)]
-    runs: dict[str, list[EvaluationRun]] = {name: [] for name in recipes}
+    runs: dict[str, list[TrackerRun]] = {name: [] for name in recipes}
     with ProcessPoolExecutor(jobs, mp_context=SPAWN) as pool:
         for found in (map if jobs == 1 else pool.map)(follow_each, *zip(*tasks, strict=True)):
             for run in found:
@@ -55,7 +55,7 @@ def follow_all(
     return runs
 
 
-def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: Start) -> list[EvaluationRun]:
+def follow_each(recipes: dict[str, Recipe], sequence: Sequence, start: Start) -> list[TrackerRun]:
     """Run each recipe on one sequence, from the same start."""
     runs = []
     # SCM is slow and does not depend on the recipe, so each frame is computed once for all recipes.
@@ -88,19 +88,20 @@ class Shared:
         return self.found[self.told - 1]
 
 
-def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> EvaluationRun:
+def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> TrackerRun:
     """Run the loop of `catstream.tracker.Tracker` with other trees, and stop learning after a share of the frames."""
-    frames = len(sequence) - start.frame
+    rest, first = sequence.since(start.frame), start.box(sequence)
+    frames = len(rest)
     settings = recipe.settings.for_length(frames)
     detectors, compressor, trainer = Detectors(settings), Compressor(settings), Trainer(settings)
     compressor.trees = {name: recipe.tree(settings.coreset.size) for name in compressor.trees}
-    boxes, scores, moments = [], [], [perf_counter()]
+    boxes, moments = [], [perf_counter()]
     with one_thread(opencv=True):
-        for row, image in enumerate(sequence.frames(start.frame)):
+        for row, image in enumerate(rest.frames()):
             frame = Pyramid(image)
             given = {}
             if row == 0:
-                given[UNNAMED] = detectors.begin(UNNAMED, frame, start.box(sequence, image.shape[1::-1]))
+                given[UNNAMED] = detectors.begin(UNNAMED, frame, first)
             tracks, features = detectors.step(frame, results=given)
             track = tracks.tracks[UNNAMED]
             part, version = features.objects[UNNAMED], compressor.version + 1
@@ -108,6 +109,5 @@ def follow(name: str, recipe: Recipe, sequence: Sequence, start: Start) -> Evalu
             if sample is not None:
                 detectors.adopt(trainer.train(sample))
             boxes.append(track.box or (np.nan,) * 4)
-            scores.append(track.score)
             moments.append(perf_counter())
-    return EvaluationRun(name, sequence, start, np.array(boxes), np.array(scores), np.diff(moments))
+    return TrackerRun(rest, np.array(boxes), np.diff(moments), name, start)

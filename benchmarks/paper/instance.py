@@ -257,7 +257,9 @@ def _paper(found: list[Sequence], learning: int, searched: int) -> Table:
     rng = np.random.default_rng(0)
     plain = np.full((240, 320, 3), 190, np.uint8)
     shown = [_shown(plain, rng, 20, (0.9, 1.1), (0.95, 1.05), centre) for centre in _path(learning)]
-    backgrounds = [cv2.resize(next(iter(sequence.frames(len(sequence) // 2))), (320, 240)) for sequence in found]
+    backgrounds = [
+        cv2.resize(next(iter(sequence.since(len(sequence) // 2).frames())), (320, 240)) for sequence in found
+    ]
     tasks: list[tuple[np.ndarray, Box | None]] = []
     for number in range(searched):
         background = backgrounds[number % len(backgrounds)]

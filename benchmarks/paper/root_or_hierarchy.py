@@ -10,15 +10,13 @@ import argparse
 from collections.abc import Iterator
 
 import shared  # noqa: F401
-from accuracy import MEANS, accuracy_command, described, means, spread, videos
+from accuracy import MEANS, TrackerRun, accuracy_command, described, means, rows_of, spread, videos
 from assembled import Recipe, follow_all
 from table import Table, benchmark
 
 from catstream.base.settings import PRESETS, Settings
 from catstream.compression.node import sample
 from catstream.compression.tree import CoresetTree
-from catstream.evaluation.accuracy import rows_of
-from catstream.evaluation.runs import EvaluationRun
 from catstream.messages.kinds import Summary
 
 #: Training set -> success and precision in the paper.
@@ -50,7 +48,7 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
     yield Table("Root or hierarchy", columns, rows, f"{described(options)} of each sequence")
 
 
-def ends(runs: list[EvaluationRun]) -> Iterator[str | float]:
+def ends(runs: list[TrackerRun]) -> Iterator[str | float]:
     """Yield the names and the success of the worst and of the best sequence."""
     ranked = sorted(rows_of(runs), key=lambda row: row.success)
     for row in (ranked[0], ranked[-1]):
@@ -58,4 +56,4 @@ def ends(runs: list[EvaluationRun]) -> Iterator[str | float]:
 
 
 if __name__ == "__main__":
-    benchmark(figures, accuracy_command(__doc__, starts=3, kept=False), ours=(False, "only with our settings"))
+    benchmark(figures, accuracy_command(__doc__, starts=3), ours=(False, "only with our settings"))

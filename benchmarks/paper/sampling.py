@@ -110,7 +110,7 @@ def base_of(options: argparse.Namespace) -> Settings:
 if __name__ == "__main__":
     benchmark(
         figures,
-        accuracy_command(__doc__, kept=False),
+        accuracy_command(__doc__),
         base_of,
         sizes=([64, 256], "n"),
         ours=(False, "with our settings in place of the paper's"),

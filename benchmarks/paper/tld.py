@@ -13,12 +13,10 @@ from collections.abc import Iterator
 from statistics import fmean
 
 import shared  # noqa: F401
-from accuracy import accuracy_command, compared, videos
+from accuracy import TrackerRun, accuracy_command, compared, rows_of, videos
 from table import Table, benchmark
 
 from catstream.base.settings import PRESETS, Settings
-from catstream.evaluation.accuracy import rows_of
-from catstream.evaluation.runs import EvaluationRun
 from catstream.evaluation.scores import score
 
 #: Our settings, and presets.
@@ -53,14 +51,14 @@ def figures(options: argparse.Namespace) -> Iterator[Table]:
         yield Table("Success by part of the video", ("tracker", "followed by", "mean", *names), parts)
 
 
-def by_part(tracker: str, runs: list[EvaluationRun], settings: Settings) -> Iterator[tuple[str | float, ...]]:
+def by_part(tracker: str, runs: list[TrackerRun], settings: Settings) -> Iterator[tuple[str | float, ...]]:
     """Rows of the success in the frames that SCM follows, until n rows make the first leaf, and in those after them."""
 
-    def success(run: EvaluationRun, *, scm: bool) -> float:
+    def success(run: TrackerRun, *, scm: bool) -> float:
         of_video = settings.for_length(len(run.boxes))
         first = math.ceil(of_video.coreset.size / (1 + of_video.training.copies))
         part = slice(first) if scm else slice(first, None)
-        return score(run.boxes[part], run.truth[part]).success
+        return score(run.boxes[part], run.sequence.boxes[part]).success
 
     for name, scm in (("SCM", True), ("after SCM", False)):
         each = [success(run, scm=scm) for run in runs]

@@ -10,10 +10,10 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 from rich.console import Console
@@ -146,19 +146,23 @@ def stopped(result: str = "") -> NoReturn:
     raise SystemExit(INTERRUPTS.exit_code)
 
 
-def _checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
-    from catstream.base.files import check_file
+def _with_file(name: str, suffix: str, help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """An option for a file to write, which is checked before the work; only a file with the suffix is replaced."""
 
-    if file is not None:
-        if file.is_file() and file.suffix != ".json":
-            raise ServiceError(f"{file} exists already, and only a file whose name ends with .json is replaced")
-        check_file(file)
-    return file
+    def checked(_: click.Context, __: click.Parameter, file: Path | None) -> Path | None:
+        from catstream.base.files import check_file
+
+        if file is not None:
+            if file.is_file() and file.suffix != suffix:
+                raise ServiceError(f"{file} exists already, and only a file whose name ends with {suffix} is replaced")
+            check_file(file)
+        return file
+
+    return click.option(f"--{name}", f"{name}_file", type=click.Path(path_type=Path), callback=checked, help=help)
 
 
-with_json_file = click.option(
-    "--json", "json_file", type=click.Path(path_type=Path), callback=_checked, help="File for all figures."
-)
+with_json_file = _with_file("json", ".json", "File for all figures.")
+with_report_file = _with_file("report", ".html", "HTML file for a table with plots.")
 
 
 def write_json(file: Path | None, figures: dict[str, object]) -> None:

@@ -1,4 +1,4 @@
-"""Annotated sequences in the layouts of public data sets, and the frames and boxes that runs start with.
+"""Annotated sequences in the layouts of public data sets.
 
 A sequence is a folder with frames, in any form that `catstream.video.source`
 opens, and one of these files:
@@ -15,13 +15,6 @@ the object is absent. So do the flags of a data set beside the file, since boxes
 of frames without the object repeat the last one: see `_ABSENCE`. Numbers may
 have a decimal comma, if commas do not also separate them. Boxes are used as
 published; OTB's pixel coordinates, which start at 1, are not shifted.
-
-A run starts from one of these:
-
-    one_pass  one-pass evaluation (OPE): the first box of the ground truth
-    temporal  temporal robustness (TRE): several frames
-    spatial   spatial robustness (SRE) of the CVPR2013 benchmark: 12 initial boxes, shifted or scaled
-    jittered  several initial boxes that differ by at most 2 %: dependence of a result on chance
 """
 
 from __future__ import annotations
@@ -33,21 +26,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from catstream.base.arrays import Bool, Float64, UInt8
-from catstream.base.box import Box
 from catstream.base.text import cause_of, counted
-from catstream.errors import BoxError, SettingsError, VideoError
+from catstream.errors import VideoError
 from catstream.video.images import natural_order
 from catstream.video.source import open_source
 
 #: First annotated frame of the OTB sequences whose ground truth starts later than their images, by name and number of
 #: boxes.
 _FIRST_FRAMES = {("david", 471): 299}
-_RECT = re.compile(r"groundtruth_rect(\.\d+)?")  # others beside it, such as groundtruth_rect_old, are of no sequence
-
+_RECT = re.compile(r"groundtruth_rect(\.\d+)?\.txt")
 
 #: Files with a number for each frame that say in which frames the object is absent, and the test of a number.
 _ABSENCE: dict[str, Callable[[Float64], Bool]] = {
@@ -76,10 +66,20 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def frames(self, start: int = 0) -> Generator[UInt8]:
-        """Yield the images of boxes[start:], uint8 (h, w, 3), one for each box; VideoError if there are too few."""
-        missing = len(self.boxes) - start
-        with open_source(self.path, self.begin + start) as source:
+    @property
+    def present(self) -> Bool:
+        """Whether each frame shows the object, bool (frames,)."""
+        present: Bool = np.isfinite(self.boxes).all(axis=1)
+        return present
+
+    def since(self, frame: int) -> Sequence:
+        """Return the part from a frame on, under the same name."""
+        return Sequence(self.name, self.path, self.boxes[frame:], self.begin + frame)
+
+    def frames(self) -> Generator[UInt8]:
+        """Yield the images, uint8 (h, w, 3), one for each box; VideoError if there are too few."""
+        missing = len(self.boxes)
+        with open_source(self.path, self.begin) as source:
             for frame in source:
                 yield frame.image
                 missing -= 1
@@ -90,9 +90,9 @@ class Sequence:
             "each line of the ground truth needs a frame"
         )
 
-    def size(self, start: int = 0) -> tuple[int, int]:
-        """Read the frame of boxes[start], and return its width and height."""
-        with closing(self.frames(start)) as frames:
+    def size(self) -> tuple[int, int]:
+        """Read the first frame, and return its width and height."""
+        with closing(self.frames()) as frames:
             height, width = next(frames).shape[:2]
         return width, height
 
@@ -105,13 +105,7 @@ def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | No
     """
     sequences: dict[Path, Sequence | None] = {}  # by the file of the ground truth
     for path in map(Path, paths):
-        folders = _folders(path)
-        truths = [truth for folder in folders for truth in _truths(folder)]
-        for link in filter(_is_dead_link, folders):
-            error = VideoError(f"{str(link)!r} is a dead link: {str(link.readlink())!r} does not exist")
-            if failed is None:
-                raise error
-            failed(error)
+        truths = [truth for folder in _folders(path) for truth in _truths(folder)]
         if not truths:
             raise VideoError(
                 f"there is no annotated sequence in {str(path)!r}: expected a folder of frames with "
@@ -119,11 +113,11 @@ def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | No
                 "(Princeton), or a folder of such folders"
             )
         for truth in truths:
-            if (file := truth[2].resolve()) in sequences:
+            if (file := truth.file.resolve()) in sequences:
                 continue
             sequences[file] = None
             try:
-                sequences[file] = _sequence(*truth)
+                sequences[file] = _sequence(truth)
             except VideoError as error:
                 if failed is None:
                     raise
@@ -137,11 +131,6 @@ def _folders(path: Path) -> list[Path]:
         return [path]
     inner = (inner for inner in path.iterdir() if not inner.name.startswith("."))
     return sorted((folder for folder in inner if folder.is_dir() or _is_dead_link(folder)), key=natural_order)
-
-
-def _is_there(file: Path) -> bool:
-    """Return True if there is such a file, or a dead link, which is an error when it is read."""
-    return file.is_file() or _is_dead_link(file)
 
 
 def _is_dead_link(path: Path) -> bool:
@@ -171,7 +160,8 @@ def _corners(table: Float64) -> Float64:
 def _polygons(table: Float64) -> Float64:
     if table.shape[1] == 4:
         return _rectangles(table)
-    low, high = (np.stack([pick(table[:, axis::2], axis=1) for axis in (0, 1)], axis=1) for pick in (np.min, np.max))
+    points = table.reshape(len(table), -1, 2)
+    low, high = points.min(axis=1), points.max(axis=1)
     return np.hstack([low, high - low])
 
 
@@ -181,35 +171,47 @@ _VOT = _Layout("x,y,w,h or the corners of a polygon, x1,y1,x2,y2 ...", range(4, 
 _PRINCETON = _Layout("x,y,w,h or x,y,w,h,occluded", (4, 5), _rectangles)
 
 
-def _truths(folder: Path) -> list[tuple[str, Path, Path, _Layout]]:
-    """Return the name, the folder, the ground truth and its layout of each sequence in a folder."""
+class _Truth(NamedTuple):
+    """The ground truth of a sequence: the name and the folder of the sequence, the file, and its layout."""
+
+    name: str
+    folder: Path
+    file: Path
+    layout: _Layout
+
+
+def _truths(folder: Path) -> list[_Truth]:
+    """Return the ground truth of each sequence in a folder; a dead link counts as a file, which cannot be read."""
+    if _is_dead_link(folder):
+        return [_Truth(folder.name, folder, folder, _OTB)]
     target = folder.resolve()
     name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
-    rects = [file for file in sorted(folder.glob("*.txt"), key=natural_order) if _RECT.fullmatch(file.stem)]
+    rects = [file for file in sorted(folder.glob("*.txt"), key=natural_order) if _RECT.fullmatch(file.name)]
     # One of the two files of an OTB sequence with two objects is empty.
-    rects = [file for file in rects if not file.exists() or file.stat().st_size] or rects
+    rects = [file for file in rects if _is_dead_link(file) or file.stat().st_size] or rects
     if rects:
         ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
-        return [(name + end, folder, file, _OTB) for file, end in zip(rects, ends, strict=True)]
-    others = {"gt.txt": _TLD, "groundtruth.txt": _VOT, f"{target.name}.txt": _PRINCETON}
-    files = [(name, folder, folder / file, layout) for file, layout in others.items() if _is_there(folder / file)]
-    return files[:1]
+        return [_Truth(name + end, folder, file, _OTB) for file, end in zip(rects, ends, strict=True)]
+    for file, layout in {"gt.txt": _TLD, "groundtruth.txt": _VOT, f"{target.name}.txt": _PRINCETON}.items():
+        if (folder / file).is_file() or _is_dead_link(folder / file):
+            return [_Truth(name, folder, folder / file, layout)]
+    return []
 
 
-def _sequence(name: str, folder: Path, file: Path, layout: _Layout) -> Sequence:
+def _sequence(truth: _Truth) -> Sequence:
+    name, folder, file, layout = truth
     try:
         boxes = layout.boxes(_numbers(file, layout))
     except ValueError as error:
         raise VideoError(f"{str(file)!r}: {error}") from None
     boxes[_absent(folder, len(boxes))] = np.nan
     boxes[~(np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1))] = np.nan
-    present = np.isfinite(boxes).all(axis=1).sum()
-    if present < 2:  # a run starts with the initial box
+    sequence = Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
+    if (present := sequence.present.sum()) < 2:  # a run starts with the initial box
         raise VideoError(
             f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
             "frame, and the object in at least two frames"
         )
-    sequence = Sequence(name, folder, boxes, _FIRST_FRAMES.get((name.lower(), len(boxes)), 0))
     if layout is not _TLD and _look_like_corners(sequence):
         raise VideoError(
             f"{str(file)!r} looks like corners x1,y1,x2,y2, expected {layout.line}: for corners, name the file gt.txt"
@@ -222,14 +224,14 @@ def _look_like_corners(sequence: Sequence) -> bool:
 
     Then w > x and h > y in each frame, and w and h change with x and y, or reach out of the frame.
     """
-    x, y, w, h = sequence.boxes[np.isfinite(sequence.boxes).all(axis=1)].T
+    x, y, w, h = sequence.boxes[sequence.present].T
     if (w <= x).any() or (h <= y).any():
         return False
     if 2 * (np.var(w - x) + np.var(h - y)) < np.var(w) + np.var(h):
         return True
     try:
         width, height = sequence.size()
-    except VideoError:  # said by the run
+    except VideoError:  # the run reports it
         return False
     fits = ((w <= width + 1) & (h <= height + 1)).mean() > 0.5
     return bool(fits and ((x + w > width + 2) | (y + h > height + 2)).mean() > 1 / 3)
@@ -238,8 +240,7 @@ def _look_like_corners(sequence: Sequence) -> bool:
 def _absent(folder: Path, frames: int) -> Bool:
     """Read the flags of absence in the folder of a sequence, bool (frames,)."""
     absent = np.zeros(frames, bool)
-    for name, is_absent in _ABSENCE.items():
-        file = folder / name
+    for file in (folder / name for name in _ABSENCE):
         if not file.is_file():
             continue
         try:
@@ -250,7 +251,7 @@ def _absent(folder: Path, frames: int) -> Bool:
             raise VideoError(
                 f"{str(file)!r} has {counted(len(flags), 'number')} for {frames} boxes: expected one for each box"
             )
-        absent |= is_absent(flags)
+        absent |= _ABSENCE[file.name](flags)
     return absent
 
 
@@ -299,164 +300,3 @@ def _readings(line: str) -> list[list[float]]:
     if "," in "".join(words) and all(re.fullmatch(r"[-+]?\d+(,\d+)?|nan", word, re.IGNORECASE) for word in words):
         readings.append([float(word.replace(",", ".")) for word in words])
     return readings
-
-
-@dataclass(frozen=True, slots=True)
-class Variation:
-    """A change of the initial box: shifts of its centre in widths and heights, and factors of its sides.
-
-    name  part of the name of the run; empty for the box of the ground truth, which is not changed
-
-    >>> Variation("right", right=0.1).applied(Box(10, 20, 30, 40))
-    Box(x=13.0, y=20.0, w=30.0, h=40.0)
-    """
-
-    name: str = ""
-    right: float = 0.0
-    down: float = 0.0
-    wider: float = 1.0
-    higher: float = 1.0
-
-    def applied(self, box: Box) -> Box:
-        x, y = box.centre
-        return box.scaled(self.wider, self.higher).centred(x + self.right * box.w, y + self.down * box.h)
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """The frame and the box that a run starts with: a row of the ground truth, and a change of its box."""
-
-    frame: int = 0
-    variation: Variation = Variation()
-
-    @property
-    def suffix(self) -> str:
-        """The end of the name of a run, after the name of its sequence: `@120`, `@left`, `@120-left`, or empty."""
-        parts = [str(self.frame)] if self.frame else []
-        parts += [self.variation.name] if self.variation.name else []
-        return "@" + "-".join(parts) if parts else ""
-
-    def box(self, sequence: Sequence, size: tuple[int, int] | None = None) -> Box:
-        """Return the initial box.
-
-        size : width and height of the frame; a changed box that tracking cannot start with there is moved until its
-            centre is in the frame, and gets sides from 2 pixels to twice those of the frame; None: the box is not moved
-        """
-        box = Box(*map(float, sequence.boxes[self.frame]))
-        if not self.variation.name:
-            return box
-        changed = self.variation.applied(box)
-        return changed if size is None else _startable(changed, *size)
-
-
-FIRST = Start()
-#: Chooses the starts of a sequence.
-Starts = Callable[[Sequence], list[Start]]
-
-_DIRECTIONS = {"left": (-1, 0), "right": (1, 0), "up": (0, -1), "down": (0, 1)}
-_CORNERS = {"left-up": (-1, -1), "right-up": (1, -1), "left-down": (-1, 1), "right-down": (1, 1)}
-
-#: The 12 initial boxes of the CVPR2013 benchmark: shifts by 10 % of the box, and four sizes.
-SHIFTS = (
-    *(Variation(name, 0.1 * x, 0.1 * y) for name, (x, y) in (_DIRECTIONS | _CORNERS).items()),
-    *(Variation(f"size-{factor}", wider=factor, higher=factor) for factor in (0.8, 0.9, 1.1, 1.2)),
-)
-
-_JITTER = 0.02
-
-
-def choose_starts(frames: int | None = None, boxes: int | None = None, *, shifts: bool = False) -> Starts:
-    """Return the starts for `--starts FRAMES`, `--jitter BOXES` or `--shifts`; without any of them, those of OPE."""
-    if shifts:
-        return spatial
-    if boxes is not None:
-        return jittered(boxes)
-    return one_pass if frames is None else temporal(frames)
-
-
-def one_pass(sequence: Sequence) -> list[Start]:
-    """Return one start: the first frame with the object."""
-    return [Start(_present(sequence)[0])]
-
-
-def temporal(count: int) -> Starts:
-    """Choose `count` evenly spaced start frames.
-
-    If the object is absent in one, or tracking cannot start with its box, the next frame is used. It reads a frame of
-    each sequence.
-    """
-
-    def starts(sequence: Sequence) -> list[Start]:
-        frames = _valid(sequence)
-        places = np.searchsorted(frames, np.arange(count) * len(sequence) // count)
-        return [Start(frame) for frame in sorted({frames[place] for place in places if place < len(frames)})]
-
-    return starts
-
-
-def spatial(sequence: Sequence) -> list[Start]:
-    """Return the first frame with the object, with each of the initial boxes in `SHIFTS`."""
-    return [Start(_present(sequence)[0], variation) for variation in SHIFTS]
-
-
-def jittered(count: int) -> Starts:
-    """Choose `count` boxes in the first frame with the object: that of the ground truth, and random changes of it.
-
-    The changes are at most 2 % of the sides, and the same in each sequence and on each machine.
-    """
-    variations = [Variation(), *map(_jitter, range(1, count))]
-
-    def starts(sequence: Sequence) -> list[Start]:
-        return [Start(_present(sequence)[0], variation) for variation in variations]
-
-    return starts
-
-
-def _jitter(seed: int) -> Variation:
-    right, down, wider, higher = np.random.default_rng(seed).uniform(-_JITTER, _JITTER, 4).tolist()
-    return Variation(f"jitter-{seed}", right, down, 1 + wider, 1 + higher)
-
-
-def _present(sequence: Sequence) -> list[int]:
-    """Return the frames with the object."""
-    return [int(frame) for frame in np.flatnonzero(np.isfinite(sequence.boxes).all(axis=1))]
-
-
-def _valid(sequence: Sequence) -> list[int]:
-    """Return the frames with a box that `Box.validated` accepts; all with the object if none has one, or none is read.
-
-    The run then raises the error. The last frame with the object is left out: nothing but the given box would be
-    measured.
-    """
-    present = _present(sequence)[:-1]
-    try:
-        size = sequence.size(present[0])
-    except VideoError:
-        return present
-    return [frame for frame in present if _is_valid(Start(frame).box(sequence), *size)] or present
-
-
-def _is_valid(box: Box, width: int, height: int) -> bool:
-    try:
-        box.validated(width, height)
-    except BoxError:
-        return False
-    return True
-
-
-def _startable(box: Box, width: int, height: int) -> Box:
-    """Return the nearest box that `Box.validated` accepts in a frame of this size."""
-    x, y = box.centre
-    w, h = min(max(box.w, 2.0), 2.0 * width), min(max(box.h, 2.0), 2.0 * height)
-    return Box(0.0, 0.0, w, h).centred(x, y).with_centre_in(width, height)
-
-
-def read_attributes(file: Path) -> dict[str, list[str]]:
-    """Read attributes of sequences, for example occlusion, from a JSON file {sequence: [attribute]}."""
-    try:
-        return msgspec.json.decode(file.read_bytes(), type=dict[str, list[str]])
-    except (OSError, UnicodeDecodeError, msgspec.DecodeError) as error:
-        raise SettingsError(
-            f"cannot read the attributes in {str(file)!r} ({cause_of(error)}): "
-            'expected a JSON file {"sequence": ["occlusion"]}'
-        ) from None

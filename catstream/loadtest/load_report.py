@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields
+from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -13,7 +14,6 @@ from catstream.base.text import counted
 from catstream.loadtest.latency import PERCENTILES, percentiles
 from catstream.loadtest.load_test import MOST_STREAMS, LoadTest
 from catstream.loadtest.result import Result, violations
-from catstream.reports.provenance import provenance
 from catstream.reports.report import write_page
 
 _SUSTAINED = 0.01  # share of skipped frames up to which a rate counts as sustained
@@ -95,14 +95,15 @@ def _cost(cores: float, memory: float | None) -> dict[str, str]:
 
 
 def to_json(load_test: LoadTest) -> dict[str, object]:
-    """Return the figures of the decisive run, those of the search steps, and the provenance.
+    """Return the figures of the decisive run, those of the search steps, the version and the settings.
 
     Units are seconds, bytes, and shares from 0 to 1.
     """
     result = load_test.result
     plan = {item.name: getattr(result.plan, item.name) for item in fields(result.plan) if item.name != "settings"}
     return {
-        **provenance(result.plan.settings),
+        "version": version("catstream"),
+        "settings": result.plan.settings.changed(),
         "plan": plan,
         "seconds": result.seconds,
         "interrupted": load_test.interrupted,

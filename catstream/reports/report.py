@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
-from itertools import cycle
 from pathlib import Path
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from catstream.base.arrays import Float64
 from catstream.base.files import write_atomically, writing
 
 #: Colours of the curves, in order; distinguishable for colour-blind people, on light and on dark background.
@@ -39,30 +34,6 @@ def _environment() -> Environment:
     environment.filters["clock"] = clock
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode("ascii")
     return environment
-
-
-@dataclass(frozen=True, slots=True)
-class Plot:
-    """A line plot of shares from 0 to 1 over thresholds from 0 to `high`.
-
-    label    of the thresholds
-    curves   the points of the polyline of each curve, by its name
-    colours  of the curves, by their order: it is that of the trackers in all plots of a report
-    """
-
-    title: str
-    label: str
-    high: float
-    curves: dict[str, str]
-    colours: dict[str, str]
-
-    @classmethod
-    def of(cls, title: str, label: str, thresholds: np.ndarray, shares: Mapping[str, Float64]) -> Plot:
-        """Plot shares, float64 (k,), over thresholds (k,), by the names of the curves."""
-        high = float(thresholds[-1])
-        xs = 46 + 390 * thresholds / high
-        curves = {name: " ".join(map("{:.1f},{:.1f}".format, xs, 276 - 240 * ys)) for name, ys in shares.items()}
-        return cls(title, label, high, curves, dict(zip(curves, cycle(COLOURS), strict=False)))
 
 
 def clock(seconds: float) -> str:

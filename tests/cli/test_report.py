@@ -4,9 +4,11 @@ import json
 import re
 
 import pytest
+from jinja2 import UndefinedError
 
 from catstream.base.box import Box
 from catstream.messages.kinds import Track
+from catstream.reports.report import write_page
 from catstream.sinks.destinations import Head
 
 STATES = "PPPPDDAAPP"  # present, doubtful, absent
@@ -77,3 +79,9 @@ def test_a_report_of_something_else_is_an_error_of_one_line(fail, tmp_path, name
 def test_a_report_of_a_log_without_tracks_is_an_error(fail, tmp_path):
     (tmp_path / "walk.ndjson").write_text(Head().to_json() + "\n")
     assert "contains no track" in fail("report", tmp_path / "walk.ndjson")
+
+
+def test_a_value_that_a_template_lacks_is_an_error(tmp_path):
+    with pytest.raises(UndefinedError):
+        write_page(tmp_path / "report.html", "loadtest.html", verdicts=[])
+    assert not (tmp_path / "report.html").exists()

@@ -7,16 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from catstream.base.box import Box
-from catstream.evaluation.scores import (
-    Absence,
-    distances,
-    is_lost,
-    long_term,
-    overlaps,
-    precision_plot,
-    score,
-    success_plot,
-)
+from catstream.evaluation.scores import distances, overlaps, precision_plot, score, success_plot
 
 
 def boxes(frames: int = 40) -> tuple[np.ndarray, np.ndarray]:
@@ -61,31 +52,13 @@ def test_normalised_precision_is_the_mean_share_over_distances_in_parts_of_the_s
     assert score(found, truth).normalised_precision == pytest.approx(np.mean(shares))
 
 
-def test_the_long_term_measures_are_the_best_over_all_thresholds(rng):
-    """As defined with VOT-LT (Lukezic et al. 2020), threshold by threshold."""
-    found, truth = boxes()
-    truth[10:18] = np.nan
-    found[15:25] = np.nan
-    confidence = rng.integers(0, 9, len(truth)) / 8
-    best = (0.0, 0.0, 0.0)
-    for threshold in np.unique(confidence):
-        answered = (confidence >= threshold) & np.isfinite(found).all(axis=1)
-        shared = overlaps(found, truth)[answered]
-        if answered.any():
-            precision, recall = shared.mean(), shared.sum() / np.isfinite(truth).all(axis=1).sum()
-            best = max(best, (2 * precision * recall / (precision + recall), precision, recall))
-    result = long_term(found, truth, confidence)
-    assert (result.f_score, result.precision, result.recall) == pytest.approx(best)
-
-
 def test_a_perfect_run_is_perfect_and_one_without_boxes_scores_zero():
     truth = boxes()[1]
     truth[5:9] = np.nan
-    best, worst = score(truth, truth, np.ones(len(truth))), score(np.full_like(truth, np.nan), truth)
+    best, worst = score(truth, truth), score(np.full_like(truth, np.nan), truth)
     assert (best.success, best.precision, best.normalised_precision) == (1, 1, 1)
     assert best.auc == pytest.approx(20 / 21)  # nothing is above an overlap of 1
     assert (worst.auc, worst.success, worst.precision, worst.normalised_precision) == (0, 0, 0, 0)
-    assert [result.long_term and result.long_term.f_score for result in (best, worst)] == [1, 0]
 
 
 def test_frames_without_the_object_do_not_count(rng):
@@ -110,38 +83,8 @@ def test_frames_without_a_reported_box_count_as_missed():
 def test_frames_without_a_reported_box_are_noticed_or_false_absence():
     found, truth = boxes()
     truth[10:18], found[15:25] = np.nan, np.nan
-    assert score(found, truth).absence == Absence(absent=8, noticed=3, present=32, false=7)
-
-
-def test_boxes_in_frames_without_the_object_reduce_precision_by_their_confidence():
-    truth = boxes()[1]
-    found = truth.copy()
-    truth[10:20] = np.nan
-    sure, unsure = np.ones(len(truth)), np.where(np.isnan(truth[:, 0]), 0.1, 0.9)
-    assert long_term(found, truth, sure).precision == pytest.approx(0.75)
-    assert long_term(found, truth, sure).recall == 1
-    assert long_term(found, truth, unsure).f_score == 1
-
-
-@pytest.mark.parametrize(
-    ("followed", "lost"),
-    [
-        ([True] * 8, False),
-        ([False] * 6 + [True, True], False),
-        ([True] * 6 + [True, False], False),  # half of the last quarter
-        ([True] * 6 + [False, False], True),
-        ([True] * 3 + [False] * 2, True),  # the last quarter of five frames is two
-        ([True] * 5 + [False, True, True, True], False),
-        ([True] * 12 + [True, None, None, None], False),  # frames without the object count for no loss
-        ([True] * 12 + [False, None, None, None], True),
-        ([True] * 12 + [None, None, None, None], False),
-    ],
-)
-def test_a_run_is_lost_if_less_than_half_of_its_last_quarter_is_followed(followed, lost):
-    truth = np.tile([10.0, 10, 20, 20], (len(followed), 1))
-    boxes = np.where(np.array(followed, bool)[:, None], truth, truth + 15)
-    truth[[each is None for each in followed]] = np.nan
-    assert is_lost(boxes, truth) == score(boxes, truth).lost == lost
+    result = score(found, truth)
+    assert (result.absent, result.noticed, result.present, result.false) == (8, 3, 32, 7)
 
 
 SIDES = st.tuples(*[st.floats(-50, 50)] * 2, *[st.floats(0.1, 50)] * 2)

@@ -1,27 +1,31 @@
-"""Evaluation of annotation: boxes are drawn from the ground truth where `Annotation.next_frame` asks for them.
+"""Accuracy of annotation: boxes are drawn from the ground truth where `Annotation.next_frame` asks for them.
 
 The first box is that of the first frame with the object. Where the annotation asks for a frame with whose box tracking
-cannot start, for example one of a single pixel, the nearest other frame gets a box.
+cannot start, for example one of a single pixel, the nearest other frame gets a box. A row is printed for each number of
+boxes, with means over the sequences. A sequence is complete from the number of boxes on with which both the share of
+right frames and its estimate are at least 0.95.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-from collections.abc import Callable, Generator
-from contextlib import closing
+import sys
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
 import numpy as np
+from accuracy import accuracy_command, in_processes, videos
+from table import Table, benchmark
 
 from catstream.annotation.annotation import Annotation
 from catstream.annotation.passes import box_of, iou, row_of
 from catstream.base.arrays import Bool, Float64
 from catstream.base.box import Box
 from catstream.base.settings import Settings
-from catstream.base.workers import run_tasks
-from catstream.errors import BoxError, CatstreamError, VideoError
+from catstream.errors import BoxError, VideoError
 from catstream.evaluation.datasets import Sequence
 
 #: The measures of a row, with their headings.
@@ -67,35 +71,30 @@ class KeyframeRow:
     forward: float
 
 
-def evaluate_keyframes(
-    sequences: list[Sequence],
-    most: int,
-    settings: Settings,
-    *,
-    jobs: int = 1,
-    done: Callable[[list[KeyframeRow]], None] = lambda _: None,
-    failed: Callable[[CatstreamError], None] | None = None,
-) -> list[KeyframeRow]:
-    """Annotate sequences with 1, 2 ... `most` boxes; return a row for each sequence and number of boxes.
+def figures(options: argparse.Namespace) -> Iterator[Table]:
+    found = videos(options)
+    tasks = [(sequence, options.boxes, Settings()) for sequence in sorted(found, key=len, reverse=True)]
+    by_name = {}
+    for rows in in_processes(annotated, tasks, 1 if options.quick else options.jobs):
+        print(rows[0].name, file=sys.stderr)
+        by_name[rows[0].name] = rows
+    rows = [row for sequence in found for row in by_name[sequence.name]]
+    means, complete = mean_by_boxes(rows), boxes_until_complete(rows)
+    options.record = {
+        "rows": [dataclasses.asdict(row) for row in rows],
+        "mean": [dataclasses.asdict(row) for row in means],
+        "complete": complete,
+    }
+    counts = [count for count in complete.values() if count is not None]
+    note = f"{len(counts)} of {len(complete)} sequences complete"
+    note += f", with {fmean(counts):.1f} boxes on average" if counts else ""
+    shares = [(row.boxes, *(getattr(row, measure) for measure in MEASURES)) for row in means]
+    yield Table("Annotation with boxes from the ground truth", ("boxes", *MEASURES.values()), shares, note)
 
-    jobs : number of processes, one sequence in each at a time
-    done : function that is called with the rows of each finished sequence
-    failed : function that is called with the error of each sequence that fails; if None, the error is raised
-    """
-    tasks = [(sequence, most, settings) for sequence in sorted(sequences, key=len, reverse=True)]
-    rows: list[KeyframeRow] = []
-    results = run_tasks(_annotated, tasks, jobs) if jobs > 1 else (_annotated(*task) for task in tasks)
-    with closing(results):
-        for result in results:
-            if not isinstance(result, CatstreamError):
-                rows += result
-                done(result)
-            elif failed is None:
-                raise result
-            else:
-                failed(result)
-    order = {sequence.name: number for number, sequence in enumerate(sequences)}
-    return sorted(rows, key=lambda row: (order[row.name], row.boxes))
+
+def annotated(sequence: Sequence, most: int, settings: Settings) -> list[KeyframeRow]:
+    """Annotate a sequence with 1, 2 ... `most` boxes; return a row for each number of boxes."""
+    return [*_rows(sequence, most, settings)]
 
 
 def mean_by_boxes(rows: list[KeyframeRow]) -> list[KeyframeRow]:
@@ -116,13 +115,6 @@ def boxes_until_complete(rows: list[KeyframeRow]) -> dict[str, int | None]:
         if first.setdefault(row.name, None) is None and row.complete:
             first[row.name] = row.boxes
     return first
-
-
-def _annotated(sequence: Sequence, most: int, settings: Settings) -> list[KeyframeRow] | CatstreamError:
-    try:
-        return [*_rows(sequence, most, settings)]
-    except CatstreamError as error:
-        return CatstreamError(f"{sequence.name}: {error}")
 
 
 def _rows(sequence: Sequence, most: int, settings: Settings) -> Generator[KeyframeRow]:
@@ -199,3 +191,7 @@ def _is_usable(row: Float64, size: tuple[int, int]) -> bool:
         return box is None or bool(box.validated(*size))
     except BoxError:
         return False
+
+
+if __name__ == "__main__":
+    benchmark(figures, accuracy_command(__doc__), boxes=(8, "largest number of boxes of a sequence"))
