@@ -21,7 +21,6 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TypeVar
 
-from catstream.base.cgroup import oom_kills
 from catstream.errors import ServiceError
 
 _Result = TypeVar("_Result")
@@ -104,7 +103,7 @@ class Workers:
     """Processes that run functions of this program. They are started by the first tasks, and remain until `close`."""
 
     def __init__(self, jobs: int) -> None:
-        self._jobs, self._kills = jobs, oom_kills()
+        self._jobs = jobs
         self._pool: ProcessPoolExecutor | None = None
         self._processes: set[BaseProcess] = set()
 
@@ -121,8 +120,7 @@ class Workers:
         try:
             return future.result()
         except BrokenProcessPool:
-            doubt = "" if oom_kills() > self._kills else "?"
-            raise ServiceError(f"a worker process was killed (out of memory{doubt}): try fewer --jobs") from None
+            raise ServiceError("a worker process was killed (out of memory?): try fewer --jobs") from None
 
     def run(self, work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]]) -> Generator[_Result]:
         """Yield the result of `work(*task)` for each task, in order of completion.

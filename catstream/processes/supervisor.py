@@ -21,7 +21,6 @@ from secrets import token_hex
 from typing import BinaryIO
 
 from catstream.base.addresses import is_live
-from catstream.base.cgroup import oom_kills
 from catstream.base.clock import RunningClock
 from catstream.errors import ServiceError, VideoError
 from catstream.jobs.job import Job
@@ -98,7 +97,6 @@ class Child:
         self.restarts: deque[float] = deque()
         self.process: StartedProcess | None = None
         self.hung = False
-        self._oom_kills = oom_kills()  # before its start
         self.memory = SharedMemory()
         self.log = ProcessLog(name, (folder / f"{name}.log").open("w+b"))
 
@@ -112,7 +110,7 @@ class Child:
         self.end()
         self.memory.close()
         self.memory, self._turns, self.silent = SharedMemory(after=after), 0.0, 0.0
-        self.hung, self._oom_kills = False, oom_kills()
+        self.hung = False
         self.log.begin()
         log, memory = self.log.fileno(), self.memory.handle
         self.process = start_server().start(self.name, self._job, log, memory, restarted=bool(self.restarts))
@@ -128,19 +126,9 @@ class Child:
             return "killed after it made no progress"
         if self.process is not None and self.process.lost:
             server = self.process.server_code
-            return f"with the start server: {self._status(server)}" if server is not None else "with the start server"
+            return f"with the start server: {_status(server)}" if server is not None else "with the start server"
         last = self.log.last_line() if code > 0 or code == -signal.SIGABRT else ""
-        return f"{self._status(code)}: {last}" if last else self._status(code)
-
-    def _status(self, code: int) -> str:
-        """An exit code in words; of SIGKILL, which catstream did not send here, the probable cause."""
-        if code >= 0:
-            return f"exit code {code}"
-        if code != -signal.SIGKILL:  # signals for real time have no name
-            return f"signal {signal.Signals(-code).name if -code in {*signal.Signals} else -code}"
-        if oom_kills() > self._oom_kills:
-            return "out of memory: the kernel sent SIGKILL"
-        return "signal SIGKILL, not sent by catstream; out of memory?"
+        return f"{_status(code)}: {last}" if last else _status(code)
 
     def check(self, seconds: float) -> bool:
         """Return True if the loop has been stuck for longer than the watchdog limit."""
@@ -165,6 +153,15 @@ class Child:
         self.end()
         self.log.close()
         self.memory.close()
+
+
+def _status(code: int) -> str:
+    """An exit code in words; of SIGKILL, which catstream did not send here, the probable cause."""
+    if code >= 0:
+        return f"exit code {code}"
+    if code == -signal.SIGKILL:
+        return "signal SIGKILL, not sent by catstream; out of memory?"
+    return f"signal {signal.Signals(-code).name if -code in {*signal.Signals} else -code}"  # else real-time
 
 
 class Supervisor:
