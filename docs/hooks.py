@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from catstream.base.settings import PRESETS, describe
+from catstream.base.settings import PRESETS, RESUMABLE, describe
 from catstream.cli import COMMANDS, load_command
 
 README = Path(__file__).parents[1] / "README.md"
@@ -33,15 +33,12 @@ def index() -> str:
 
 def settings() -> str:
     """Return the tables of settings and of presets in Markdown."""
-    lines = []
-    for heading, expert in (("", False), ("### Expert settings", True)):
-        lines += [heading, "", "| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
-        for setting in describe().values():
-            if setting.expert == expert:
-                default = "empty" if setting.default == "" else json.dumps(setting.default).strip('"')
-                takes = setting.takes.replace("|", "&#124;")
-                about = f"{setting.about} May change at a resume." if setting.resumable else setting.about
-                lines.append(f"| `{setting.name}` | {takes} | {default} | {about} |")
+    lines = ["", "| setting | takes | default | meaning |", "| --- | --- | --- | --- |"]
+    for name, setting in describe().items():
+        default = "empty" if setting.default == "" else json.dumps(setting.default).strip('"')
+        takes = setting.takes.replace("|", "&#124;")
+        about = f"{setting.about} May change at a resume." if name in RESUMABLE else setting.about
+        lines.append(f"| `{name}` | {takes} | {default} | {about} |")
     lines += ["", "### Presets", "", "| preset | sets |", "| --- | --- |"]
     for preset, values in PRESETS.items():
         pairs = ", ".join(f"`{name} = {json.dumps(value)}`" for name, value in values.items())

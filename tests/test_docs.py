@@ -91,7 +91,7 @@ def test_every_setting_and_preset_has_its_row_on_the_page_of_settings():
     for name, setting in describe().items():
         assert f"| `{name}` |" in rows
         assert setting.about, f"{name}: write what it means, in the docstring of its group"
-        assert setting.expert or setting.about.count(". ") >= 1, f"{name}: write when to change it"
+        assert setting.about.count(". ") >= 1, f"{name}: write when to change it"
     assert all(f"| `{preset}` |" in rows for preset in PRESETS)
     assert not built("api.md").strip()
 

@@ -7,7 +7,6 @@ and the program or the command line (`--set coreset.size=128`).
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import inspect
 import json
@@ -17,105 +16,38 @@ import re
 import reprlib
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, get_args, get_type_hints
+from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, Struct
 
 from catstream.errors import CatstreamError, SettingsError
 
 #: The value of a setting.
 Value = str | int | float | bool
 
-
-@dataclass(frozen=True, kw_only=True)
-class Setting:
-    """A row of the list of settings.
-
-    name       full name
-    type       of the value: a type of Python, or a Literal
-    default    value
-    about      meaning, and when to change it; the latter is missing if `expert`
-    bounds     ge, gt, le and lt of the value
-    expert     whether it is for experiments and the presets of the paper
-    resumable  whether a resumed run may change it, because it does not affect the training
-    local      whether its value has a meaning on this machine only
-    """
-
-    name: str = ""
-    type: Any = str
-    default: Value
-    about: str = ""
-    bounds: Mapping[str, float]
-    expert: bool = False
-    resumable: bool = False
-    local: bool = False
-
-    @property
-    def takes(self) -> str:
-        """The valid values: the type or the options, and the bounds.
-
-        >>> describe()["coreset.size"].takes
-        'int >= 2, <= 4096'
-        """
-        signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
-        bounds = ", ".join(f"{signs[bound]} {value:g}" for bound, value in self.bounds.items())
-        return " ".join([" | ".join(get_args(self.type)) or self.type.__name__, bounds]).strip()
-
-    def check(self, value: object) -> Value:
-        """Return a value in the type of the setting; SettingsError if it is not valid. A numpy scalar is converted."""
-        if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
-            value = value.item()
-        try:
-            checked: Value = msgspec.convert(value, Annotated[self.type, Meta(**self.bounds)])  # type: ignore[call-overload]
-        except (UnicodeEncodeError, msgspec.ValidationError):  # a byte of the command line that is not UTF-8
-            raise self._invalid(value) from None
-        if isinstance(checked, float) and not math.isfinite(checked):
-            raise self._invalid(value)
-        return checked
-
-    def parse(self, text: str) -> object:
-        """Return the value of a text, in which numbers are written as in Python."""
-        try:
-            if self.type is bool:
-                return msgspec.convert(text, bool, strict=False)
-            return self.type(text) if self.type in (int, float) else text
-        except (ValueError, msgspec.ValidationError):
-            raise self._invalid(text) from None
-
-    def _invalid(self, value: object) -> SettingsError:
-        return SettingsError(f"setting {self.name} cannot be {reprlib.repr(value)}: it takes {self.takes}")
+_Rate = Annotated[float, Meta(ge=1e-9, le=1000)]
+_Timeout = Annotated[float, Meta(ge=0.1, le=3600)]
 
 
-def _setting(
-    default: Value, *, expert: bool = False, resumable: bool = False, local: bool = False, **bounds: float
-) -> Any:
-    """Declare a setting of a group: see `Setting`. The docstring of the group describes it."""
-    setting = Setting(default=default, bounds=bounds, expert=expert, resumable=resumable, local=local)
-    return field(default=default, metadata={"setting": setting})
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Group:
-    """A group of settings, which checks names and values. Its docstring has a row for each of them."""
-
-    group: ClassVar[str]
-
-    def __new__(cls, **values: object) -> Self:
-        for name in values:
-            _find(f"{cls.group}.{name}")
-        return super().__new__(cls)
+class _Group(Struct, frozen=True, kw_only=True):
+    """A group of settings, which checks its values. Its docstring has a row for each of them."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            object.__setattr__(self, name, _find(f"{self.group}.{name}").check(value))
+        group = next(name for name, kind in _groups().items() if isinstance(self, kind))
+        for name in self.__struct_fields__:
+            value = describe()[f"{group}.{name}"].check(getattr(self, name))
+            msgspec.structs.force_setattr(self, name, value)
+
+    def replace(self, **values: object) -> Self:
+        """Return a copy with other values."""
+        return msgspec.structs.replace(self, **values)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunSettings(_Group):
+class RunSettings(_Group, frozen=True, kw_only=True):
     """How a pipeline runs: its endpoint, its pace, its seed, and how it reads the source.
 
     endpoint              Address of the processes: a folder for ipc:// sockets (empty: a new private one), or
@@ -145,45 +77,39 @@ class RunSettings(_Group):
                           it to lose fewer training rows of a live source in a crash.
     """
 
-    group = "run"
-
-    endpoint: str = _setting("", resumable=True, local=True)
-    keys: str = _setting("", resumable=True, local=True)
-    lockstep: bool = _setting(False, resumable=True)
-    lag_frames: int = _setting(25, ge=0, le=65536, resumable=True)
-    seed: int = _setting(0, ge=0)
-    image_rate: float = _setting(25.0, ge=1e-9, le=1000)
-    open_timeout_seconds: float = _setting(10.0, ge=0.1, le=3600, resumable=True)
-    read_timeout_seconds: float = _setting(5.0, ge=0.1, le=3600, resumable=True)
-    hwaccel: str = _setting("")
-    skip_damaged: bool = _setting(False)
-    resize: bool = _setting(False)
-    unstored_frames: int = _setting(256, ge=1, le=65536, resumable=True)
-    max_objects: int = _setting(32, ge=1, le=64)
-    checkpoint_seconds: float = _setting(2.0, gt=0, le=3600, resumable=True)
+    endpoint: str = ""
+    keys: str = ""
+    lockstep: bool = False
+    lag_frames: Annotated[int, Meta(ge=0, le=65536)] = 25
+    seed: Annotated[int, Meta(ge=0)] = 0
+    image_rate: _Rate = 25.0
+    open_timeout_seconds: _Timeout = 10.0
+    read_timeout_seconds: _Timeout = 5.0
+    hwaccel: str = ""
+    skip_damaged: bool = False
+    resize: bool = False
+    unstored_frames: Annotated[int, Meta(ge=1, le=65536)] = 256
+    max_objects: Annotated[int, Meta(ge=1, le=64)] = 32
+    checkpoint_seconds: Annotated[float, Meta(gt=0, le=3600)] = 2.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class CoresetSettings(_Group):
+class CoresetSettings(_Group, frozen=True, kw_only=True):
     """The coreset trees (paper, section "Coreset Tree").
 
-    size             n in the paper: rows of a node of a coreset tree. Raise it for an object with many appearances;
-                     time and memory grow with it.
-    share            n as a share of the video's frames, as in the paper (0: coreset.size is used).
+    size   n in the paper: rows of a node of a coreset tree. Raise it for an object with many appearances; time and
+           memory grow with it.
+    share  n as a share of the video's frames (0: coreset.size is used). Set by the presets cat10 and cat25.
     """
 
-    group = "coreset"
-
-    size: int = _setting(64, ge=2, le=4096)
-    share: float = _setting(0.0, ge=0, le=0.5, expert=True)
+    size: Annotated[int, Meta(ge=2, le=4096)] = 64
+    share: Annotated[float, Meta(ge=0, le=0.5)] = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SearchSettings(_Group):
+class SearchSettings(_Group, frozen=True, kw_only=True):
     """The search for the object in a frame.
 
     mode           Search near the predicted position, and in the whole frame if the score is low (local); or always in
-                   the whole frame, as in the paper (full).
+                   the whole frame (full). Set by the presets of the paper.
     area           Side of the local search area as a multiple of the window's. Raise it for fast objects; time grows
                    with its square.
     full_interval  Frames between two searches of the whole frame while the local score is between belief.weak_score and
@@ -191,15 +117,12 @@ class SearchSettings(_Group):
                    save time.
     """
 
-    group = "search"
-
-    mode: Literal["local", "full"] = _setting("local", expert=True)
-    area: float = _setting(2.5, ge=1.5, le=6)
-    full_interval: int = _setting(10, ge=1)
+    mode: Literal["local", "full"] = "local"
+    area: Annotated[float, Meta(ge=1.5, le=6)] = 2.5
+    full_interval: Annotated[int, Meta(ge=1)] = 10
 
 
-@dataclass(frozen=True, kw_only=True)
-class BeliefSettings(_Group):
+class BeliefSettings(_Group, frozen=True, kw_only=True):
     """The thresholds of the score, which is about 0 on background and about 1 on the object.
 
     weak_score          Score below which the object is absent, and the whole frame is searched. Raise it if absence is
@@ -210,61 +133,53 @@ class BeliefSettings(_Group):
                         the model learns similar objects.
     """
 
-    group = "belief"
-
-    weak_score: float = _setting(0.4)
-    confident_score: float = _setting(0.45)
-    trusted_score: float = _setting(0.75)
+    weak_score: float = 0.4
+    confident_score: float = 0.45
+    trusted_score: float = 0.75
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainingSettings(_Group):
+class TrainingSettings(_Group, frozen=True, kw_only=True):
     """The training rows of a frame, and how a model is trained on them.
 
-    bootstrap          Source of the first model: n affine copies of the initial box (copies), or n boxes of the sparse
-                       collaborative model, as in the paper (scm).
-    classifier         Classifier: the linear discriminant of object and background plus the regression of the loss tree
-                       (joint); the former alone (least-squares); or the paper's one-class SVM (one-class).
-    colours            Use the histogram of the window's colours as a feature. Turn it off if the light changes its
-                       colour.
-    copies             Affine copies of the object in each frame (paper: 4 for n = 5 % of the video). Raise it for an
-                       object that rotates or is seen in few frames.
-    augment            Flip a copy in each frame left to right, and put most copies of the first frame on another
-                       background. Turn it off if the object never turns or its background never changes.
-    hard_negatives     Background windows with the highest scores, from a search of the whole frame. Raise it if the
-                       tracker switches to similar objects.
-    interval           Train on one of this number of frames whose score is high (1: on all). Raise it for speed, lower
-                       it for an object that changes quickly.
+    bootstrap       Source of the first model: n affine copies of the initial box (copies), or n boxes of the sparse
+                    collaborative model (scm). Set by the presets of the paper.
+    classifier      Classifier: the linear discriminant of object and background plus the regression of the loss tree
+                    (joint); the former alone (least-squares); or a one-class SVM (one-class). Set by the presets of the
+                    paper.
+    colours         Use the histogram of the window's colours as a feature. Turn it off if the light changes its colour.
+    copies          Affine copies of the object in each frame (paper: 4 for n = 5 % of the video). Raise it for an
+                    object that rotates or is seen in few frames.
+    augment         Mirror a copy in each frame, and put most copies of the first frame on another background. Turned
+                    off by the presets of the paper.
+    hard_negatives  Background windows with the highest scores, from a search of the whole frame. Raise it if the
+                    tracker switches to similar objects.
+    interval        Train on one of this number of frames whose score is high (1: on all). Raise it for speed, lower it
+                    for an object that changes quickly.
     """
 
-    group = "training"
-
-    bootstrap: Literal["copies", "scm"] = _setting("copies", expert=True)
-    classifier: Literal["joint", "least-squares", "one-class"] = _setting("joint", expert=True)
-    colours: bool = _setting(True)
-    copies: int = _setting(3, ge=0, le=64)
-    augment: bool = _setting(True)
-    hard_negatives: int = _setting(10, ge=0)
-    interval: int = _setting(2, ge=1, le=1024)
+    bootstrap: Literal["copies", "scm"] = "copies"
+    classifier: Literal["joint", "least-squares", "one-class"] = "joint"
+    colours: bool = True
+    copies: Annotated[int, Meta(ge=0, le=64)] = 3
+    augment: bool = True
+    hard_negatives: Annotated[int, Meta(ge=0)] = 10
+    interval: Annotated[int, Meta(ge=1, le=1024)] = 2
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExtentSettings(_Group):
+class ExtentSettings(_Group, frozen=True, kw_only=True):
     """Size and aspect ratio of the object.
 
-    size_count    Sizes that a search may try, an odd number. Raise it for an object that changes its size quickly; 1
-                  keeps the size.
+    size_count  Number of sizes that a search may try. Raise it for an object that changes its size quickly; 1 keeps the
+                size.
     learned     Learn the size and the aspect ratio from windows of wrong ones, and prefer those of the initial box.
                 Turn it off for more speed if the object keeps its shape.
     """
 
-    group = "extent"
-
-    size_count: int = _setting(7, ge=1, le=15)
-    learned: bool = _setting(True)
+    size_count: Literal[1, 3, 5, 7, 9, 11, 13, 15] = 7
+    learned: bool = True
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, init=False)
 class Settings:
     """All settings of a run, in groups, checked. Frozen: `replace` returns a changed copy.
 
@@ -284,42 +199,28 @@ class Settings:
     128
     """
 
-    run: RunSettings = field(default_factory=RunSettings)
-    coreset: CoresetSettings = field(default_factory=CoresetSettings)
-    search: SearchSettings = field(default_factory=SearchSettings)
-    belief: BeliefSettings = field(default_factory=BeliefSettings)
-    training: TrainingSettings = field(default_factory=TrainingSettings)
-    extent: ExtentSettings = field(default_factory=ExtentSettings)
+    run: RunSettings
+    coreset: CoresetSettings
+    search: SearchSettings
+    belief: BeliefSettings
+    training: TrainingSettings
+    extent: ExtentSettings
 
-    if TYPE_CHECKING:  # a mapping is converted to its group
-
-        def __init__(
-            self,
-            *,
-            run: RunSettings | Mapping[str, object] = ...,
-            coreset: CoresetSettings | Mapping[str, object] = ...,
-            search: SearchSettings | Mapping[str, object] = ...,
-            belief: BeliefSettings | Mapping[str, object] = ...,
-            training: TrainingSettings | Mapping[str, object] = ...,
-            extent: ExtentSettings | Mapping[str, object] = ...,
-        ) -> None: ...
-
-    def __new__(cls, **groups: object) -> Self:
-        for name in groups:
-            if name not in _groups():
-                _find(name)
-        return super().__new__(cls)
-
-    def __post_init__(self) -> None:
-        for name, group in _groups().items():
-            value = getattr(self, name)
-            if isinstance(value, Mapping):
-                object.__setattr__(self, name, group(**value))
-            elif not isinstance(value, group):
+    def __init__(self, **groups: _Group | Mapping[str, object]) -> None:
+        for name in groups.keys() - _groups().keys():
+            _check_name(name)
+        for name, kind in _groups().items():
+            group = groups.get(name, {})
+            if isinstance(group, Mapping):
+                for short in group:
+                    _check_name(f"{name}.{short}")
+                group = kind(**group)
+            elif not isinstance(group, kind):
                 raise SettingsError(
-                    f"the group of settings {name} cannot be {reprlib.repr(value)}: pass a {group.__name__} or a "
+                    f"the group of settings {name} cannot be {reprlib.repr(group)}: pass a {kind.__name__} or a "
                     f"mapping of names to values, Settings({name}={{...}})"
                 )
+            object.__setattr__(self, name, group)
 
     @classmethod
     def load(
@@ -369,15 +270,15 @@ class Settings:
         for variable, text in (os.environ if environment is None else environment).items():
             name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
             if variable.startswith("CATSTREAM_") and not _is_foreign(name):
-                _find(name, variable)
+                _check_name(name, f" for the environment variable {variable}")
                 if not text:
                     raise SettingsError(f"the environment variable {variable} is empty: set a value, or unset it")
                 values[name] = text
-        return values | _named(overrides)
+        return values | (flat(overrides) if isinstance(overrides, Mapping) else dict(map(_pair, overrides)))
 
     @classmethod
     def from_values(cls, values: Mapping[str, object]) -> Settings:
-        """Check names and values, by full name (`coreset.size`) or in groups; texts are parsed.
+        """Make settings from names and values, by full name (`coreset.size`) or in groups; defaults for the rest.
 
         Examples
         --------
@@ -386,9 +287,9 @@ class Settings:
         """
         groups: dict[str, dict[str, object]] = {}
         for name, value in flat(values).items():
-            setting = _find(name)
+            _check_name(name)
             group, _, short = name.partition(".")
-            groups.setdefault(group, {})[short] = setting.parse(value) if isinstance(value, str) else value
+            groups.setdefault(group, {})[short] = value
         return cls(**groups)
 
     def for_length(self, frames: int | None) -> Settings:
@@ -410,44 +311,32 @@ class Settings:
             )
         return self.replace({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
-    def replace(self, others: Mapping[str, object] | Iterable[str]) -> Settings:
-        """Return a copy with other values, by name, or as texts `group.name=value` in the form of `--set`.
+    def replace(self, others: Mapping[str, object]) -> Settings:
+        """Return a copy with other values, given as in `from_values`.
 
         Examples
         --------
-        >>> Settings(run={"lockstep": True}).replace(["coreset.size=32"]).changed()
+        >>> Settings(run={"lockstep": True}).replace({"coreset.size": 32}).changed()
         ['run.lockstep=true', 'coreset.size=32']
         """
-        return Settings.from_values(self.values() | flat(_named(others)))
+        return Settings.from_values(self.values() | flat(others))
 
     def values(self) -> dict[str, Value]:
         """All values, by full name."""
-        groups = dataclasses.asdict(self).items()
-        return {f"{group}.{name}": value for group, values in groups for name, value in values.items()}
+        groups = {group: msgspec.structs.asdict(getattr(self, group)) for group in _groups()}
+        return {f"{group}.{name}": value for group, values in groups.items() for name, value in values.items()}
 
     def changed(self) -> list[str]:
-        """Texts `group.name=value` of the settings that differ from their default.
-
-        Examples
-        --------
-        >>> Settings(run={"lockstep": True}, coreset={"size": 32}).changed()
-        ['run.lockstep=true', 'coreset.size=32']
-        """
-        texts, settings = self.texts(), describe()
-        return [f"{name}={texts[name]}" for name, value in self.values().items() if value != settings[name].default]
-
-    def texts(self) -> dict[str, str]:
-        """All values as texts, by full name, for `from_values`."""
-        values = self.values().items()
-        return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values}
-
-    def portable(self) -> dict[str, str]:
-        """The texts of all settings except those with a meaning on this machine only."""
-        settings = describe()
-        return {name: text for name, text in self.texts().items() if not settings[name].local}
+        """Texts `group.name=value` of the settings that differ from their default."""
+        changed = {name: value for name, value in self.values().items() if value != describe()[name].default}
+        return [f"{name}={value if isinstance(value, str) else json.dumps(value)}" for name, value in changed.items()]
 
 
-_SERVICE = re.compile(r"(^|[._])(service[._](host|port)|port(_[0-9]+_(tcp|udp).*)?$|port\.[0-9]+_(tcp|udp))")
+#: Settings that a resumed run may change, because they do not affect the training.
+RESUMABLE = {
+    *("run.endpoint", "run.keys", "run.lockstep", "run.lag_frames", "run.unstored_frames", "run.checkpoint_seconds"),
+    *("run.open_timeout_seconds", "run.read_timeout_seconds"),
+}
 
 _PAPER: dict[str, Value] = {
     "training.classifier": "one-class",
@@ -469,21 +358,65 @@ PRESETS: dict[str, dict[str, Value]] = {
 }
 
 
+@dataclass(frozen=True)
+class Setting:
+    """A row of the list of settings.
+
+    name     full name
+    type     of the value: a type of Python or a Literal, which may be annotated with bounds
+    default  value
+    about    meaning, and when to change it
+    """
+
+    name: str
+    type: Any
+    default: Value
+    about: str
+
+    @property
+    def takes(self) -> str:
+        """The valid values: the type or the options, and the bounds.
+
+        >>> describe()["coreset.size"].takes
+        'int >= 2, <= 4096'
+        """
+        kind, *bounds = get_args(self.type) if get_origin(self.type) is Annotated else (self.type,)
+        signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+        limits = [
+            f"{sign} {limit:g}"
+            for meta in bounds
+            for bound, sign in signs.items()
+            if (limit := getattr(meta, bound)) is not None
+        ]
+        return " ".join([" | ".join(map(str, get_args(kind))) or kind.__name__, ", ".join(limits)]).strip()
+
+    def check(self, value: object) -> Value:
+        """Return a value, or that of a text, in the type of the setting; SettingsError if it is not valid."""
+        given = value
+        if getattr(value, "ndim", None) == 0:  # a number of numpy
+            value = value.item()  # type: ignore[attr-defined]
+        try:
+            if isinstance(value, str) and isinstance(self.default, int | float) and not isinstance(self.default, bool):
+                value = type(self.default)(value)  # ".5" and "007" are numbers of Python, not of JSON
+            checked: Value = msgspec.convert(value, self.type, strict=not isinstance(value, str))
+            if not isinstance(checked, float) or math.isfinite(checked):
+                return checked
+        except (ValueError, msgspec.ValidationError):  # ValueError: also a byte of the command line that is not UTF-8
+            pass
+        raise SettingsError(f"setting {self.name} cannot be {reprlib.repr(given)}: it takes {self.takes}")
+
+
 @cache
 def describe() -> dict[str, Setting]:
     """All settings by full name: for `--help` and the docs."""
     settings: dict[str, Setting] = {}
     for group, kind in _groups().items():
-        types = get_type_hints(kind)
+        types = get_type_hints(kind, include_extras=True)
         rows = re.findall(r"^(\w+) {2,}(.+(?:\n {2,}.+)*)", inspect.cleandoc(kind.__doc__ or ""), re.MULTILINE)
         texts = {name: " ".join(text.split()) for name, text in rows}
-        for entry in dataclasses.fields(kind):
-            settings[f"{group}.{entry.name}"] = dataclasses.replace(
-                entry.metadata["setting"],
-                name=f"{group}.{entry.name}",
-                type=types[entry.name],
-                about=texts.get(entry.name, ""),
-            )
+        for field in msgspec.structs.fields(kind):
+            name = f"{group}.{field.name}"
+            settings[name] = Setting(name, types[field.name], field.default, texts.get(field.name, ""))
     return settings
 
 
@@ -504,19 +437,17 @@ def flat(values: Mapping[str, object]) -> dict[str, object]:
     return flattened
 
 
-def _find(name: str, variable: str = "") -> Setting:
-    """Return the setting of a name, which came from an environment variable if one is named.
+def _check_name(name: str, origin: str = "") -> None:
+    """Raise SettingsError, with the nearest names, if there is no setting of this name; `origin` is for the error."""
+    if name not in describe():
+        near = " or ".join(map(repr, _nearest(name)))
+        suggestion = f", did you mean {near}?" if near else ":"
+        raise SettingsError(
+            f"there is no setting {name!r}{origin}{suggestion} `catstream settings` lists all {len(describe())}"
+        )
 
-    SettingsError, with the nearest names, if there is none.
-    """
-    if name in describe():
-        return describe()[name]
-    near = [repr(other) for other in _nearest(name)]
-    suggestion = f", did you mean {' or '.join(near)}?" if near else ":"
-    origin = f" for the environment variable {variable}" if variable else ""
-    raise SettingsError(
-        f"there is no setting {name!r}{origin}{suggestion} `catstream settings` lists all {len(describe())}"
-    )
+
+_SERVICE = re.compile(r"(^|[._])(service[._](host|port)|port(_[0-9]+_(tcp|udp).*)?$|port\.[0-9]+_(tcp|udp))")
 
 
 def _is_foreign(name: str) -> bool:
@@ -533,10 +464,6 @@ def _nearest(name: str) -> list[str]:
     """Full names that are similar, or that have this name in their group."""
     similar = difflib.get_close_matches(name.replace("_", "."), describe(), n=3)
     return similar or [full for full in describe() if full.partition(".")[2] == name]
-
-
-def _named(values: Mapping[str, object] | Iterable[str]) -> dict[str, object]:
-    return dict(values if isinstance(values, Mapping) else map(_pair, values))
 
 
 def _pair(text: str) -> tuple[str, str]:

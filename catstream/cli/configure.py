@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from itertools import groupby
 
 import click
 
-from catstream.base.settings import describe
+from catstream.base.settings import RESUMABLE, describe
 from catstream.cli.common import screen, table
 from catstream.cli.options import with_json
 from catstream.errors import SettingsError
@@ -22,8 +21,7 @@ def settings(words: tuple[str, ...], as_json: bool) -> None:
 
     With words, only those whose name or description has all of them. Set them
     with --set GROUP.NAME=VALUE, in a TOML file with a table for each group
-    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME). Expert
-    settings, for experiments and the presets of the paper, come last.
+    (--settings FILE), or in the environment (CATSTREAM_GROUP_NAME).
 
     \b
     EXAMPLES
@@ -38,17 +36,19 @@ def settings(words: tuple[str, ...], as_json: bool) -> None:
     ]
     if not matches:
         raise SettingsError(f"no setting has {' and '.join(map(repr, words))} in its name or description")
-    matches.sort(key=lambda setting: setting.expert)
     if as_json:
-        keys = ("name", "takes", "default", "about", "expert", "resumable")
-        click.echo(json.dumps([{key: getattr(setting, key) for key in keys} for setting in matches], indent=2))
+        keys = ("name", "takes", "default", "about")
+        rows = [
+            {key: getattr(setting, key) for key in keys} | {"resumable": setting.name in RESUMABLE}
+            for setting in matches
+        ]
+        click.echo(json.dumps(rows, indent=2))
         return
     if not sys.stdout.isatty():
         for setting in matches:
             click.echo(f"{setting.name}\t{setting.default}\t{setting.takes}\t{setting.about}")
         return
-    for expert, group in groupby(matches, key=lambda setting: setting.expert):
-        rows = table("expert setting" if expert else "setting", "default", "takes", "meaning")
-        for setting in group:
-            rows.add_row(setting.name, str(setting.default), setting.takes, setting.about)
-        screen().print(rows)
+    listing = table("setting", "default", "takes", "meaning")
+    for setting in matches:
+        listing.add_row(setting.name, str(setting.default), setting.takes, setting.about)
+    screen().print(listing)

@@ -19,7 +19,7 @@ import msgspec
 from catstream.base.box import Box
 from catstream.base.files import writing
 from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_count
-from catstream.base.settings import Settings, describe
+from catstream.base.settings import RESUMABLE, Settings
 from catstream.base.text import listed
 from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.messages import storage
@@ -241,14 +241,13 @@ class Job:
 
 
 def changed_setting(before: Settings, after: Settings) -> str:
-    """The first setting that differs and is not `resumable`, with its values; empty if there is none.
+    """The first setting that differs and is not `RESUMABLE`, with its values; empty if there is none.
 
     >>> changed_setting(Settings(), Settings(coreset={"size": 32}, run={"lag_frames": 25}))
     'coreset.size=64, not 32'
     """
     ours, theirs = before.values(), after.values()
-    fixed = sorted(name for name, setting in describe().items() if not setting.resumable)
-    changed = (name for name in fixed if ours[name] != theirs[name])
+    changed = (name for name in sorted(ours.keys() - RESUMABLE) if ours[name] != theirs[name])
     return next((f"{name}={ours[name]}, not {theirs[name]}" for name in changed), "")
 
 

@@ -124,7 +124,7 @@ class SavedModel:
             "origins": list(self.origins),
             "box": list(self.box),
             "model": model,
-            "settings": self.settings.portable(),
+            "settings": {name: value for name, value in self.settings.values().items() if not name.startswith("run.")},
         }
         return storage.encode(arrays | model_arrays | {"centres": self.centres}, metadata)
 
@@ -342,7 +342,7 @@ def _trained(trees: dict[str, CoresetTree], centres: np.ndarray, version: int, n
 
 def _check_same(ours: Settings, theirs: Settings, one: str, other: str) -> None:
     """Raise SettingsError if settings that both sides share differ."""
-    own, others = ours.texts(), theirs.texts()
+    own, others = ours.values(), theirs.values()
     for name in _SAME:
         if own[name] != others[name]:
             raise SettingsError(f"{one} with {name}={own[name]}, {other} {name}={others[name]}: use the same setting")

@@ -28,7 +28,6 @@ import os
 import re
 import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
@@ -140,7 +139,7 @@ def open_source(
     VideoError if the source does not exist or cannot be read; from the iterator where it cannot be decoded, after the
     frames before.
     """
-    settings = replace(settings or RunSettings(), **single)
+    settings = (settings or RunSettings()).replace(**single)
     if min(part.start or 0, part.stop or 0) < 0 or (part.step is not None and part.step < 1):
         raise VideoError(f"frames count from 0 and the stride from 1, got {part.start}, {part.stop}, {part.step}")
     if part.stop is not None and part.stop <= (part.start or 0):

@@ -184,7 +184,7 @@ def test_features_of_as_many_objects_as_there_may_be_fit_into_their_channel():
     detectors, ((image, box),) = Detectors(Settings()), rendered.render(1, (320, 240))
     pyramid = Pyramid(image)
     _, features = detectors.step(pyramid, results={"": detectors.begin("", pyramid, box)})
-    largest = describe()["run.max_objects"].bounds["le"] * len(encode(features)) + LARGEST_GIVEN_MODELS
+    largest = get_args(describe()["run.max_objects"].type)[1].le * len(encode(features)) + LARGEST_GIVEN_MODELS
     assert largest < CHANNELS["all-features"].limit == CHANNELS["features"].limit
 
 
