@@ -74,7 +74,7 @@ picture: $(READY)  ## render the animated picture of README.md
 	@$(BIN)/python .ci/picture
 
 protocol: $(TOOLS)  ## update the fields in docs/protocol.md
-	$(BIN)/python tests/wire/test_protocol_page.py
+	$(BIN)/python docs/fields.py
 
 bench: $(TOOLS)  ## measure speed, memory and growth on an idle machine, into benchmarks/results: 20 minutes
 	PYTHON=$${PYTHON_OF_PEERS:-$(BIN)/python} benchmarks/measure.sh

@@ -148,7 +148,7 @@ def test_imports_follow_the_rule(rule):
 
 def test_the_page_shows_the_levels():
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    shown = page.partition("The levels, from the top, are:\n\n```\n")[2].partition("```")[0]
+    shown = page.partition("The levels, from the top:\n\n```\n")[2].partition("```")[0]
     assert [set(level.replace(",", " ").split()) for level in shown.split(">")] == LEVELS[::-1]
 
 
