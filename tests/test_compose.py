@@ -7,11 +7,9 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-import pytest
 import yaml
 
 from catstream.client.attach import subscribe
-from catstream.processes.by_hand import parser
 from catstream.processes.start_server import NAMES
 from catstream.wire import keys
 
@@ -25,13 +23,6 @@ SCRIPTS = "/opt/catstream/services"  # in the image
 def filled_in(text, **variables):
     """A text with its variables replaced, as docker compose does it."""
     return re.sub(r"\$\{(\w+):[-?]([^}]*)\}", lambda match: variables.get(match[1], match[2]), text)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_each_process_accepts_its_command_line(name):
-    script, *options = [filled_in(word, BOX="1,2,30,40") for word in SERVICES[name]["command"]]
-    assert script == f"{SCRIPTS}/{name}.py"
-    parser(name).parse_args(options)
 
 
 def test_a_subscriber_outside_of_the_containers_receives_from_the_services(demo_video, tmp_path, tcp, monkeypatch):

@@ -32,11 +32,6 @@ def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch):
         require_extra("fleet")
 
 
-@pytest.mark.parametrize("extra", EXTRAS)
-def test_an_installed_extra_is_no_error(extra):
-    require_extra(extra)
-
-
 def test_the_install_command_is_that_of_this_environment(monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     assert install_command("fleet") == f'{sys.executable} -m pip install "catstream[fleet]"'
