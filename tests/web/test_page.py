@@ -75,7 +75,7 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
     assert "overflow 0" in lines
 
 
-def test_an_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_of_browser, folder, walker):
+def test_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_of_browser, folder, walker):
     url, find = walker
     server = Server(pipeline_site(Address(str(folder))), port=0, token=None)
     words = script_of_browser("live.mjs", server.url, "1")
