@@ -76,8 +76,8 @@ def two_objects(endpoint, turning):
 
 @pytest.mark.parametrize(
     ("options", "objects"),
-    [((), ["anna", ""] * 4), (("--object", "anna"), ["anna"] * 4), (("--object", ""), [""] * 4)],
-    ids=["all", "anna", "without a name"],
+    [((), ["anna", ""] * 4), (("--object", "anna"), ["anna"] * 4)],
+    ids=["all", "anna"],
 )
 def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
     code, output, errors = said("watch", "tracks", *options, "--endpoint", two_objects, "--json")
@@ -86,7 +86,7 @@ def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
     assert [json.loads(line)["object"] for line in output.splitlines()] == objects
 
 
-def test_a_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
+def test_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):
     code, output, errors = said("watch", "models", "--count", 1, "--json", "--endpoint", resting.endpoint)
     model = json.loads(output)
     assert model["version"] >= 1
@@ -107,16 +107,15 @@ def test_watch_says_why_nothing_arrives(resting, catstream):
     assert said.endswith("the state of the pipeline is: paused\n")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_is_no_error(resting, catstream, number):
+def test_ctrl_c_is_no_error(resting, catstream):
     process = catstream("watch", "health", "--endpoint", resting.endpoint)
     assert process.stdout.readline()
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=SECONDS)
     assert (process.returncode, "Traceback" in errors) == (0, False)
 
 
-def test_a_silent_endpoint_is_one_line_of_error(fail, tmp_path):
+def test_silent_endpoint_is_one_line_of_error(fail, tmp_path):
     error = fail("watch", "tracks", "--endpoint", tmp_path, "--wait", 0.2)
     assert error.startswith(f"catstream: no health arrived from {tmp_path} within 0.2 s: is a pipeline running there?")
     assert error.endswith("It has no sockets: if it runs, they were removed; start it again")
@@ -131,17 +130,8 @@ def test_status_shows_all_processes(resting, said, until):
         "pipeline", "state", "frames", "learning", "model", "trees", "rejected", "reports",
     ]  # fmt: skip
     assert all(name in output for name in NAMES)
-
-
-def test_status_has_a_json_form(resting, succeed, until):
-    def at_rest():
-        output, _ = succeed("status", "--endpoint", resting.endpoint, "--json", "--wait", SECONDS)
-        return (found := json.loads(output))["frames_per_second"] == 0 and found
-
-    found = until(at_rest)  # nobody takes its tracks
-    assert found["ok"]
-    assert found["processes"].keys() == set(NAMES)
-    assert found["processes"]["detector"]["counters"]["sent"] >= 1
+    found = json.loads(said(*command, "--json")[1])
+    assert (found["ok"], found["processes"].keys()) == (True, set(NAMES))
 
 
 def test_status_fails_and_names_a_silent_process(resting, said):

@@ -32,7 +32,7 @@ def shown(width, seen, **pipeline):
 
 @pytest.mark.parametrize("live", [False, True], ids=["file", "live"])
 @pytest.mark.parametrize("width", [40, 80, 200])
-def test_the_line_fits_and_begins_with_the_state_and_the_frames(width, live):
+def test_line_fits_and_begins_with_the_state_and_the_frames(width, live):
     health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
     track = Track(0, 0.0, "bootstrapping", None, -12.25, 12345)
     written, _ = shown(width, [{"": track}], live=live, frames=None if live else 30000, health=health)
@@ -69,7 +69,7 @@ def interrupts():
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_takes_effect_after_the_current_frame(interrupts, number):
+def test_signal_takes_effect_after_the_current_frame(interrupts, number):
     results, video = [], []
 
     def follow():
@@ -83,13 +83,6 @@ def test_a_signal_takes_effect_after_the_current_frame(interrupts, number):
     with pytest.raises(KeyboardInterrupt):
         follow()
     assert results == video == [0, 1, 2, 3]
-
-
-def test_between_frames_a_signal_takes_effect_at_once(interrupts):
-    with interrupts.deferred():
-        pass
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
 
 
 def test_during_imports_a_signal_ends_the_process_at_once(interrupts, monkeypatch, capfd):
@@ -108,7 +101,7 @@ def test_ignored_signals_stay_ignored(interrupts):
         signal.raise_signal(signal.SIGHUP)
 
 
-def test_a_second_signal_does_not_disturb_the_end_of_a_command():
+def test_second_signal_does_not_disturb_the_end_of_a_command():
     send = "import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT)"
     command = [sys.executable, "-P", "-c", f"{send}; from catstream.cli import main; main()", "--version"]
     ended = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -1,13 +1,12 @@
 """Help teaches, also about settings: what a command does and writes, and an example. And what all commands do alike."""
 
-import json
 import signal
 from pathlib import Path
 
 import click
 import pytest
 
-from catstream.base.settings import Settings, describe
+from catstream.base.settings import describe
 from catstream.cli import COMMANDS, group, load_command
 from catstream.processes.by_hand import parser
 from catstream.processes.start_server import NAMES
@@ -25,7 +24,7 @@ def help_of(said):
     return ask
 
 
-def test_the_help_lists_the_commands_and_shows_a_first_example(help_of):
+def test_help_lists_the_commands_and_shows_a_first_example(help_of):
     text = help_of()
     assert "Track objects in a video stream" in text
     assert all(command in text for command in COMMANDS)
@@ -39,7 +38,7 @@ def test_every_command_has_a_help_text_with_examples(help_of, command):
     assert " EXAMPLES catstream " in text
 
 
-def test_the_start_server_imports_while_the_command_track_is_imported(monkeypatch):
+def test_start_server_imports_while_the_command_track_is_imported(monkeypatch):
     calls = []
     monkeypatch.setattr("catstream.processes.start_server.start_server", lambda: calls.append("start_server"))
     monkeypatch.setattr("catstream.cli.load_command", calls.append)
@@ -98,14 +97,6 @@ def test_words_select_settings_by_name_and_description(said):
     assert (code, "no setting has 'nothing-of-this-kind'" in errors) == (1, True)
 
 
-@pytest.mark.parametrize("words", [[], ["extent"]])
-def test_as_json_a_program_reads_names_and_defaults(said, words):
-    _, output, _ = said("settings", "--json", *words)
-    read = {each["name"]: each["default"] for each in json.loads(output)}
-    assert read.items() <= Settings().values().items()
-    assert bool(words) == (len(read) < len(Settings().values()))
-
-
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
@@ -115,6 +106,6 @@ def test_as_json_a_program_reads_names_and_defaults(said, words):
         (["keys", "alow"], "allow"),
     ],
 )
-def test_the_nearest_command_is_suggested_for_a_mistyped_one(fail, words, meant):
+def test_nearest_command_is_suggested_for_a_mistyped_one(fail, words, meant):
     assert fail(*words).endswith(f"Did you mean {meant!r}?")
     assert "Did you mean" not in fail(*words[:-1], "xyzzy")

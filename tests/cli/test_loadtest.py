@@ -9,7 +9,7 @@ import pytest
 from catstream.loadtest import load_report, load_test
 
 
-def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
+def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
     limits = ["--limit", "max=0", "--limit", "missed=1"]
     code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
@@ -37,7 +37,7 @@ def test_a_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
 
 
 @pytest.mark.system
-def test_a_search_for_the_number_of_streams_names_it_first_and_what_each_costs(said, tmp_path, monkeypatch):
+def test_search_for_the_number_of_streams_names_it_first_and_what_each_costs(said, tmp_path, monkeypatch):
     for module in (load_test, load_report):
         monkeypatch.setattr(module, "MOST_STREAMS", 2)
     arguments = ["--find-streams", "--rate", 20, "--duration", 1, "--size", "320x240", "--limit", "p99=60"]

