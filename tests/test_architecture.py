@@ -76,7 +76,7 @@ IO_MODULES = {"asyncio", "multiprocessing", "random", "socket", "subprocess", "t
 #: Folders of the stages, and state machines with the same rule: bytes, events and the time are arguments.
 STAGES = {"features", "paper", "detection", "compression", "training"}
 PURE = [
-    *("catstream/wire/go_back_n.py", "catstream/fleet/lifecycle.py", "catstream/sinks/events.py"),
+    *("catstream/wire/go_back_n.py", "catstream/sinks/events.py"),
     *("catstream/processes/decisions.py", "catstream/processes/control_commands.py"),
 ]
 

@@ -216,10 +216,13 @@ class FleetSpec:
                     f"the stream with its models (catstream fleet remove {name} --forget)"
                 )
 
-    def check_stream(self, name: str) -> None:
-        if name not in self.streams:
-            streams = ", ".join(self.streams) or "none"
-            raise FleetError(f"no stream named {name!r} in the fleet {self.name} (streams: {streams})")
+    def without(self, names: Collection[str]) -> dict[str, StreamSpec]:
+        """The other streams; FleetError if there is no stream of one of the names."""
+        for name in names:
+            if name not in self.streams:
+                streams = ", ".join(self.streams) or "none"
+                raise FleetError(f"no stream named {name!r} in the fleet {self.name} (streams: {streams})")
+        return {name: stream for name, stream in self.streams.items() if name not in names}
 
     def changes(self, new: FleetSpec, ended: Collection[str], *, are_running: bool) -> list[str]:
         """Describe the changes if another spec takes the place of this one, a line for each stream and key."""
@@ -231,10 +234,8 @@ class FleetSpec:
                 lines.append(f"{name}: is {'added' if before is None else 'removed'}")
             elif before.order != after.order:
                 lines.append(f"{name}: starts again with its changes")
-            elif name in ended:
-                lines.append(f"{name}: has ended")
             else:
-                lines.append(f"{name}: {same}")
+                lines.append(f"{name}: {'has ended' if name in ended else same}")
         later = [key for key in _AT_START if getattr(self, key) != getattr(new, key)]
         return lines + [f"{key} changes at the next start, after catstream fleet down" for key in later if are_running]
 

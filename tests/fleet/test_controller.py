@@ -12,9 +12,7 @@ import pytest
 from catstream.client.registry import Registry
 from catstream.errors import FleetError, SilenceError, StoreError
 from catstream.fleet import controller as module
-from catstream.fleet import lifecycle
 from catstream.fleet.controller import Controller
-from catstream.fleet.lifecycle import Node
 from catstream.fleet.spec import FleetSpec, StreamSpec, from_json
 from catstream.fleet.store import StateStore, Store
 from catstream.messages.kinds import StreamStatus
@@ -109,9 +107,10 @@ def ray(monkeypatch):
     fake = Ray()
     for part in (fake, fake.util, fake.exceptions):
         monkeypatch.setitem(sys.modules, part.__name__, part)
-    fake.nodes = [Node("n1", "1", "127.0.0.1", 2.0), Node("n2", "2", "127.0.0.1", 2.0)]
+    facts = {"NodeManagerAddress": "127.0.0.1", "Resources": {"CPU": 2.0}, "Alive": True}
+    fake.nodes = [facts | {"NodeName": f"n{number}", "NodeID": str(number)} for number in (1, 2)]
     monkeypatch.setattr(module, "nodes", lambda: list(fake.nodes))
-    monkeypatch.setattr(Controller, "_run", lambda _: None)  # a test calls each turn
+    monkeypatch.setattr(module, "_TURN_SECONDS", 1e6)  # a test calls each turn
     return fake
 
 
@@ -125,7 +124,7 @@ def spec(tmp_path):
 def made(ray, spec, monkeypatch, folder):  # noqa: ARG001  the module finds it as Ray
     """Starts a controller."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))  # no other fleet is found
-    monkeypatch.setattr(lifecycle, "_PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(module, "_PAUSE_SECONDS", 0.0)
     controllers = []
 
     def make():
@@ -202,7 +201,7 @@ def test_a_stream_with_other_labels_starts_again_where_they_are(site, ray):
 
 def test_a_stream_whose_node_died_is_left_to_ray(site, ray):
     running(site, ray, "gate")
-    ray.nodes[0] = replace(ray.nodes[0], alive=False)
+    ray.nodes[0]["Alive"] = False
     actor = ray.of("gate")
     site._actors["gate"].call = Call(error=RayError("unavailable"))
     site._turn()
@@ -331,6 +330,39 @@ def test_a_stream_that_is_not_placed_or_silent_is_reported_long_before_its_resta
     assert (gate.state, gate.node, gate.trouble) == ("running", "n1", "it has not answered for 50 s")
     unplaced = "Ray has not started it for 50 s: `ray status` says what it needs"
     assert (roof.state, roof.trouble) == ("starting", unplaced)
+
+
+def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed(site, ray, monkeypatch):
+    running(site, ray, "gate")
+    gate, roof = ray.of("gate"), ray.of("roof")
+    gate.status = None
+    site._turn()
+    later = time.monotonic() + module.SILENT_SECONDS + 1
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    site._turn()
+    assert (gate.restarted, roof.restarted) == (1, 0), "Ray waits for a node for the roof"
+    site._actors["gate"].call = Call(error=RayError("killed"))
+    site._turn()
+    running(site, ray, "gate")
+    gate.unstored = None  # it does not answer
+    site.remove(("gate",))
+    site._turn()
+    assert gate.asked[-1] == ("stop",)
+    later += module.STOPPING_SECONDS + 1
+    for _ in range(3):
+        site._turn()
+    assert "gate" not in site._actors
+
+
+def test_one_that_is_gone_at_once_is_started_again_after_a_pause(site, ray, monkeypatch):
+    monkeypatch.setattr(module, "_PAUSE_SECONDS", 5.0)
+    ray.kill(ray.of("gate"))
+    site._turn()
+    assert ray.started.count("gate") == 1
+    later = time.monotonic() + 6.0
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    site._turn()
+    assert ray.started.count("gate") == 2
 
 
 def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):

@@ -170,7 +170,7 @@ def test_a_subscriber_with_a_key_of_the_fleet_stays_attached_to_a_stream_that_mo
 
 def node_id(name):
     """The id of a node, which Ray has as a label."""
-    return next(node.id for node in nodes() if node.name == name)
+    return next(node["NodeID"] for node in nodes() if node["NodeName"] == name)
 
 
 def test_a_stream_runs_on_a_node_with_its_labels_and_moves_when_the_node_dies(site, cluster, streams, until):
