@@ -49,8 +49,6 @@ _LONGEST = 1 << 16  # bytes of a request
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time. Each
 #: process releases its memory once a second. All threads share one arena: what one has freed, another can use.
 _MALLOC = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20), "MALLOC_ARENA_MAX": "1"}
-#: Modules that numba imports if they are installed, for kernels that call BLAS or C; they take a sixth of a second.
-_UNUSED = ("scipy.linalg.cython_blas", "cffi")
 
 
 class StartedProcess:
@@ -221,22 +219,7 @@ after_fork(_forget)
 def _import(name: str) -> None:
     """Import the module of a process; after an error, the process imports it again, and reports it."""
     with suppress(Exception):
-        if name == "detector":
-            with _hidden(*_UNUSED):
-                import_module("catstream.features.kernels")
         import_module(f"catstream.processes.{name}")
-
-
-@contextmanager
-def _hidden(*modules: str) -> Iterator[None]:
-    """Let modules that were not imported yet appear not to be installed."""
-    hidden = [module for module in modules if module not in sys.modules]
-    sys.modules |= dict.fromkeys(hidden)  # type: ignore[arg-type]
-    try:
-        yield
-    finally:
-        for module in hidden:
-            del sys.modules[module]
 
 
 def main(descriptor: int, program: int) -> None:
@@ -292,13 +275,8 @@ def _run(request: dict[str, str], parent: int, log: int, memory: int) -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.dup2(log, sys.stderr.fileno())
-        try:
-            descriptors = {int(entry.name) for entry in Path("/proc/self/fd").iterdir()}
-        except FileNotFoundError:  # there is no /proc
-            descriptors = {*range(1024)}
-        for descriptor in descriptors - {0, 1, 2, memory}:
-            with suppress(OSError):  # the one of the listing
-                os.close(descriptor)
+        os.closerange(3, memory)
+        os.closerange(memory + 1, os.sysconf("SC_OPEN_MAX"))
         with suppress(OSError):  # it was removed
             os.chdir(request["folder"])
         gc.enable()

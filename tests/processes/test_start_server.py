@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 from contextlib import closing, suppress
-from importlib import import_module
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -50,13 +49,6 @@ def start(folder, tmp_path, until):
         process.close()
         memory.close()
         log.close()
-
-
-def test_a_hidden_module_appears_not_to_be_installed(monkeypatch):
-    monkeypatch.delitem(sys.modules, "cffi", raising=False)
-    with module._hidden("cffi"), pytest.raises(ImportError):
-        import_module("cffi")
-    assert import_module("cffi").FFI
 
 
 def opened(pid):
