@@ -48,11 +48,3 @@ def test_a_subscriber_outside_of_the_containers_receives_from_the_services(demo_
         monkeypatch.setenv("CATSTREAM_RUN_KEYS", str(tmp_path / "pipeline"))
         health = address.replace("5707", str(int(tcp.rpartition(":")[2]) + 7))
         subprocess.run([sys.executable, "-P", "-c", script, health], check=True)
-
-
-def test_the_image_contains_only_files_that_exist():
-    image = (ROOT / "services" / "Dockerfile").read_text()
-    files = {file for line in re.findall(r"^COPY (?!--from)(.+) \S+$", image, re.M) for file in line.split()}
-    assert all((ROOT / file).exists() for file in files)
-    allowed = (ROOT / ".dockerignore").read_text().splitlines()
-    assert {line.removeprefix("!") for line in allowed if line.startswith("!")} == files
