@@ -58,7 +58,7 @@ def loadtest(
 ) -> None:
     """Measure latency and dropped frames of pipelines under load.
 
-    The load test sends a rendered video with ground truth as a network camera
+    The load test sends a rendered video as a network camera
     does, H.264 over RTSP, on the loopback interface; a pipeline of its own
     tracks each stream. The camera does not wait: frame i is due at
     start + i / RATE, and latency counts from then. The latency of a skipped
@@ -71,7 +71,6 @@ def loadtest(
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
       missed                    share of frames whose tracks fast subscribers missed, at most
-      success                   share of frames with an IoU above 0.5, at least
 
     With --find-streams, the load test searches for the number of cameras that
     this machine can serve: it starts with STREAMS, each step takes DURATION, and

@@ -20,7 +20,6 @@ from catstream.base.arrays import Float64
 from catstream.client.address import Address
 from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
-from catstream.evaluation.scores import overlaps
 from catstream.loadtest.camera import Schedule
 from catstream.loadtest.rtsp import due_time
 from catstream.messages.kinds import Model, Track
@@ -32,7 +31,6 @@ PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.
 REST = "everything else"
 
 _POLL_SECONDS = 0.1
-_SUCCESS = 0.5  # a frame with a larger overlap with the ground truth is a success
 
 
 @dataclass(slots=True)
@@ -107,7 +105,6 @@ class Measures:
     track            seconds from the due time of each frame to the track of this frame or a newer one; at most to the
                      end of the run
     model            seconds to the model trained on this frame or a newer one
-    success          share of frames with the object whose overlap is above 0.5; a skipped frame has the last known box
     totals           those of the pipeline at its end; empty if the stream has not ended
     """
 
@@ -115,7 +112,6 @@ class Measures:
     tracked: np.ndarray
     track: Float64
     model: Float64
-    success: float | None
     totals: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -131,35 +127,26 @@ class Measures:
     def figures(self) -> dict[str, float]:
         """The figures that can have a limit, by name."""
         model = {f"model-{name}": seconds for name, seconds in percentiles(self.model).items()}
-        return {**percentiles(self.track), **model, "skipped": self.skipped, "success": self.success or 0.0}
+        return {**percentiles(self.track), **model, "skipped": self.skipped}
 
 
 def measure(
-    observations: Observations, schedule: Schedule, frames: int, truth: np.ndarray, end: float, totals: dict[str, int]
+    observations: Observations, schedule: Schedule, frames: int, end: float, totals: dict[str, int]
 ) -> Measures:
     """Compute the measures of one stream.
 
     frames : number of due frames: all of the schedule of the camera, or those before an interruption
-    truth : ground truth of the images, which are sent over and over, float64 (images, 4), NaN if the object is absent
     end : time at which the observation ended
     totals : totals of the pipeline at its end
     """
     due = np.array([schedule.due(number) for number in range(frames)])
-    tracks = [(moment, track, schedule.number(track.pts or 0.0)) for moment, track in observations.tracks]
+    tracks = [(moment, schedule.number(track.pts or 0.0)) for moment, track in observations.tracks]
     models = [(moment, schedule.number(newest)) for moment, newest in observations.models]
-    boxes, tracked = np.full((frames, 4), np.nan), np.zeros(frames, bool)
-    for _, track, number in tracks:
-        if 0 <= number < frames:
-            boxes[number], tracked[number] = track.box or np.nan, True
-    true = truth[np.arange(frames) % len(truth)]
-    present = np.isfinite(true).all(axis=1)
-    successes = overlaps(carried_forward(boxes, tracked), true)[present] > _SUCCESS
     return Measures(
         due=due,
-        tracked=tracked,
-        track=latencies_to_answer(due, [(moment, number) for moment, _, number in tracks], end),
+        tracked=np.isin(np.arange(frames), [number for _, number in tracks]),
+        track=latencies_to_answer(due, tracks, end),
         model=latencies_to_answer(due, models, end),
-        success=float(successes.mean()) if present.any() else None,
         totals=totals,
     )
 
@@ -190,17 +177,7 @@ def latencies_to_answer(due: Float64, answers: list[tuple[float, int]], end: flo
             place = min(number, len(due) - 1)
             first[place] = min(first[place], moment)
     first = np.minimum.accumulate(first[::-1])[::-1]
-    return np.minimum(first, end) - due
-
-
-def carried_forward(boxes: np.ndarray, tracked: np.ndarray) -> np.ndarray:
-    """Return the last known box at each frame: its own, or that of the last tracked frame before it.
-
-    >>> carried_forward(np.array([[1.0], [2.0], [3.0]]), np.array([False, True, False])).ravel()
-    array([nan,  2.,  2.])
-    """
-    last = np.maximum.accumulate(np.where(tracked, np.arange(len(boxes)), -1))
-    return np.where(last[:, None] >= 0, boxes[last], np.nan)
+    return np.asarray(np.minimum(first, end) - due)
 
 
 class Usage:

@@ -7,11 +7,8 @@ import threading
 from collections.abc import Iterable, Iterator, MutableSequence
 from contextlib import ExitStack, suppress
 from time import monotonic, sleep
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, cast
 
-import numpy as np
-
-from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
@@ -41,31 +38,27 @@ class Video(NamedTuple):
     units  access units of H.264; the first one is a keyframe
     still  those of the first image, which are sent before
     boxes  boxes of all objects in the first image, by name; the first object is the one whose tracks are measured
-    truth  boxes of the first object in all images, float64 (images, 4), NaN if it is absent
     """
 
     units: list[bytes]
     still: list[bytes]
     boxes: dict[str, Box]
-    truth: Float64
 
 
 def render(plan: Plan, report: Report) -> Video:
     """Render the demo video, forwards, then backwards, and encode it."""
-    count, demo, truth = min(plan.frames, 2 * rendered.FRAMES - 2), rendered.Demo(plan.size), []
+    count, demo = min(plan.frames, 2 * rendered.FRAMES - 2), rendered.Demo(plan.size)
 
     def encoded(numbers: Iterable[int]) -> Iterator[bytes]:
         encoder = Encoder(plan.size, rate=25)
         for number in numbers:
-            image, box = demo.image(number)
-            truth.append(box or (np.nan,) * 4)
+            image, _ = demo.image(number)
             report("rendering", number / count, f"{number} of {count} frames")
             yield from map(bytes, encoder.packets(image))
         yield from map(bytes, encoder.flush())
 
-    still = [*encoded([0] * _STILL_FRAMES)]
-    units = [*encoded(range(count))]
-    return Video(units, still, _boxes(plan, Box(*truth[0])), np.array(truth[_STILL_FRAMES:]))
+    boxes = _boxes(plan, cast(Box, demo.image(0)[1]))  # its object is visible
+    return Video([*encoded(range(count))], [*encoded([0] * _STILL_FRAMES)], boxes)
 
 
 def _boxes(plan: Plan, dahlia: Box) -> dict[str, Box]:

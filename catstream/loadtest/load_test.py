@@ -61,7 +61,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         plan=plan,
         seconds=min(due) / plan.rate,
         streams=[
-            measure(observation, schedule, number, video.truth, end, stream.totals)
+            measure(observation, schedule, number, end, stream.totals)
             for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
         usage=usage.readings,

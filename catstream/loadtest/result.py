@@ -22,9 +22,8 @@ KINDS = {
     **{f"model-{name}": "from a frame to the model trained on it" for name in PERCENTILES},
     "skipped": "share of frames that were not tracked",
     "missed": "share of frames whose tracks fast subscribers missed",
-    "success": "share of frames with an overlap above 0.5",
 }
-_SHARES = ("skipped", "missed", "success")  # the other figures are times
+_SHARES = ("skipped", "missed")  # the other figures are times
 
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
 Report = Callable[[str, float, str], None]
@@ -115,7 +114,7 @@ class Result:
     def worst(self) -> dict[str, float]:
         """The value of each of the `KINDS`."""
         streams = [stream.figures for stream in self.streams]
-        worst = {name: (min if name == "success" else max)(stream[name] for stream in streams) for name in streams[0]}
+        worst = {name: max(stream[name] for stream in streams) for name in streams[0]}
         return worst | {"missed": sum(self.missed) / max(1, sum(self.missed) + sum(self.received))}
 
     @property
@@ -150,7 +149,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A limit on one of the `KINDS`: a minimum of the success, a maximum of the others.
+    """A maximum of one of the `KINDS`.
 
     >>> Limit.parse("p99=0.1")
     Limit(name='p99', value=0.1)
@@ -177,8 +176,7 @@ class Limit:
         return f"{self.name}={self.value:g}"
 
     def is_met(self, result: Result) -> bool:
-        value = result.worst[self.name]
-        return value >= self.value if self.name == "success" else value <= self.value
+        return result.worst[self.name] <= self.value
 
     def describe(self, result: Result) -> str:
         """The figure and its limit, times in milliseconds, as in the tables."""
@@ -186,8 +184,7 @@ class Limit:
             f"{number:.4g}" if self.name in _SHARES else f"{1000 * number:.4g} ms"
             for number in (result.worst[self.name], self.value)
         )
-        sense = "least" if self.name == "success" else "most"
-        return f"{self.name} is {value}, limit at {sense} {limit} ({KINDS[self.name]})"
+        return f"{self.name} is {value}, limit at most {limit} ({KINDS[self.name]})"
 
 
 def violations(limits: Iterable[Limit], result: Result) -> list[str]:

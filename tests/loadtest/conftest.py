@@ -24,10 +24,10 @@ def schedule() -> Schedule:
 def track(schedule) -> Callable[..., tuple[float, Track]]:
     """A track of a frame of the schedule that came some seconds after the frame."""
 
-    def made(number: int, after: float, *, frame: int | None = None, box: Box | None = BOX) -> tuple[float, Track]:
+    def made(number: int, after: float, *, frame: int | None = None) -> tuple[float, Track]:
         due = schedule.due(number)
         frame = number if frame is None else frame
-        return due + after, Track(frame, 0.0, "present", box, 0.9, 1, due)
+        return due + after, Track(frame, 0.0, "present", BOX, 0.9, 1, due)
 
     return made
 
@@ -36,12 +36,12 @@ def track(schedule) -> Callable[..., tuple[float, Track]]:
 def result() -> Callable[..., Result]:
     """A result of streams with these latencies to the track."""
 
-    def made(*streams: list[float], tracked: float = 1.0, success: float = 1.0, **others) -> Result:
+    def made(*streams: list[float], tracked: float = 1.0, **others) -> Result:
         measures = []
         for seconds in map(np.array, streams):
             frames = np.arange(len(seconds))
             seen = {"due": 100 + frames / 10, "tracked": frames < tracked * len(seconds)}
-            measures.append(Measures(**seen, success=success, track=seconds, model=seconds))
+            measures.append(Measures(**seen, track=seconds, model=seconds))
         facts = {"usage": {}, "received": [], "missed": [], "camera_late": 0.001}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, **others})
 
