@@ -63,14 +63,12 @@ class Registry(AbstractContextManager["Registry"]):
     def running(self, stream: str) -> Endpoint:
         """The endpoint of the pipeline of a stream; ServiceError if it does not run."""
         status = self.stream(stream)
-        if (endpoint := self.endpoint_of(status)) is None:
-            raise ServiceError(f"stream {stream} is not running (state: {described(status)})")
-        return endpoint
-
-    def endpoint_of(self, status: StreamStatus) -> Endpoint | None:
-        """The endpoint of the pipeline of a stream in this state, with the keys to connect; None if it has none."""
         if not status.endpoint:
-            return None
+            raise ServiceError(f"stream {stream} is not running (state: {described(status)})")
+        return self.endpoint_of(status)
+
+    def endpoint_of(self, status: StreamStatus) -> Endpoint:
+        """The endpoint of the pipeline of a stream that runs, with the keys to connect."""
         keys = self._endpoint.keys
         if status.server and keys is None:
             raise ServiceError(

@@ -8,7 +8,6 @@ the tracks.
 from __future__ import annotations
 
 import logging
-import os
 import shutil
 import threading
 import time
@@ -128,7 +127,7 @@ class Stream:
     def _run_once(self) -> None:
         """Claim the stream, and run the pipeline from the state in the store, or from the start."""
         self._store = Store(self._url)
-        claim = self._store.stream(self._spec.name).claim(f"{self._status.node} process {os.getpid()}")
+        claim = self._store.stream(self._spec.name).claim()
         self._store_trouble = ""
         shutil.rmtree(self._folder / "state", ignore_errors=True)  # of the run before a failure
         self._has_tracked, self._files, ended = False, set(), False

@@ -14,17 +14,12 @@ Below each of these folders, only the newest holder decides what comes next:
             this holder was superseded, and has to stop
     read    take the newest undamaged state of the highest token that has one
 
-A holder that was paused or cut off may continue to write under its own token: as soon as the newer holder has written
-one state, nobody reads the older ones any more. Before that, its states continue the one that the newer holder began
-from, and are as good as any. What can fail besides:
+A holder that was paused or disconnected may continue to write under its own token: as soon as the newer holder has
+written a state, older ones are not read. Before that, they continue the state that the newer holder began from. If the
+answer to a claim or a write is lost, the caller uses the next token or number; a half-written state is passed over.
 
-    the answer to a claim is lost   The caller claims again, and gets the next token; a claim without states is passed.
-    the answer to a write is lost   The caller writes the next state, under the next number.
-    a write ends half way           The state is damaged, and is passed over.
-
-A holder removes all states but the newest two, and the older claims that have no state any more. Of a stream that was
-removed, a state that says so stays, and hides what a holder writes that comes back later. See
-decision 78 in docs/decisions.md.
+A holder removes all states but the newest two, and the older claims without a state. Of a stream that was removed, a
+state that says so stays, and hides what a holder writes that comes back later (docs/decisions.md, 78).
 
 A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
 bucket has to be private. obstore takes the credentials of S3 from the environment or the machine's role, and the
@@ -37,7 +32,6 @@ import contextlib
 import errno
 import os
 import re
-import socket
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -61,7 +55,6 @@ _CLAIM = "claim"
 _DIGITS = 8  # of a token and of the number of a state in their names
 _KEEP = 2  # newest states
 _ATTEMPTS = 20  # to claim, or to read the newest state, while other processes change the folder
-_LONGEST_HOLDER = 200
 _NO_NAME = "-"  # folder of the object without a name: no name begins with a dash
 _PROBE = "created-exclusively"
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
@@ -230,39 +223,27 @@ def _trouble(error: Exception) -> str:
     return f"{os.strerror(number)}: {'free some space there' if is_full else 'check the folder, or the server'}"
 
 
-class _Version(NamedTuple):
-    """The version of a state: the token of its writer, and its number."""
-
-    token: int
-    number: int
-
-
-@dataclass(frozen=True, slots=True)
-class Contents:
+class Contents(NamedTuple):
     """The names below the folder of a stream.
 
     claims  tokens of the claims
-    states  versions of the states
+    states  of each state, the token of its writer and its number
     """
 
     claims: set[int]
-    states: set[_Version]
+    states: set[tuple[int, int]]
 
     @classmethod
     def of(cls, names: Iterable[str]) -> Contents:
-        """The listing of these names, each without the folder; names of other things are passed over.
+        """The listing of these names, each without the folder; other names are passed over.
 
         >>> Contents.of(["00000001/claim", "00000001/00000007", "00000001/.part"])
-        Contents(claims={1}, states={_Version(token=1, number=7)})
+        Contents(claims={1}, states={(1, 7)})
         """
-        claims, states = set[int](), set[_Version]()
-        for name in names:
-            token, _, rest = name.partition("/")
-            if token.isdecimal() and rest.isdecimal():
-                states.add(_Version(int(token), int(rest)))
-            elif token.isdecimal() and rest == _CLAIM:
-                claims.add(int(token))
-        return cls(claims, states)
+        parts = [name.split("/") for name in names]
+        claims = {int(token) for token, *rest in parts if token.isdecimal() and rest == [_CLAIM]}
+        numbers = [part for part in parts if len(part) == 2 and all(text.isdecimal() for text in part)]
+        return cls(claims, {(int(token), int(number)) for token, number in numbers})
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,27 +275,27 @@ class StateStore:
                 return None if state is None or state.facts.get("removed") else state
         raise self._busy("read")
 
-    def claim(self, holder: str) -> Claim:
-        """Become the only process that may write states; the name of the holder, such as its node, is for messages."""
+    def claim(self) -> Claim:
+        """Become the only process that may write states."""
         for _ in range(_ATTEMPTS):
             listing = self.listed()
-            token = max([0, *listing.claims, *(version.token for version in listing.states)]) + 1
+            token = max([0, *listing.claims, *(token for token, _ in listing.states)]) + 1
             with contextlib.suppress(FileExistsError):  # another process claims at this moment
-                self._objects.create(self._name(token, _CLAIM), holder[:_LONGEST_HOLDER].encode())
-                return Claim(self, token, holder, self.newest())
+                self._objects.create(self._name(token, _CLAIM), b"")
+                return Claim(self, token, self.newest())
         raise self._busy("claimed")
 
     def put(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         """Write a state where there is no lasting holder. Of two processes at once, both write, one after the other."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(FencedError):
-                return self.claim(_this_process()).write(files, facts)
+                return self.claim().write(files, facts)
         raise self._busy("written")
 
     def clear(self) -> None:
         """Remove all states. A process that still holds them is superseded: it can no longer write."""
         if self.newest() is not None:
-            claim = self.claim(_this_process())
+            claim = self.claim()
             claim.write({}, {"removed": True})
             self.remove_up_to(claim.token, self.listed(), keep=1)
 
@@ -322,36 +303,30 @@ class StateStore:
         """The names below the folder now."""
         return Contents.of(self._objects.names(self.folder))
 
-    def holder(self, token: int) -> str:
-        """The name of the holder with a token, for messages."""
-        with contextlib.suppress(FileNotFoundError, StoreError, UnicodeDecodeError):
-            return self._objects.read(self._name(token, _CLAIM)).decode()
-        return "another process"
-
-    def create(self, version: _Version, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
+    def create(self, token: int, number: int, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
         arrays = {name: np.frombuffer(content, np.uint8) for name, content in files.items()}
-        self._objects.create(self._name(*version), storage.encode(arrays, {"facts": dict(facts)}))
+        self._objects.create(self._name(token, number), storage.encode(arrays, {"facts": dict(facts)}))
 
     def remove_up_to(self, token: int, listing: Contents, keep: int) -> None:
         """Remove the states up to a token but the newest ones, and the claims below it that have none any more."""
-        before = sorted(version for version in listing.states if version.token <= token)
+        before = sorted(version for version in listing.states if version[0] <= token)
         stay = before[len(before) - keep :]
         for version in before[: len(before) - keep]:
             self._objects.remove(self._name(*version))
-        for old in sorted(listing.claims - {version.token for version in stay}):
+        for old in sorted(listing.claims - {writer for writer, _ in stay}):
             if old < token:
                 self._objects.remove(self._name(old, _CLAIM))
 
     def _name(self, token: int, rest: str | int) -> str:
         return f"{self.folder}/{token:0{_DIGITS}}/{rest if isinstance(rest, str) else f'{rest:0{_DIGITS}}'}"
 
-    def _read(self, version: _Version) -> Snapshot | None:
+    def _read(self, version: tuple[int, int]) -> Snapshot | None:
         """A state; None if it is damaged."""
         name = self._name(*version)
         try:
             arrays, header = storage.decode(self._objects.read(name), name)
             files = {key: array.tobytes() for key, array in arrays.items()}
-            return Snapshot(version.token, files, dict(header["facts"]))
+            return Snapshot(version[0], files, dict(header["facts"]))
         except (ProtocolError, KeyError, TypeError, ValueError):
             return None
 
@@ -366,9 +341,8 @@ class Claim:
     state    the state to continue from; None if there is none
     """
 
-    def __init__(self, states: StateStore, token: int, holder: str, state: Snapshot | None) -> None:
-        self.token, self.state = token, state
-        self._states, self._holder = states, holder
+    def __init__(self, states: StateStore, token: int, state: Snapshot | None) -> None:
+        self.token, self.state, self._states = token, state, states
         self._number = 0
         self._fenced: FencedError | None = None
 
@@ -382,7 +356,7 @@ class Claim:
             raise self._fenced
         self._number += 1  # whatever becomes of this state, its number is not used again
         with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
-            self._states.create(_Version(self.token, self._number), files, facts)
+            self._states.create(self.token, self._number, files, facts)
         listing = self.check()
         with contextlib.suppress(StoreError):  # they are removed after the next write
             self._states.remove_up_to(self.token, listing, _KEEP)
@@ -392,13 +366,8 @@ class Claim:
         listing = self._states.listed()
         if self.token in listing.claims and max(listing.claims) == self.token:
             return listing
-        newer = self._states.holder(max(listing.claims, default=0))
         self._fenced = FencedError(
-            f"{self._states.folder} was claimed by {newer} after {self._holder} (token {self.token}): "
-            f"{self._holder} may not write it any more, and has to stop"
+            f"{self._states.folder} was claimed by another process (token {max(listing.claims, default=0)}) after this "
+            f"one (token {self.token}), which has to stop"
         )
         raise self._fenced
-
-
-def _this_process() -> str:
-    return f"process {os.getpid()} on {socket.gethostname()}"

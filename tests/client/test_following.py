@@ -6,13 +6,10 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import catstream
 from catstream.client.address import Address
 from catstream.client.attach import wait_until_running
-from catstream.client.following import FollowedStream
 from catstream.errors import ServiceError, SilenceError
 from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus
 from catstream.wire.channels import CONTROL, HEALTH, TRACKS
@@ -204,51 +201,3 @@ def test_a_client_of_the_fleet_has_its_role_at_each_stream_until_it_is_revoked(s
             stream.update(token=7)  # the pipeline was started again: she connects again
             with pytest.raises(ServiceError, match="rejects the key"):
                 watched.result(60)
-
-
-class _Script:
-    """A registry whose answers a test decides; None if its controller is down."""
-
-    def __init__(self):
-        self.answer = self._status(0, "running")
-
-    @staticmethod
-    def _status(token, state):
-        return StreamStatus("cam-7", state, endpoint=f"run-{token}" if state == "running" else "", token=token)
-
-    def stream(self, _):
-        return self.answer
-
-    def endpoint_of(self, status):
-        return Endpoint.parse(status.endpoint)
-
-    def request(self, _):
-        pass
-
-    def receive(self):
-        return None if self.answer is None else FleetStatus("site", 1.7e9, {"cam-7": self.answer})
-
-
-STEPS = st.lists(st.sampled_from(["move", "stop", "down", "end of the pipeline"]), max_size=20)
-
-
-@given(STEPS, st.sampled_from(["ended", "removed"]))
-def test_only_the_registry_ends_a_stream_not_its_pipelines_or_its_controller(steps, last):
-    registry, token = _Script(), 0
-    followed = FollowedStream(registry, "cam-7")
-    for step in steps:
-        if step == "end of the pipeline":
-            followed.pipeline_ended(STOPPED)
-        elif step == "move":
-            token += 1
-            registry.answer = _Script._status(token, "running")
-        else:
-            registry.answer = None if step == "down" else _Script._status(token, "moving")
-        moved = followed.update()
-        assert moved == (step == "move")
-        assert (followed.end, str(followed.endpoint)) == (None, f"run-{token}")
-    registry.answer = _Script._status(token, last) if last == "ended" else None
-    if last == "removed":
-        registry.receive = lambda: FleetStatus("site", 1.7e9)
-    assert not followed.update()
-    assert followed.end is not None

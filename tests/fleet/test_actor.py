@@ -87,7 +87,7 @@ def test_a_live_stream_uses_no_frame_number_of_its_log_again(store, until, tmp_p
         until(lambda: Store(store).stream("gate").newest() is not None)
         stream._every = 60.0  # what follows is not stored
         until(lambda: stream.report()[0].frame > 60)
-        Store(store).stream("gate").claim("another node")
+        Store(store).stream("gate").claim()
         stream._superseded = True
     with started(spec, store, "n2") as stream:
         last = frames_of(tmp_path / "gate.ndjson")[-1]
@@ -116,7 +116,7 @@ def test_a_zone_outside_the_frame_is_the_trouble_of_a_stream(spec, store, until)
 def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(long_spec, store, until):
     with started(long_spec, store) as old:
         until(lambda: Store(store).stream("cam-7").newest() is not None)
-        claim = Store(store).stream("cam-7").claim("another node")
+        claim = Store(store).stream("cam-7").claim()
         until(lambda: old.report()[1])
     assert Store(store).stream("cam-7").newest().token < claim.token
     claim.write({"state": b"newer"}, {"ended": False})
@@ -179,7 +179,7 @@ def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until,
         until(lambda: stream.report()[0].state == "paused")
         until(lambda: not uploads())  # the last checkpoint may follow
         assert (uploads(), stream.report()[0].trouble) == (0, "")
-        Store(store).stream("gate").claim("another node")
+        Store(store).stream("gate").claim()
         until(lambda: stream.report()[1])
 
 

@@ -235,7 +235,7 @@ def test_one_that_another_process_has_claimed_is_killed_and_claims_again(site, r
 
 def test_of_a_stream_that_is_removed_and_forgotten_nothing_is_left(site, ray, spec):
     store = Store(spec.store)
-    store.stream("gate").claim("n1").write({"a": b""}, {"ended": False})
+    store.stream("gate").claim().write({"a": b""}, {"ended": False})
     with pytest.raises(FleetError, match=r"no stream named 'cam-8' in the fleet site \(streams: gate, roof\)"):
         site.remove(("cam-8",))
     assert site.remove(("gate",)) == ["gate: is removed", "roof: is unchanged"]

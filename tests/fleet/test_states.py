@@ -223,7 +223,7 @@ class Fencing(RuleBasedStateMachine):
         if process.task or (kind == "write" and not process.claim):
             return False
         process.newest, process.before = self.newest_claim, set(self.durable)
-        task = {"claim": lambda states: states.claim("node"), "read": lambda states: states.newest()}.get(kind)
+        task = {"claim": lambda states: states.claim(), "read": lambda states: states.newest()}.get(kind)
         if kind == "write":
             self.serial += 1
             process.chain = (*process.chain, (process.claim.token, self.serial))
@@ -284,13 +284,13 @@ def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_fr
 def test_a_late_write_does_not_bring_a_removed_stream_back():
     memory = Memory()
     states = StateStore(memory, FOLDER)
-    claim = states.claim("old")
+    claim = states.claim()
     claim.write({}, {})
     memory.late.append((f"{FOLDER}/00000001/00000002", memory.read(f"{FOLDER}/00000001/00000001")))
     states.clear()
     memory.land(0)
     assert states.newest() is None
-    new = states.claim("new")
+    new = states.claim()
     assert (new.state, new.token) == (None, 3)
     new.write({}, {"frame": 1})
     assert states.newest().facts == {"frame": 1}
