@@ -168,18 +168,6 @@ def test_rows_shorter_than_a_reduction_stay_within_the_bound(kind, width, rng):
     assert width > SIZE or 0 <= tree.dropped_energy <= slack
 
 
-def test_dropped_energy_is_never_negative(rng):
-    tree = CoresetTree(128)
-    for _ in range(40):
-        tree.insert(rng.normal(size=(128, 64)))
-        assert all(node.dropped >= 0 for node in tree.nodes)
-
-
-@KINDS
-def test_the_energy_is_that_of_all_rows(stream, kind):
-    assert_allclose(grown(stream, kind=kind).energy, energy(stream), rtol=1e-12)
-
-
 def test_a_leaf_is_reduced_on_one_thread_and_other_rows_do_not_change_the_number(stream, monkeypatch):
     limits = []
     monkeypatch.setattr("catstream.compression.tree.one_thread", lambda: limits.append(1) or nullcontext())

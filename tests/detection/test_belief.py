@@ -53,12 +53,6 @@ def test_trust_allows_to_train_and_searches_no_more_often(score):
     assert searches(doubted) >= searches(trusted)
 
 
-def test_a_redetected_object_trains_nothing_and_a_lost_one_is_searched_in_each_frame():
-    assert done("redetected") == {"report", "resize"}
-    assert not done("lost")
-    assert TABLE["lost"].search_interval == 1
-
-
 @given(states(), SCORES, st.booleans())
 def test_a_lost_object_needs_at_least_the_score_to_return_that_it_needs_to_stay(state, score, redetected):
     lost, present = (

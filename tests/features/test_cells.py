@@ -24,6 +24,7 @@ def cells(rng):
 
 def test_every_window_scores_weights_times_row_plus_bias(cells, rng):
     weights = rng.normal(size=ROW_LENGTH).astype(np.float32)
+    weights.flags.writeable = False  # as those of a message
     scores = cells.respond(weights, 0.5)
     expected = [[cells.row(row, column) @ weights + 0.5 for column in range(7)] for row in range(4)]
     np.testing.assert_allclose(scores, expected, rtol=1e-4, atol=1e-3)
@@ -97,11 +98,6 @@ def test_features_of_a_crop_equal_the_slice_of_the_frames_grid(soft):
     np.testing.assert_array_equal(grid(crop, MARGIN), expected)
 
 
-def test_light_added_everywhere_changes_no_gradient(soft):
-    dim = soft // 2
-    np.testing.assert_array_equal(grid(dim)[:, :, :31], grid(dim + 50)[:, :, :31])
-
-
 def test_colour_channels_tell_red_from_green():
     red, green = (np.full((64, 64, 3), colour, np.uint8) for colour in ((0, 0, 200), (0, 200, 0)))
     assert np.abs(grid(red)[0, 0, 31:] - grid(green)[0, 0, 31:]).max() > 1
@@ -144,17 +140,6 @@ def test_neither_the_place_of_a_colour_nor_the_edge_of_an_image_changes_features
     turned[8:56, 8:56] = np.rot90(image[8:56, 8:56])
     turned[:8] = 0
     np.testing.assert_array_equal(colour_features(image), colour_features(turned))
-
-
-@pytest.mark.parametrize("writeable", [True, False], ids=["learned", "received"])
-def test_scores_are_added_for_each_window(rng, writeable):
-    image = np.repeat(np.repeat(rng.integers(0, 256, (24, 32, 3), np.uint8), 4, axis=0), 4, axis=1)
-    weights = rng.normal(size=SHADES).astype(np.float32)
-    weights.flags.writeable = writeable
-    scores = np.full((5, 9), 7, np.float32)
-    features.add_colour_scores(shades(image), weights, scores)
-    expected = [[7 + colour_features(image, row, column) @ weights for column in range(9)] for row in range(5)]
-    np.testing.assert_allclose(scores, expected, atol=1e-4)
 
 
 def test_no_histogram_scores_higher_than_the_highest_score(rng):
