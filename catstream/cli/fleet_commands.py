@@ -23,10 +23,8 @@ from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
 from catstream.cli.options import PATH, with_json
 from catstream.cli.view import HostPort, fleet_view, with_token, with_view
-from catstream.cli.write import check_options, with_sink_options
 from catstream.client.address import Address
 from catstream.errors import FleetError
-from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import FleetStatus, StreamStatus
 
 if TYPE_CHECKING:
@@ -186,16 +184,13 @@ def status(address: Address, as_json: bool) -> None:
 fleet.add_command(fleet_view)
 
 
-@fleet.command()
+@fleet.command(short_help="Add a stream, or change the one of that name.")
 @click.argument("name")
-@click.option("--source", required=True, metavar="SOURCE", help="Video, folder, camera or stream.")
+@click.argument("source")
 @click.option("--box", "boxes", multiple=True, metavar="[NAME=]X,Y,W,H", help="Box of an object in the first frame.")
 @click.option("--model", "models", multiple=True, metavar="[NAME=]FILE", help="Saved model of an object to search for.")
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A setting.")
-@click.option("--cores", type=float, metavar="N", help="Processor cores that Ray reserves for it; default: 1.")
-@click.option("--label", "labels", multiple=True, metavar="NAME=VALUE", help="Label that its node must have.")
-@click.option("--write", multiple=True, metavar="DEST", help="Destination of its tracks, as for catstream track.")
-@with_sink_options
+@click.option("--write", multiple=True, metavar="DEST", help="Destination of its tracks, as in the file.")
 @with_fleet
 def add(
     running: Fleet,
@@ -204,35 +199,27 @@ def add(
     boxes: tuple[str, ...],
     models: tuple[str, ...],
     settings: tuple[str, ...],
-    cores: float | None,
-    labels: tuple[str, ...],
     write: tuple[str, ...],
-    options: SinkOptions,
 ) -> None:
     """Add a stream, or change the one of that name.
 
-    The defaults of the file of the fleet are not for it. To keep the change,
-    put it into the file too.
+    The file of the fleet is not changed, and its defaults do not apply. All
+    other keys of a stream, such as cores and labels, need the file and `up`.
 
     \b
     EXAMPLE
-      catstream fleet add gate --source rtsp://10.0.0.1/1 --box 120,80,64,48 --write "tracks/{stream}.ndjson"
+      catstream fleet add gate rtsp://10.0.0.1/1 --box 120,80,64,48 --write "tracks/{stream}.ndjson"
     """
     from catstream.fleet.spec import StreamSpec
-    from catstream.sinks.options import resolved
-
-    check_options(options, [*write, *options.places])
 
     table = {
         "source": source,
         "boxes": dict(map(split_name, boxes)),
         "models": dict(map(split_name, models)),
         "settings": dict(setting.partition("=")[::2] for setting in settings),
-        "labels": dict(label.partition("=")[::2] for label in labels),
+        "write": list(write),
     }
-    spec = StreamSpec.parse(name, table | ({} if cores is None else {"cores": cores}), Path.cwd())
-    places, options = resolved(write, options, Path.cwd(), name, source)
-    for line in running.add(dataclasses.replace(spec, write=places, options=options)):
+    for line in running.add(StreamSpec.parse(name, table, Path.cwd())):
         click.echo(line)
 
 

@@ -30,14 +30,12 @@ def test_without_a_home_directory_a_fleet_is_an_error_of_one_line(command, fail,
     assert "set HOME or XDG_STATE_HOME" in fail("fleet", command, *([file] if command == "up" else []))
 
 
-def test_a_stream_that_is_added_has_destinations_as_one_of_the_file(succeed, fail, tmp_path, monkeypatch):
+def test_a_stream_that_is_added_is_as_one_of_the_file(succeed, tmp_path, monkeypatch):
     added = []
     site = SimpleNamespace(add=lambda spec: [added.append(spec)] and ["gate: is added"])
     monkeypatch.setattr(fleet, "Fleet", lambda *_, **__: nullcontext(site))
     monkeypatch.chdir(tmp_path)
-    words = ["fleet", "add", "gate", "--source", "demo:1", "--write", "{stream}.ndjson"]
-    succeed(*words, "--events-folder", "{stream}", "--when", "lost=10")
-    folder = tmp_path / "gate"
-    assert added[0].write == (f"{folder}.ndjson", f"folder://{folder}")
-    assert (added[0].options.folder, added[0].options.lost_seconds) == (folder, 10.0)
-    assert "--when has no effect on these destinations" in fail(*words, "--when", "lost")
+    words = ["--box", "anna=1,2,30,40", "--set", "coreset.size=32", "--write", "{stream}.ndjson"]
+    assert succeed("fleet", "add", "gate", "demo:1", *words)[0] == "gate: is added\n"
+    assert (added[0].source, added[0].settings) == ("demo:1", {"coreset.size": "32"})
+    assert (list(added[0].boxes), added[0].write) == (["anna"], (str(tmp_path / "gate.ndjson"),))
