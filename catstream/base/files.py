@@ -192,14 +192,24 @@ def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int
 
 
 @contextlib.contextmanager
-def locked_folder(folder: Path, kind: type[CatstreamError] = ServiceError, seconds: float = 0.0) -> Iterator[None]:
-    """Lock a folder, which is made, for a block; an error of this kind if another process keeps it for `seconds`."""
+def locked_folder(
+    folder: Path,
+    kind: type[CatstreamError] = ServiceError,
+    seconds: float = 0.0,
+    *,
+    mode: int = 0o777,
+    busy: str = "",
+) -> Iterator[None]:
+    """Make a folder if it does not exist, and lock it for a block.
+
+    An error of this kind if it cannot be made, or if another process keeps it locked for `seconds`: the text `busy`.
+    """
     with contextlib.ExitStack() as stack:
         with writing(folder, kind):
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(mode, parents=True, exist_ok=True)
             handle = None if fcntl is None else stack.enter_context(descriptor(folder, os.O_DIRECTORY))
         if handle is not None and not lock(handle, seconds):
-            raise kind(f"{folder} is being written by {_holder(folder)}: stop it, or pass another path")
+            raise kind(busy or f"{folder} is being written by {_holder(folder)}: stop it, or pass another path")
         yield
 
 

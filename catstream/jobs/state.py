@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
 
-from catstream.base.files import descriptor, lock, write_atomically, writing
+from catstream.base.files import locked_folder, write_atomically, writing
 from catstream.base.forks import forked, generation
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
@@ -110,16 +109,9 @@ def restore(folder: Path, content: Mapping[str, bytes]) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
-    """Lock a folder for this process alone, and make it if it does not exist; wait so many seconds for another process.
-
-    ServiceError if another process keeps it locked, or it cannot be made.
-    """
-    with contextlib.ExitStack() as stack:
-        with writing(folder):
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
-        if not lock(handle, seconds):
-            raise ServiceError(f"a running pipeline uses the state in {str(folder)!r}: stop it, or use another folder")
+    """Lock the folder of a state, as `locked_folder` does."""
+    busy = f"a running pipeline uses the state in {str(folder)!r}: stop it, or use another folder"
+    with locked_folder(folder, seconds=seconds, mode=0o700, busy=busy):
         yield folder
 
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from catstream.base.files import descriptor, is_locked, lock, writing
+from catstream.base.files import descriptor, is_locked, lock, locked_folder, writing
 from catstream.base.forks import forked, generation
 from catstream.errors import ServiceError
 from catstream.wire.channels import CHANNELS
@@ -83,18 +83,11 @@ def reserve_endpoint(text: str, default: Path, keys: str = "", source: str = "",
 @contextlib.contextmanager
 def _locked(folder: Path, text: str) -> Iterator[Path]:
     """A folder for the sockets of one pipeline, which is made; the sockets are removed afterwards."""
-    with contextlib.ExitStack() as stack:
-        with writing(folder):
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            handle = stack.enter_context(descriptor(folder, os.O_DIRECTORY))
-        facts = os.fstat(handle)
+    busy = f"a pipeline is already running on {text!r}: wait for it, or use another folder (--set run.endpoint=FOLDER)"
+    with locked_folder(folder, mode=0o700, busy=busy):
+        facts = folder.stat()
         if facts.st_uid != os.geteuid() or facts.st_mode & 0o022:
             raise ServiceError(f"other users may write to {text!r}: use a folder of your own, chmod 700")
-        if not lock(handle):
-            raise ServiceError(
-                f"a pipeline is already running on {text!r}: "
-                "wait for it, or use another folder (--set run.endpoint=FOLDER)"
-            )
         since = generation()
         try:
             yield folder
