@@ -26,7 +26,7 @@ from catstream.wire.channels import HEALTH
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher
-from catstream.wire.rejects import rejects
+from catstream.wire.rejects import rejected
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
 PERMANENT_FAILURE = 2
@@ -82,7 +82,7 @@ class Process:
         self.watchdog.beat()
         if now or time.monotonic() - self._reported >= HEALTH_SECONDS:
             self._reported = time.monotonic()
-            own = counters() | rejects()
+            own = counters() | {"rejected": float(rejected())}
             state = run_state(own)[0] if self.name == "detector" else None
             self._health.send(Health(self.name, time.time(), own, self.trouble, self.source, objects(), state))
             release_memory()

@@ -101,7 +101,6 @@ class Sender(ChannelSocket[Message]):
         self._transmit()
 
     def _disconnected(self) -> None:
-        super()._disconnected()
         self.window.disconnected()
 
     def _transmit(self) -> None:
@@ -189,7 +188,6 @@ class Receiver(ChannelSocket[Message]):
         super().close()
 
     def _disconnected(self) -> None:
-        super()._disconnected()
         self.window.disconnected()
 
     def _reply(self, peer: bytes, position: Position) -> None:

@@ -65,7 +65,6 @@ class Channel(Generic[Message]):
     port             offset from the first port; each further sender takes the next one
     megabytes        size of the largest message
     role             role that a peer which connects needs at least
-    is_public        whether a client may subscribe by its name (`catstream.subscribe`, `catstream watch`)
     high_water_mark  how many messages a subscriber may lag behind before it misses some
     """
 
@@ -77,7 +76,6 @@ class Channel(Generic[Message]):
     port: int
     megabytes: int
     role: Role = "pipeline"
-    is_public: bool = False
     high_water_mark: int = 1000
 
     @property
@@ -98,22 +96,20 @@ ALL_FEATURES: Channel[Features | End] = Channel(
     "all-features", (Features, End), ("detector",), "compressor", "every", port=0, megabytes=_FEATURES
 )
 SAMPLES: Channel[Sample | End] = Channel(
-    "samples", (Sample, End), ("compressor",), None, "newest", 1, 512, "watch", True, high_water_mark=16
+    "samples", (Sample, End), ("compressor",), None, "newest", 1, 512, "watch", high_water_mark=16
 )
-MODELS: Channel[Model] = Channel(
-    "models", (Model,), ("trainer",), None, "newest", 2, 1, "watch", True, high_water_mark=256
-)
-TRACKS: Channel[Track | End] = Channel("tracks", (Track, End), ("detector",), None, "every", 3, 1, "watch", True)
+MODELS: Channel[Model] = Channel("models", (Model,), ("trainer",), None, "newest", 2, 1, "watch", high_water_mark=256)
+TRACKS: Channel[Track | End] = Channel("tracks", (Track, End), ("detector",), None, "every", 3, 1, "watch")
 RESULTS: Channel[Tracks | End] = Channel("results", (Tracks, End), ("detector",), "owner", "every", port=4, megabytes=1)
-HEALTH: Channel[Health] = Channel("health", (Health,), _ALL, None, "newest", 5, 1, "watch", True, high_water_mark=16)
+HEALTH: Channel[Health] = Channel("health", (Health,), _ALL, None, "newest", 5, 1, "watch", high_water_mark=16)
 PREVIEWS: Channel[Preview] = Channel(
-    "previews", (Preview,), ("detector",), None, "newest", 8, 1, "watch", True, high_water_mark=8
+    "previews", (Preview,), ("detector",), None, "newest", 8, 1, "watch", high_water_mark=8
 )
 CONTROL: Channel[Command | Answer] = Channel(
     "control", (Command, Answer), ("anyone",), "detector", "every", port=9, megabytes=64, role="control"
 )
 FEATURES: Channel[Features | End] = Channel(
-    "features", (Features, End), ("detector",), None, "every", 10, _FEATURES, "watch", True, high_water_mark=64
+    "features", (Features, End), ("detector",), None, "every", 10, _FEATURES, "watch", high_water_mark=64
 )
 SAVED_MODELS: Channel[ModelFile] = Channel(
     "saved-models", (ModelFile,), ("compressor",), None, "newest", 11, 512, role="watch", high_water_mark=2
@@ -136,8 +132,10 @@ CHANNELS: dict[str, Channel[object]] = {
     )
 }
 
-#: The channels that a client may subscribe to, by name.
-PUBLIC: dict[str, Channel[object]] = {name: channel for name, channel in CHANNELS.items() if channel.is_public}
+#: The channels that a client may subscribe to, by name (`catstream.subscribe`, `catstream watch`).
+PUBLIC: dict[str, Channel[object]] = {
+    name: channel for name, channel in CHANNELS.items() if channel.role == "watch" and channel is not SAVED_MODELS
+}
 
 #: The only channel of the controller of a fleet, which is no process of a pipeline and has an endpoint of its own.
 REGISTRY: Channel[Question | Listing] = Channel(

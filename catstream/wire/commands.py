@@ -90,7 +90,6 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         self._is_connected = True
 
     def _disconnected(self) -> None:
-        super()._disconnected()
         self._is_connected = self._in_transit = False
 
 

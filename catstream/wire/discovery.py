@@ -132,13 +132,9 @@ def find() -> Endpoint:
         list(_endpoints(_NOTE, strict=True))  # raises the error of a pipeline whose keys cannot be read
         raise ServiceError("no pipeline of yours is running: start one (catstream track), or pass its --endpoint")
     if len(endpoints) > 1:
-        raise ServiceError(f"{len(endpoints)} pipelines are running: select one (--endpoint){_listed(endpoints)}")
+        places = "; ".join(sorted(f"{endpoint.source or 'a pipeline'} at {endpoint}" for endpoint in endpoints))
+        raise ServiceError(f"{len(endpoints)} pipelines are running: select one (--endpoint); {places}")
     return endpoints[0]
-
-
-def _listed(endpoints: list[Endpoint]) -> str:
-    """List the running pipelines, for the end of an error message."""
-    return "".join(f"; {endpoint.source or 'a pipeline'} at {endpoint}" for endpoint in sorted(endpoints, key=str))
 
 
 def source_at(endpoint: Endpoint) -> str:

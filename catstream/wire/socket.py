@@ -24,7 +24,7 @@ from catstream.wire.channels import Channel
 from catstream.wire.codec import decode_with_run, encode
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.monitor import Event, Monitor, arrives
-from catstream.wire.rejects import disconnected, reject
+from catstream.wire.rejects import reject
 from catstream.wire.zap import ZapHandler
 
 LINGER_SECONDS = 2.0  #: that a closed socket still has to transmit its last messages
@@ -83,16 +83,12 @@ def _too_many(error: zmq.ZMQError) -> ServiceError:
 
 def _remedy(error: zmq.ZMQError) -> str:
     """The advice if a socket cannot listen."""
-    match error.errno:
-        case errno.EADDRINUSE:
-            what = "another pipeline may be running there: wait for it, or choose"
-        case errno.ENOENT | errno.ENOTDIR:
-            what = "the folder does not exist: create it, or choose"
-        case errno.EACCES | errno.EPERM | errno.EROFS:
-            what = "this user may not write there: change the permissions, or choose"
-        case _:
-            what = "choose"
-    return f"{what} another endpoint (--set run.endpoint=...)"
+    causes = {
+        errno.EADDRINUSE: "another pipeline may be running there: wait for it, or ",
+        errno.ENOENT: "the folder does not exist: create it, or ",
+        errno.EACCES: "this user may not write there: change the permissions, or ",
+    }
+    return f"{causes.get(error.errno or 0, '')}choose another endpoint (--set run.endpoint=...)"
 
 
 @atexit.register
@@ -269,8 +265,6 @@ class ChannelSocket(Generic[Message]):
 
     def _disconnected(self) -> None:
         """A connection ended."""
-        if self._listens:
-            disconnected()
 
     def _handshake_failed(self, event: Event) -> None:
         """Count a peer that failed, unless the ZAP handler has counted it; as a client, raise an error if denied."""

@@ -7,7 +7,6 @@ import numpy as np
 from catstream.base.box import Box, Window
 from catstream.messages.kinds import Command, Model, Preview, Track
 from catstream.messages.schema import Field, Named, fields
-from catstream.wire.rejects import rejects
 
 
 def track(seq: int, name: str = "") -> Track:
@@ -20,11 +19,6 @@ def present(seq: int, name: str = "") -> Track:
 
 def model(version: int, name: str = "") -> Model:
     return Model(version, version, np.full(5, version, np.float32), 0.0, object=name)
-
-
-def rejected() -> int:
-    """How many messages this process has rejected until now."""
-    return rejects()["rejected"]
 
 
 def example(kind: type, full: bool = True, d: int = 5) -> Any:

@@ -13,11 +13,10 @@ from unittest.mock import Mock
 import pytest
 
 from catstream.errors import ServiceError
-from catstream.wire.channels import CHANNELS, TRACKS
-from catstream.wire.discovery import find, note, private_folder, reserve_endpoint, running, source_at
+from catstream.wire.channels import CHANNELS
+from catstream.wire.discovery import find, private_folder, reserve_endpoint, running, source_at
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import Keys, create
-from catstream.wire.newest import Publisher
 
 PLACES = [(channel, sender) for channel in CHANNELS.values() for sender in channel.senders]
 
@@ -131,12 +130,6 @@ def killed(place: str = "") -> Path:
     return Path(subprocess.run([sys.executable, "-c", script, place], capture_output=True, text=True).stdout.strip())
 
 
-def test_the_folder_of_a_killed_pipeline_is_free_again(folder):
-    assert killed(str(folder)) == folder
-    with reserve_endpoint(str(folder), folder) as endpoint:
-        assert endpoint.folder == folder
-
-
 def test_the_folder_of_a_killed_process_is_removed_and_that_of_a_running_one_is_not(folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.setenv("TMPDIR", str(folder))
@@ -172,17 +165,6 @@ def test_only_running_pipeline_is_found_if_the_name_of_its_source_is_not_utf_8()
         assert (str(find()), find().source) == (str(endpoint), source)
 
 
-@pytest.mark.parametrize("text", ["", "run", "run\n", "http://run\n\n"])
-def test_a_note_of_another_version_does_not_hide_the_pipelines_of_this_one(text):
-    with (
-        private_folder() as one,
-        reserve_endpoint("", one, source="good.mp4") as good,
-        private_folder() as two,
-        note(two / "endpoint", text),
-    ):
-        assert {str(good): "good.mp4"}.items() <= {str(endpoint): endpoint.source for endpoint in running()}.items()
-
-
 def test_a_pipeline_whose_keys_cannot_be_read_does_not_hide_the_others(tmp_path):
     create(tmp_path / "keys")
     with (
@@ -215,22 +197,3 @@ def test_an_address_without_its_prefix_is_not_taken_for_a_folder(text, meant, fo
     if "/" not in text:
         (folder / text).mkdir()
         assert Endpoint.parse(text).folder == Path(text)
-
-
-def test_a_file_is_no_endpoint(folder):
-    (folder / "file").touch()
-    with pytest.raises(ServiceError, match="is a file: pass a folder"):
-        Endpoint.parse(str(folder / "file"))
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "remedy"),
-    [
-        ("missing", "No such file or directory.*the folder does not exist"),
-        ("tcp://no-such-host.invalid:5700", "choose another endpoint"),
-    ],
-)
-def test_what_cannot_be_listened_on_is_an_error_with_its_remedy(endpoint, remedy, folder, keys):
-    place = Endpoint.parse(endpoint if "://" in endpoint else str(folder / endpoint), str(keys))
-    with pytest.raises(ServiceError, match=f"cannot listen on .*{remedy}"), Publisher(TRACKS, place):
-        pass

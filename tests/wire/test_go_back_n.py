@@ -327,17 +327,6 @@ def test_a_sender_asks_only_while_messages_wait_and_not_more_often_than_its_pati
     assert not window.must_ask(200.0)
 
 
-def test_a_sender_that_only_waits_transmits_nothing_again():
-    sender, receiver = filled(size=4, count=3), ReceiveWindow(Position(), size=4)
-    for seq in (1, 2):
-        receiver.receive(b"peer", seq, now=0.0)
-    for stored in (0, 2):
-        receiver.acknowledge(Position(stored))
-        sender.receive(receiver.asked(b"peer"), now=1.0)
-        assert (sender.acknowledged, sender.processed) == (stored, 2)
-        assert frames(sender) == []
-
-
 @pytest.mark.parametrize("late", [Position(1, 3), Position(2, 2)], ids=["stored less", "received less"])
 def test_an_acknowledgement_that_steps_back_is_rejected_and_changes_nothing(late):
     window = filled(size=4, count=4)

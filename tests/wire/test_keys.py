@@ -19,8 +19,9 @@ from catstream.wire.commands import Requester, Responder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.keys import ROLES, Keys, allow, clients, create
 from catstream.wire.newest import Publisher, Subscriber
+from catstream.wire.rejects import rejected
 from catstream.wire.results import ResultsReceiver
-from tests.wire.examples import rejected, track
+from tests.wire.examples import track
 
 WINDOW = 4
 CLIENTS = {"watcher": "watch", "operator": "control", "host": "pipeline"}  # name and role of some

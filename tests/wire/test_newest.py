@@ -17,7 +17,8 @@ from catstream.wire.codec import encode, opening, topic_of
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Publisher, Subscriber
-from tests.wire.examples import model, rejected, track
+from catstream.wire.rejects import rejected
+from tests.wire.examples import model, track
 
 NAMES = st.just("") | st.from_regex(r"\w[\w.-]{0,63}", fullmatch=True)
 

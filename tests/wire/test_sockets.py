@@ -33,25 +33,6 @@ def tracks(seq):
     return Tracks(seq - 1, {"": track(seq)})
 
 
-def test_a_sender_that_asked_a_slow_receiver_still_learns_its_position(endpoint, until):
-    taken = []
-    with Receiver(RESULTS, endpoint, Position(), WINDOW) as receiver, Sender(RESULTS, endpoint, WINDOW) as sender:
-
-        def turn():
-            if (message := receiver.receive(0.05)) is not None:
-                taken.append(message.seq)
-            receiver.answer()
-            sender.poll(0.05)
-
-        sender.send(tracks(1))
-        for _ in range(10):
-            sender.poll(0.05)  # nobody answers: it asks where the receiver is, and will send all again
-        for _ in range(10):
-            turn()
-        until(lambda: sender.window.processed == 1, turn)
-    assert taken == [1]
-
-
 def test_a_message_that_is_too_large_to_arrive_is_an_error_that_says_what_to_give(endpoint):
     small = replace(RESULTS, megabytes=0)
     with Sender(small, endpoint, WINDOW) as sender, pytest.raises(ServiceError, match=r"lower coreset\.size"):
