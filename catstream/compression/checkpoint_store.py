@@ -1,4 +1,4 @@
-"""The last two checkpoints of a compressor, one file each: if the newest is damaged, the previous one is used."""
+"""The last checkpoints of a compressor, one file each: if the newest is damaged, an earlier one is used."""
 
 from __future__ import annotations
 
@@ -21,14 +21,20 @@ _log = logging.getLogger(__name__)
 
 
 class CheckpointStore:
-    """A folder with the newest two checkpoints, and the last damaged one; `trouble` describes current problems.
+    """A folder with the newest two checkpoints, the newest durable one, and the last damaged one.
 
-    A checkpoint is written atomically, and is on disk before `save` returns. No file is overwritten: an older
-    checkpoint is removed after a newer one is complete.
+    A checkpoint is written atomically. A durable one is on disk before `save` returns. The others survive `kill -9`,
+    but not a power cut: the kernel writes a file to disk after about 30 s, and they are removed before. No file is
+    overwritten: an older checkpoint is removed after a newer one is complete.
+
+    size     bytes of the newest checkpoint that this store has written
+    trouble  current problems
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self._folder = Path(folder)
+        self._durable: Path | None = None  # the newest that this store has written
+        self.size = 0
         self._damaged: list[Path] = []
         self._read_problem = ""  # why checkpoints were not used
         self._write_problem = ""  # why the last checkpoint could not be written
@@ -68,12 +74,14 @@ class CheckpointStore:
                 self._damaged.append(path)
         return None
 
-    def save(self, forest: Forest) -> bool:
+    def save(self, forest: Forest, *, durable: bool = True) -> bool:
         """Write a checkpoint, and remove the oldest; returns False and changes nothing if it cannot be written."""
         files = self._files()
         number = int(files[-1].stem) + 1 if files else 1
+        path = self._folder / f"{number:012d}.safetensors"
         try:
-            forest.save(self._folder / f"{number:012d}.safetensors")
+            forest.save(path, durable=durable)
+            self.size = path.stat().st_size
         except OSError as error:
             problem = f"cannot write checkpoints to {self._folder} ({error.strerror})"
             if problem != self._write_problem:
@@ -83,11 +91,13 @@ class CheckpointStore:
         if self._write_problem:
             _log.warning("checkpoints are written again")
         self._write_problem = ""
-        for path in self._damaged:
-            path.replace(self._folder / _DAMAGED)
+        for damaged in self._damaged:
+            damaged.replace(self._folder / _DAMAGED)
         self._damaged = []
-        for path in self._files()[:-_CHECKPOINTS]:
-            path.unlink()
+        self._durable = path if durable else self._durable
+        for old in self._files()[:-_CHECKPOINTS]:
+            if old != self._durable:
+                old.unlink()
         return True
 
     def _files(self) -> list[Path]:

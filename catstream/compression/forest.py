@@ -129,10 +129,10 @@ class Forest:
         """Counters of each object, by name, for the health messages."""
         return {name: compressor.counters() for name, compressor in self.compressors.items()}
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one file, atomically."""
+    def save(self, path: str | os.PathLike[str], *, durable: bool = True) -> None:
+        """Write everything to one file, as `storage.write` does."""
         arrays, metadata = self.state()
-        storage.write(path, arrays, metadata | {"kind": _KIND})
+        storage.write(path, arrays, metadata | {"kind": _KIND}, durable=durable)
 
     @staticmethod
     def position_in(path: str | os.PathLike[str]) -> tuple[int, float]:

@@ -33,9 +33,10 @@ _KEY = "catstream"  # the only metadata key: with several, their order, and so t
 _VERSION = 1  # version of the metadata's format
 
 
-def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> None:
+def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata, *, durable: bool = True) -> None:
     """Write arrays and JSON metadata to a file for its owner only, as `write_atomically` does; memory holds no copy.
 
+    A file that is not durable survives the death of this process, and may be lost or damaged by a power cut.
     OSError if the file cannot be written; the old one stays unchanged.
     """
     path = Path(path)
@@ -47,9 +48,11 @@ def write(path: str | os.PathLike[str], arrays: Arrays, metadata: Metadata) -> N
             safetensors.numpy.save_file(contiguous, part, header)
         except safetensors.SafetensorError as error:
             raise OSError(errno.EIO, str(error)) from None
-        sync(part)  # the content must be on disk before the new name
+        if durable:
+            sync(part)  # the content must be on disk before the new name
         part.replace(path)
-    sync(path.parent)
+    if durable:
+        sync(path.parent)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[Arrays, Metadata]:

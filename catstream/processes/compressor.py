@@ -15,7 +15,7 @@ from catstream.jobs.saved_model import SavedModel, continued
 from catstream.jobs.state import CHECKPOINTS, locked
 from catstream.messages.kinds import End, Features, ModelFile, Position
 from catstream.numerics import ridge
-from catstream.processes.decisions import checkpoint_is_due, stored, with_end
+from catstream.processes.decisions import checkpoint_is_due, stored, sync_interval, with_end
 from catstream.processes.process import MESSAGE_SECONDS, Process
 from catstream.wire.acknowledged import Receiver
 from catstream.wire.channels import ALL_FEATURES, SAMPLES, SAVED_MODELS
@@ -60,6 +60,7 @@ class CompressorLoop:
         seq = self._forest.seq
         self._position = Position(seq, seq, versions=self._forest.versions)
         self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was written, and for how long
+        self._sync_at = 0.0  # when the next one is durable
         check, states, window = self._check, self._forest.states_at, settings.run.unstored_frames
         self._features = stack.enter_context(Receiver(ALL_FEATURES, endpoint, self._position, window, check, states))
         self._samples = stack.enter_context(Publisher(SAMPLES, endpoint))
@@ -98,7 +99,7 @@ class CompressorLoop:
         urgent = is_end or features.window.half_full or bool(features.pending_restarts)
         interval = self._process.settings.run.checkpoint_seconds
         if seq > self._stored and (urgent or checkpoint_is_due(monotonic() - self._tried, self._took, interval)):
-            self._store(urgent)
+            self._store(urgent, is_end)
         if message is not None or self._position is not before:
             # Samples count without a checkpoint, because in lockstep the detector waits for their models.
             position = replace(self._position, processed=seq, versions=self._forest.versions)
@@ -110,10 +111,13 @@ class CompressorLoop:
         """Number of the newest message that is in a checkpoint."""
         return self._position.seq - self._position.in_memory
 
-    def _store(self, urgent: bool) -> None:
+    def _store(self, urgent: bool, is_end: bool) -> None:
         self._process.watchdog.allow()
         began = monotonic()
-        saved = self._checkpoints.save(self._forest)
+        durable = self._process.job.state is not None and (is_end or began >= self._sync_at)
+        saved = self._checkpoints.save(self._forest, durable=durable)
+        if saved and durable:
+            self._sync_at = began + sync_interval(self._checkpoints.size)
         self._position = stored(self._position, self._forest.seq, saved=saved, urgent=urgent)
         self._tried = monotonic()
         self._took = self._tried - began
@@ -130,7 +134,7 @@ class CompressorLoop:
     def stop(self) -> None:
         """Store all received messages; the sender continues with the next compressor."""
         if self._forest.seq > self._stored:
-            self._store(urgent=False)
+            self._store(urgent=False, is_end=True)
             self._features.acknowledge(
                 replace(self._position, processed=self._forest.seq, versions=self._forest.versions)
             )

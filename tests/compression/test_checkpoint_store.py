@@ -106,3 +106,13 @@ def test_a_full_disk_is_reported_and_existing_checkpoints_are_kept(kept, grow, m
     assert store.save(forest)
     assert not store.trouble
     assert CheckpointStore(kept).load(SETTINGS).seq == 65
+
+
+def test_the_newest_durable_checkpoint_remains_for_a_power_cut(grow, tmp_path):
+    forest, store = Forest(SETTINGS), CheckpointStore(tmp_path)
+    for durable in (True, False, True, False, False, False):
+        assert store.save(grow(forest, 10), durable=durable)
+    assert files(tmp_path) == [f"{number:012d}.safetensors" for number in (3, 5, 6)]
+    for path in sorted(tmp_path.iterdir())[1:]:
+        path.write_bytes(bytes(path.stat().st_size))  # as after a power cut: the name is on disk, the content is not
+    assert CheckpointStore(tmp_path).load(SETTINGS).seq == 30
