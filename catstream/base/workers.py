@@ -45,12 +45,15 @@ def die_with(parent: int) -> None:
 def name_process(name: str, command: str = "") -> None:
     """Show a name in `top`, cut after 15 characters, and a command line in `ps`, cut to the length of the present one.
 
-    Every user of the machine can read them. Without a `command`, the present one stays.
+    Every user of the machine can read them. Without a `command`, the present one stays. Systems other than Linux have
+    no such call, and keep the present ones.
     """
+    if sys.platform != "linux":
+        return
     ctypes.CDLL(None).prctl(_SET_NAME, name.encode(errors="replace"), 0, 0, 0)
     if not command:
         return
-    with suppress(OSError):  # there is no /proc
+    with suppress(OSError):  # /proc is not mounted
         first, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[_ARGUMENTS])
         text = command.encode(errors="replace")[: max(0, end - first - 1)]
         ctypes.memmove(first, text.ljust(end - first, b"\0"), end - first)

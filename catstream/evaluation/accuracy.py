@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 
@@ -40,11 +41,10 @@ class Row:
 
     @classmethod
     def mean(cls, rows: Sequence[Row]) -> Row:
-        each = [asdict(row.score) for row in rows]
-        measures = {
-            name: sum(score[name] for score in each) if isinstance(value, int) else fmean(score[name] for score in each)
-            for name, value in each[0].items()
-        }
+        measures: dict[str, Any] = {}
+        for name, value in asdict(rows[0].score).items():
+            values = [getattr(row.score, name) for row in rows]
+            measures[name] = sum(values) if isinstance(value, int) else fmean(values)
         return cls("mean", sum(row.frames for row in rows), Score(**measures), fmean(row.fps for row in rows))
 
     def cells(self) -> list[str]:

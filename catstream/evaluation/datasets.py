@@ -69,7 +69,7 @@ class Sequence:
     @property
     def present(self) -> Bool:
         """Whether each frame shows the object, bool (frames,)."""
-        present: Bool = np.isfinite(self.boxes).all(axis=1)
+        present: Bool = np.all(np.isfinite(self.boxes), axis=1)
         return present
 
     def since(self, frame: int) -> Sequence:

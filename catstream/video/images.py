@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -73,8 +74,8 @@ def _page_count(path: Path) -> int:
     """Return the number of pages of an image file, 1 for most; 0 if OpenCV cannot read it."""
     try:
         with path.open("rb") as file, _without_warnings():
-            # Not by its name: OpenCV crashes at one that is not UTF-8.
-            return cv2.imcount(f"/proc/self/fd/{file.fileno()}")
+            # On Linux not by its name: OpenCV crashes at one that is not UTF-8.
+            return cv2.imcount(f"/proc/self/fd/{file.fileno()}" if sys.platform == "linux" else str(path))
     except (OSError, cv2.error):
         return 0
 
