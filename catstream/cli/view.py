@@ -132,11 +132,12 @@ def view(address: Address, listen: HostPort, token: str | None) -> None:
       catstream view --endpoint run --listen 8080
       VIEW_TOKEN=$(cat my-token) catstream view --listen 0.0.0.0:8000
     """
-    from catstream.web.app import pipeline_site
+    from catstream.web.app import Site
+    from catstream.web.feed import PipelineFeed
 
     if address.endpoint:
         address.resolve()  # raises errors that waiting does not solve
-    _serve(pipeline_site(address), listen, token)
+    _serve(Site(PipelineFeed(address)), listen, token)
 
 
 @click.command("view")

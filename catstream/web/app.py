@@ -31,7 +31,6 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from catstream.base.box import Box
-from catstream.client.address import Address
 from catstream.errors import BoxError, CatstreamError, CommandRejectedError, ObjectError, ProtocolError, SilenceError
 from catstream.video.drawing import draw_preview
 from catstream.web import prometheus
@@ -46,6 +45,7 @@ UPDATE_SECONDS = 0.1  #: between two updates
 COMMENT_SECONDS = 5.0  #: without an update, after which a comment is sent, which detects closed connections
 RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
 _MAX_BODY = 4096  # bytes
+_MJPEG = "multipart/x-mixed-replace; boundary=picture"
 
 #: Status code of the answer to a request that ends with an error: that of its first class here.
 _CODES = {
@@ -58,11 +58,6 @@ _CODES = {
 }
 
 
-def pipeline_site(address: Address) -> Site:
-    """The site of a pipeline, which may start later."""
-    return Site(PipelineFeed(address))
-
-
 class Site:
     """The web application of a pipeline, `app`, without access control; `Server` serves it."""
 
@@ -70,15 +65,15 @@ class Site:
         self.feed = feed
         self._closed = False
         routes = [
-            Route("/", self._index),
-            Route("/events", self._events),
+            Route("/", lambda _: FileResponse(PAGE / "index.html")),
+            Route("/events", lambda request: endless(request, self._updates(), "text/event-stream")),
             Route("/metrics", self._metrics),
-            Route("/healthz", self._healthz),
+            Route("/healthz", lambda _: PlainTextResponse("ok\n")),
             Route("/readyz", self._readyz),
             Mount("/page", StaticFiles(directory=PAGE)),
             Route("/pictures/{time:float}.jpg", self._picture),
             Route("/picture.jpg", self._newest_picture),
-            Route("/live.mjpeg", self._live),
+            Route("/live.mjpeg", lambda request: endless(request, self._annotated_pictures(), _MJPEG)),
             Route("/control", self._control, methods=["POST"]),
         ]
         handlers = {CatstreamError: failed}
@@ -94,17 +89,8 @@ class Site:
         yield
         await asyncio.to_thread(self.feed.stop)
 
-    async def _index(self, _: Request) -> Response:
-        return FileResponse(PAGE / "index.html")
-
-    async def _events(self, request: Request) -> Response:
-        return endless(request, self._updates(), "text/event-stream")
-
     async def _metrics(self, _: Request) -> Response:
         return prometheus.response(prometheus.of_pipeline(self.feed))
-
-    async def _healthz(self, _: Request) -> Response:
-        return PlainTextResponse("ok\n")
 
     async def _readyz(self, _: Request) -> Response:
         problem = self.feed.problem
@@ -122,9 +108,6 @@ class Site:
             return PlainTextResponse("no picture has arrived yet\n", 404)
         jpeg = await run_in_threadpool(draw_preview, *newest, self.feed.dashboard.colours)
         return Response(jpeg, media_type="image/jpeg")
-
-    async def _live(self, request: Request) -> Response:
-        return endless(request, self._annotated_pictures(), "multipart/x-mixed-replace; boundary=picture")
 
     async def _control(self, request: Request) -> Response:
         command = await json_of(request, Command)

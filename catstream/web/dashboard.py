@@ -79,7 +79,7 @@ class Dashboard:
             "points": lambda new: list(self._points)[-new:],
             "trees": self._trees_part,
         }
-        self._revisions = Counter(self._parts.keys())
+        self._revisions: Counter[str] = Counter(self._parts.keys())
         self.endpoint = self._attached = ""
         self._run = ""  # id of the run that is shown
         self._runs_before: set[str] = set()  # ids of those before it, whose last messages may still arrive

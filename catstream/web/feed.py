@@ -161,7 +161,7 @@ class PipelineFeed:
 
 
 def _next(messages: Subscription[Any]) -> object | None:
-    """Return the next message, at last the end; None if none arrives within the time-out of the subscription."""
+    """Return the next message, at last the end; None if none arrives within the timeout of the subscription."""
     with suppress(SilenceError):
         for message in messages:
             return cast(object, message)

@@ -14,7 +14,8 @@ import pytest
 from catstream.base.box import Box
 from catstream.client.address import Address
 from catstream.messages.kinds import FleetStatus, Health, Model, NodeStatus, Preview, StreamStatus, Track
-from catstream.web.app import pipeline_site
+from catstream.web.app import Site
+from catstream.web.feed import PipelineFeed
 from catstream.web.server import Server
 from catstream.web.wall import Wall
 from catstream.wire.channels import HEALTH, PREVIEWS
@@ -77,7 +78,7 @@ def serve_site():
 @pytest.fixture
 def serve(serve_site, folder):
     """Starts pages of the pipeline in `folder`: a client of each of them."""
-    return lambda **options: serve_site(pipeline_site(Address(str(folder))), **options)
+    return lambda **options: serve_site(Site(PipelineFeed(Address(str(folder)))), **options)
 
 
 class Fleet:

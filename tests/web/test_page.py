@@ -13,7 +13,8 @@ from catstream.client.attach import subscribe
 from catstream.pipeline import Pipeline
 from catstream.video.rendered import RATE, Demo
 from catstream.video.writer import VideoWriter
-from catstream.web.app import pipeline_site
+from catstream.web.app import Site
+from catstream.web.feed import PipelineFeed
 from catstream.web.server import Server
 
 pytestmark = pytest.mark.system
@@ -32,7 +33,7 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
             boxes.append(box)
     # The pipeline continues only if its tracks are received.
     settings = Settings(run={"endpoint": str(folder), "unstored_frames": 4})
-    server = Server(pipeline_site(Address(str(folder))), port=0, token="correct-horse-battery")
+    server = Server(Site(PipelineFeed(Address(str(folder)))), port=0, token="correct-horse-battery")
     words = script_of_browser("page.mjs", server.url, ",".join(map(str, boxes[0])), str(SIZE[0]))
     output = tmp_path / "output"
 
@@ -77,7 +78,7 @@ def test_objects_are_drawn_forgotten_and_tracked_until_they_leave_after_a_restar
 
 def test_object_of_a_camera_is_tracked_from_the_still_picture_of_its_box(script_of_browser, folder, walker):
     url, find = walker
-    server = Server(pipeline_site(Address(str(folder))), port=0, token=None)
+    server = Server(Site(PipelineFeed(Address(str(folder)))), port=0, token=None)
     words = script_of_browser("live.mjs", server.url, "1")
     with (
         server.in_background(),

@@ -24,7 +24,7 @@ from catstream.client.address import Address
 from catstream.errors import ServiceError
 from catstream.messages.kinds import Health
 from catstream.web import app
-from catstream.web.app import pipeline_site
+from catstream.web.app import Site
 from catstream.web.dashboard import Dashboard
 from catstream.web.feed import PipelineFeed
 from catstream.web.server import Server
@@ -277,12 +277,12 @@ def test_browser_may_open_two_pages_at_two_ports(serve):
 def test_public_address_requires_a_long_token():
     for token, why in ((None, "without --token none"), ("secret", "the token is too short")):
         with pytest.raises(ServiceError, match=why):
-            Server(pipeline_site(Address()), host="0.0.0.0", port=0, token=token)
+            Server(Site(PipelineFeed(Address())), host="0.0.0.0", port=0, token=token)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
 def test_server_on_all_interfaces_is_reached_at_loopback_and_by_the_host_name(host):
-    server = Server(pipeline_site(Address()), host=host, port=0, token=TOKEN)
+    server = Server(Site(PipelineFeed(Address())), host=host, port=0, token=TOKEN)
     with server.in_background():
         urls = [urlsplit(url) for url in server.urls]
         assert httpx.get(server.url, follow_redirects=True).status_code == 200
@@ -303,7 +303,7 @@ def test_second_interrupt_during_the_shutdown_does_not_cut_it_short(monkeypatch)
 
     monkeypatch.setattr(PipelineFeed, "start", start)
     monkeypatch.setattr(PipelineFeed, "stop", stop)
-    site = pipeline_site(Address())
+    site = Site(PipelineFeed(Address()))
     monkeypatch.setattr(site, "close", lambda: signal.raise_signal(signal.SIGINT))
     Server(site, port=0, token=TOKEN).run()
     assert len(stops) == 1
@@ -313,7 +313,7 @@ def test_command_that_waits_for_its_answer_is_answered_at_the_end_of_the_server(
     begun, answered = threading.Event(), threading.Event()
     monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 1)
     monkeypatch.setattr(PipelineFeed, "execute", lambda *_, **__: begun.set() or answered.wait(150))
-    server = Server(pipeline_site(Address(str(folder))), port=0)
+    server = Server(Site(PipelineFeed(Address(str(folder)))), port=0)
     with ThreadPoolExecutor(1) as pool:
         with server.in_background():
             asked = pool.submit(httpx.post, f"{server.url}control", json={"verb": "pause"}, timeout=150)
@@ -328,7 +328,7 @@ def test_viewers_that_do_not_read_are_cut_off_at_the_end_without_a_traceback(fol
     updates = []
     monkeypatch.setattr("catstream.web.server.SHUTDOWN_SECONDS", 0.5)
     monkeypatch.setattr(Dashboard, "updates", lambda *_: updates.append(1) or {"status": "x" * (1 << 20)})
-    server = Server(pipeline_site(Address(str(folder))), port=0)
+    server = Server(Site(PipelineFeed(Address(str(folder)))), port=0)
     with socket.create_connection(urlsplit(server.url).netloc.split(":")) as viewer, server.in_background():
         viewer.sendall(b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         until(lambda: updates and len(updates) == (time.sleep(0.5), len(updates))[1])
@@ -338,7 +338,7 @@ def test_viewers_that_do_not_read_are_cut_off_at_the_end_without_a_traceback(fol
 def test_port_in_use_is_an_error_or_the_next_free_one_is_taken(page):
     port = urlsplit(str(page.base_url)).port
     with pytest.raises(ServiceError, match=rf"127.0.0.1:{port} \(Address already in use\): choose another port"):
-        Server(pipeline_site(Address()), port=port)
-    server = Server(pipeline_site(Address()), port=port, attempts=100)
+        Server(Site(PipelineFeed(Address())), port=port)
+    server = Server(Site(PipelineFeed(Address())), port=port, attempts=100)
     server._socket.close()
     assert port < urlsplit(server.url).port < port + 100

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from catstream.client.address import Address
-from catstream.web.app import pipeline_site
+from catstream.web.app import Site
+from catstream.web.feed import PipelineFeed
 from catstream.web.server import Server
 
 pytestmark = pytest.mark.system
@@ -21,7 +22,7 @@ SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgettin
 def seen(script_of_browser, tmp_path):
     """What `states.mjs` saw, by colour scheme and state."""
     cv2.imwrite(str(tmp_path / "picture.jpg"), np.full((240, 320, 3), (200, 160, 90), np.uint8))
-    server = Server(pipeline_site(Address(str(tmp_path / "nowhere"))), port=0, token="correct-horse-battery")
+    server = Server(Site(PipelineFeed(Address(str(tmp_path / "nowhere")))), port=0, token="correct-horse-battery")
     with server.in_background():
         words = script_of_browser("states.mjs", server.url, tmp_path / "picture.jpg")
         run = subprocess.run(words, capture_output=True, text=True, check=False)

@@ -1,29 +1,25 @@
 // Connects to the server, and passes its updates to the page.
 
-import { $, write } from "./dom.js";
 import { StreamPage } from "./stream.js";
 
-let page = null; // made with the first update
-let events = null; // the connection to the server, null while the page is hidden
 const server = { closed: false, silent: null }; // whether it has announced its shutdown; time since which it does not answer
-
-function take({ closed, ...parts }) {
-  page ??= new StreamPage(server);
-  if (closed) server.closed = true;
-  page.take(parts);
-}
+const page = new StreamPage(server);
+let events = null; // the connection to the server, null while the page is hidden
 
 function listen() {
   events = new EventSource("events");
   events.onopen = () => {
     Object.assign(server, { closed: false, silent: null });
-    page?.showState();
+    page.showState();
   };
-  events.onmessage = (event) => take(JSON.parse(event.data));
+  events.onmessage = ({ data }) => {
+    const { closed, ...parts } = JSON.parse(data);
+    if (closed) server.closed = true;
+    page.take(parts);
+  };
   events.onerror = () => {
     server.silent ??= Date.now();
-    if (page) page.showState();
-    else write($("#state b"), "page stopped");
+    page.showState();
     if (events?.readyState !== EventSource.CLOSED) return;
     stop();
     setTimeout(async () => {
@@ -40,7 +36,7 @@ function stop() {
 }
 
 document.addEventListener("visibilitychange", () => { // a browser opens few connections to a server, over all its tabs
-  if (document.hidden && !page?.stage?.drawing) stop();
+  if (document.hidden && !page.stage.drawing) stop();
   else if (!document.hidden && !events) listen();
 });
 addEventListener("pageshow", (event) => event.persisted && !events && listen());

@@ -23,7 +23,6 @@ export class StreamPage {
     this.form = new BoxForm(this.objects, { accept: () => this.stage.accept(), cancel: () => this.stage.cancel() });
     this.stage = new Stage($("#stage"), this.objects, { hold: () => this.hold(), follow: (box, still) => this.follow(box, still),
       changed: (drawing, box) => this.showDrawing(drawing, box) });
-    $("#stream").hidden = false;
     $("#all").hidden = !this.name;
     this.listen();
     this.showState();
