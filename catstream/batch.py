@@ -163,9 +163,9 @@ def track_video(video: Video, output: Path, settings: Settings, progress: Progre
             head, frames = method(video, settings, progress, stack)
             files = _files(video, output, head, overwrite=True)
             files.make_folder()
-            write = stack.enter_context(files.opened(""))
+            output_files = stack.enter_context(files.opened(""))
             for frame in frames:
-                write(frame)
+                output_files.write(frame)
                 summary = summary.add(frame.tracks)
     except CatstreamError as error:
         return replace(summary, error=str(error))

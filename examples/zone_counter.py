@@ -13,7 +13,6 @@ import sys
 from collections import defaultdict
 
 import catstream
-from catstream.jobs.job import SinkOptions
 from catstream.sinks.events import Event, Events
 
 
@@ -42,7 +41,7 @@ def main(endpoint: str, *zones: str) -> None:
     for zone in zones:
         name, _, points = zone.partition("=")
         corners[name] = tuple((float(x), float(y)) for x, y in (point.split(",") for point in points.split()))
-    events, counter = Events(SinkOptions(zones=corners)), Counter()
+    events, counter = Events(corners), Counter()
     with catstream.subscribe(endpoint, "tracks") as tracks:
         for track in tracks:
             for event in events.update([track]):

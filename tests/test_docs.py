@@ -98,7 +98,8 @@ def test_every_destination_and_format_of_tracks_is_explained():
     for name in places_of("NAME", Results(Path(), video=True)):
         assert f"`{name}`" in shown
         assert f"`{name}`" in page("docs/tutorial.md")
-    for key in [*(f"FILE{key}" if key[0] == "." else key for key in SINKS), *EXPORTS]:
+    names = {".": "FILE", "/": "DIR"}
+    for key in [*(names.get(key[0], "") + key for key in SINKS), *EXPORTS]:
         assert f"`{key}`" in shown, f"docs/how-to/sinks.md does not say what {key} is"
 
 

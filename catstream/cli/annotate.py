@@ -193,9 +193,9 @@ class _ResultFiles:
         """Write the log, and the table of the frames to look at next."""
         from catstream.sinks.destinations import TrackedFrame
 
-        with self._log().opened("") as write:
+        with self._log().opened("") as files:
             for tracks in zip(*self._annotation.tracks.values(), strict=True):
-                write(TrackedFrame(list(tracks)))
+                files.write(TrackedFrame(list(tracks)))
         rows = [f"{frame},{name},{errors:.1f}\n" for frame, name, errors in self._annotation.next_frames()]
         with writing(self._next, VideoError):
             write_atomically(self._next, "".join(["frame,object,errors\n", *rows]).encode())

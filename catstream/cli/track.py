@@ -33,9 +33,9 @@ from catstream.cli.options import (
     with_reading,
 )
 from catstream.cli.view import HostPort, with_token, with_view
-from catstream.cli.write import check_options, with_sink_options, with_table
+from catstream.cli.write import with_table
 from catstream.client.address import Address
-from catstream.jobs.job import Results, SinkOptions
+from catstream.jobs.job import Results
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.messages.kinds import Track
 from catstream.pipeline import Pipeline
@@ -48,13 +48,24 @@ _SHORTEST_SECONDS = 1.0  # a shorter run is reported without its frames per seco
 _REFRESH_SECONDS = 0.1  # between two updates of the progress
 
 
+def _files_only(_: click.Context, __: click.Parameter, places: tuple[str, ...]) -> tuple[str, ...]:
+    """Check that no destination is an address or a folder."""
+    for place in places:
+        if place != STDOUT and not is_file(place):
+            raise click.UsageError(
+                f"--write takes files, and {redacted(place)} is none: attach it to the run with catstream sink "
+                f"{redacted(place)}"
+            )
+    return places
+
+
 @click.command()
 @click.argument("source", required=False)
 @click.option("--output", type=PATH, help="Folder for the results.")
 @click.option("--video/--no-video", default=None, help="Also write the annotated video OUTPUT/NAME.mp4.")
-@click.option("--write", multiple=True, metavar="DEST", help="Also write the tracks to DEST; repeatable.")
-@click.option("--no-write", is_flag=True, help="With --resume: drop the destinations of --write.")
-@with_sink_options
+@click.option(
+    "--write", multiple=True, metavar="FILE", callback=_files_only, help="Also write the tracks to FILE; repeatable."
+)
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object to FILE at the end.")
 @with_view
@@ -68,7 +79,7 @@ _REFRESH_SECONDS = 0.1  # between two updates of the progress
 @with_part
 @with_overrides
 @with_reading
-@with_table(SINKS)
+@with_table({suffix: row for suffix, row in SINKS.items() if is_file(suffix) or suffix == STDOUT})
 def track(**options: Any) -> None:
     """Track one or several objects in a video.
 
@@ -104,13 +115,12 @@ def track(**options: Any) -> None:
     `catstream export` converts these files to the formats of annotation tools
     and benchmarks.
 
-    --write DEST, repeatable; the suffix selects the format
+    --write FILE, repeatable; the suffix selects the format, and - is standard output
 
     {table}
 
-    Existing files are not replaced without --overwrite. The run does not wait for
-    destinations on the network: losses are counted. --zone and the options after
-    it are for mqtt:// and http://.
+    Existing files are not replaced without --overwrite. MQTT, webhooks and
+    pictures of events are extra subscribers: catstream sink.
 
     \b
     EXAMPLES
@@ -123,8 +133,6 @@ def track(**options: Any) -> None:
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out
       catstream track 0 --model walker.safetensors
       catstream track 0 --view
-      catstream track 0 --model walker.safetensors --write mqtt://10.0.0.7/yard \\
-                        --zone "door=300,80 420,80 420,400 300,400" --when lost=10,entered
       catstream track walk.mp4 --box 120,80,64,48 --output out --state checkpoints
       catstream track --resume checkpoints
       catstream track rtsp://10.0.0.7/stream1 --box 120,80,64,48 --output out --state checkpoints --continue
@@ -151,8 +159,6 @@ class _Run:
     output: Path | None
     video: bool | None
     write: tuple[str, ...]
-    no_write: bool
-    options: SinkOptions
     overwrite: bool
     saved: dict[str, Path]
     view: HostPort | None
@@ -185,11 +191,9 @@ class _Run:
         finally:
             if progress.frames and not isinstance(sys.exception(), BrokenPipeError):
                 results = [] if files.output is None else [str(files.output)]
-                results += map(redacted, pipeline.results.write or ())
+                results += map(str, pipeline.results.write or ())
                 missing = files.missing()
-                console.print(
-                    progress.summary([place for place in results if not is_file(place) or Path(place).exists()])
-                )
+                console.print(progress.summary([place for place in results if Path(place).exists()]))
                 if missing:
                     console.print(f"missing results, which another program removed: {', '.join(missing)}")
         if self.resume is not None and not progress.frames and not interrupted:
@@ -224,10 +228,6 @@ class _Run:
             raise click.UsageError(
                 f"{option} and --overwrite are mutually exclusive (continue / replace the existing results)"
             )
-        if self.write and self.no_write:
-            raise click.UsageError("--write and --no-write are mutually exclusive")
-        if self.no_write and not (self.resume or self.continues):
-            raise click.UsageError("--no-write has no effect on a new run: omit it")
         if UNNAMED in self.saved and len(self.boxes) + len(self.models) > 1:
             raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
 
@@ -245,16 +245,14 @@ class _Run:
             results=Results(  # absolute, to resume from any folder
                 output=self.output and self.output.absolute(),
                 video=self.video,
-                write=() if self.no_write else self._destinations(),
+                write=self._destinations(),
                 models={name: file.absolute() for name, file in self.saved.items()},
-                options=self.options,
             ),
         )
 
-    def _destinations(self) -> tuple[str, ...] | None:
-        """The destinations of `--write`, but standard output; None if there are none."""
-        places = (place for place in self.write if place != STDOUT)
-        return tuple(str(Path(place).absolute()) if is_file(place) else place for place in places) or None
+    def _destinations(self) -> tuple[Path, ...] | None:
+        """The files of `--write`, without standard output; None without the option: a resumed run keeps its files."""
+        return tuple(Path(place).absolute() for place in self.write if place != STDOUT) if self.write else None
 
     def _files(self, pipeline: Pipeline) -> RunFiles:
         """Everything that the tracks are written to; raise an error if one of the run's files could not be written."""
@@ -262,8 +260,7 @@ class _Run:
         if results.video and results.output is None:
             raise click.UsageError("--video requires --output, the folder for the video")
         places = [*places_of(pipeline.name, results), *([STDOUT] if STDOUT in self.write else [])]
-        check_options(self.options, places, pipeline.size)
-        origin = Origin(pipeline.head, Address(keys=settings.keys), results.options)
+        origin = Origin(pipeline.head, Address(keys=settings.keys))
         files = RunFiles(origin, results.output, places)
         others = {f"the saved model of {name or 'the object'}": file for name, file in results.models.items()}
         if folder := self.state or self.resume:
@@ -325,9 +322,9 @@ class _Run:
     ) -> None:
         """Write every track to all files, which the stack closes, and show it."""
         endpoint, has_said = pipeline.endpoint, False
-        write, skip_damaged = None, pipeline.settings.run.skip_damaged
+        outputs, skip_damaged = None, pipeline.settings.run.skip_damaged
         if self.resume is not None:
-            write = stack.enter_context(files.opened(endpoint, resume=True, skip_damaged=skip_damaged))
+            outputs = stack.enter_context(files.opened(endpoint, resume=True, skip_damaged=skip_damaged))
         moment = time.perf_counter()
         for tracks in pipeline.by_frame(_REFRESH_SECONDS):
             if not has_said and "detector" in pipeline.health:  # it answers commands from now on
@@ -335,15 +332,13 @@ class _Run:
                 self._say_what_holds(pipeline, line.console)
             if not tracks:
                 progress.idle()
-                if write is not None:
-                    write(None)
                 continue
             # New files are opened with the first track: a run that cannot start does not change older results. They are
             # checked again: while this one started or waited, another run may have written them.
-            write = write or stack.enter_context(self._files(pipeline).opened(endpoint))
+            outputs = outputs or stack.enter_context(self._files(pipeline).opened(endpoint))
             before, moment = moment, time.perf_counter()
             with INTERRUPTS.deferred():  # so that a frame is in all results or in none
-                write(TrackedFrame([*tracks.values()], moment - before))
+                outputs.write(TrackedFrame([*tracks.values()], moment - before))
                 progress.show(line, tracks)
 
 

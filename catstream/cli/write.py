@@ -1,11 +1,11 @@
-"""`catstream sink`: write the tracks of a running pipeline; and the options of destinations, for other commands."""
+"""`catstream sink`: write the tracks of a running pipeline."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
-from functools import partial
+from functools import partial, wraps
 from inspect import cleandoc
 from itertools import islice
 from pathlib import Path
@@ -18,16 +18,14 @@ from catstream.base.names import split_name
 from catstream.base.text import counted, listed
 from catstream.cli.attach import wait_for_pipeline, with_address, with_silence_warnings, with_wait
 from catstream.cli.common import INTERRUPTS
-from catstream.cli.options import PATH, Command, NumberRange, combined, with_overwrite
+from catstream.cli.options import Command, with_overwrite
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SettingsError, SilenceError
-from catstream.jobs.job import SinkOptions
 from catstream.sinks import destinations
-from catstream.sinks import options as sink_options
 from catstream.sinks.destinations import SINKS, Head, Origin, TrackedFrame
-from catstream.sinks.events import KINDS, check_zones
-from catstream.sinks.options import parse_when
+from catstream.sinks.events import check_zones
+from catstream.sinks.options import OPTIONS, parse
 
 _REPORTS = 12  # of all processes, in which one of the detector says what it tracks: those of four seconds
 
@@ -43,99 +41,36 @@ def with_table(rows: Mapping[str, Any]) -> Callable[[Command], Command]:
     return changed
 
 
-def _zones(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:
-    """The corners of the zones by name."""
-    zones: dict[str, Any] = {}
-    for text in texts:
-        name, corners = split_name(text)
-        pairs = [corner.split(",") for corner in corners.split()]
-        try:
-            points = tuple((float(x), float(y)) for x, y in pairs)
-        except ValueError:
-            points = ()
-        if not (name and name not in zones and points):
-            raise click.BadParameter(f'expected NAME="X,Y X,Y X,Y ..." with a new name, got {text!r}')
-        zones[name] = points
-    check_zones(zones)
-    return zones
+def _texts(_: click.Context, __: click.Parameter, pairs: tuple[str, ...]) -> dict[str, str] | None:
+    """The texts NAME=TEXT by name; None if there is none."""
+    texts = dict(map(split_name, pairs))
+    if "" in texts or len(texts) < len(pairs):
+        raise click.BadParameter(f"expected NAME=TEXT, each with a new name, got {pairs[-1]!r}")
+    return texts or None
 
 
-def _when(_: click.Context, __: click.Parameter, text: str) -> tuple[tuple[str, ...], float]:
-    """The kinds of events, and the seconds of `lost`."""
-    try:
-        return parse_when(text)
-    except SettingsError as error:
-        raise click.BadParameter(str(error)) from None
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
-#: Adds the options of destinations, as the argument `options`, a `SinkOptions`.
-with_sink_options = combined(
-    "options",
-    lambda zone, margin, when, rate, picture, secret, folder, megabytes: SinkOptions(
-        *(zone, margin, when[0], when[1], rate, picture),
-        secret and secret.absolute(),
-        folder and folder.absolute(),
-        megabytes,
-    ),
-    click.option(
-        "--zone", multiple=True, metavar='NAME="X,Y X,Y ..."', callback=_zones, help="A polygon in pixels; repeatable."
-    ),
-    click.option(
-        "--zone-margin",
-        "margin",
-        type=NumberRange(0, 10000),
-        default=10,
-        metavar="PIXELS",
-        help="Hysteresis: an object leaves a zone only farther outside than this; default: 10.",
-    ),
-    click.option(
-        "--when",
-        default=",".join(KINDS),
-        metavar="EVENT,...",
-        callback=_when,
-        help=f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, default: 2.",
-    ),
-    click.option(
-        "--rate",
-        type=NumberRange(0, 1000, min_open=True),
-        default=1,
-        metavar="N",
-        help="States of each object per second, for mqtt://; default: 1.",
-    ),
-    click.option("--picture", is_flag=True, help="Add the pipeline's newest picture to each event."),
-    click.option("--secret-file", "secret", type=PATH, help="File with the key that signs events, for http://."),
-    click.option("--events-folder", "folder", type=PATH, metavar="DIR", help="Write a picture of each event to DIR."),
-    click.option(
-        "--events-megabytes",
-        "megabytes",
-        type=NumberRange(0, min_open=True),
-        default=1000,
-        metavar="N",
-        help="Size of DIR, above which the oldest files are removed; default: 1000.",
-    ),
-)
+def _with_options(command: Command) -> Command:
+    """Add the options of destinations; the argument `values` has the given ones by name."""
 
+    @wraps(command)
+    def wrapped(**arguments: Any) -> object:
+        values = {name: arguments.pop(name) for name in OPTIONS}
+        return command(values={name: value for name, value in values.items() if value is not None}, **arguments)
 
-#: Field of `SinkOptions` -> the option that sets it.
-_FLAGS = {
-    "zones": "--zone",
-    "margin": "--zone-margin",
-    "events": "--when",
-    "lost_seconds": "--when lost=",
-    "rate": "--rate",
-    "picture": "--picture",
-    "key": "--secret-file",
-    "folder": "--events-folder",
-    "folder_megabytes": "--events-megabytes",
-}
-
-
-def check_options(options: SinkOptions, places: Iterable[str], size: tuple[int, int] | None = None) -> None:
-    """Raise UsageError if an option has no effect; with the `size` of a frame, also if a zone is outside."""
-    try:
-        sink_options.check_options(options, places, size, _FLAGS)
-    except SettingsError as error:
-        raise click.UsageError(str(error)) from None
+    whole: Command = wrapped
+    for name, option in reversed(OPTIONS.items()):
+        if option.kind is bool:
+            add = click.option(_flag(name), is_flag=True, default=None, help=option.help)
+        elif option.kind == dict[str, str]:
+            add = click.option(_flag(name), multiple=True, metavar=option.metavar, callback=_texts, help=option.help)
+        else:
+            add = click.option(_flag(name), metavar=option.metavar, help=option.help)
+        whole = add(whole)
+    return whole
 
 
 def _head(address: Address) -> Head:
@@ -153,13 +88,13 @@ def _head(address: Address) -> Head:
 
 
 @click.command()
-@click.argument("places", nargs=-1, metavar="DEST...")
+@click.argument("places", nargs=-1, required=True, metavar="DEST...")
 @with_overwrite
-@with_sink_options
+@_with_options
 @with_address
 @with_wait
 @with_table(SINKS)
-def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address: Address, wait: float) -> None:
+def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], address: Address, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives. The pipeline does not wait; missed
@@ -177,11 +112,12 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
       catstream sink tracks.ndjson walk.mp4 --endpoint run
       catstream sink - | jq .box
       catstream sink mqtt://10.0.0.7/yard --zone "door=300,80 420,80 420,400 300,400"
-      catstream sink https://example.com/hook --when lost=10,entered --secret-file key
+      catstream sink https://example.com/hook events/ --when lost=10,entered
     """
-    if not (places := (*places, *options.places)):
-        raise click.UsageError("missing DEST: pass a file or an address, or --events-folder")
-    check_options(options, places)
+    try:
+        options = parse(values, places, _flag)
+    except SettingsError as error:
+        raise click.UsageError(str(error)) from None
     for place in places:
         destinations.check_sink(place, options)
         if destinations.is_file(place):
@@ -193,7 +129,7 @@ def sink(places: tuple[str, ...], overwrite: bool, options: SinkOptions, address
         with suppress(KeyboardInterrupt), ExitStack() as stack:
             wait_for_pipeline(address, wait)
             origin = Origin(_head(address), address, options, attached=True)
-            check_options(options, places, origin.head.size)
+            check_zones(options.zone, origin.head.size)
             opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
             sinks = [stack.enter_context(closing(sink)) for sink in opened]
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))

@@ -35,7 +35,7 @@ from catstream.messages.kinds import StreamState, StreamStatus, Track
 from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.sinks.destinations import Origin, TrackedFrame
-from catstream.sinks.options import check_options
+from catstream.sinks.events import check_zones
 from catstream.sinks.track_log import RunFiles, is_log
 from catstream.wire.discovery import free_ports, private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
@@ -141,7 +141,7 @@ class Stream:
             claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
             pipeline = self._open_pipeline(claim, stack)
-            write, resume = None, claim.state is not None
+            outputs, resume = None, claim.state is not None
             files = self._destinations(pipeline, resume=resume)
             closed_last = stack.enter_context(ExitStack())  # after the processes
             stack.enter_context(pipeline)
@@ -162,9 +162,10 @@ class Stream:
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
                 self._take(pipeline, tracks)
                 if tracks and files.places:
-                    write = write or closed_last.enter_context(files.continued(pipeline.endpoint, resume=resume))
-                if write is not None:
-                    write(TrackedFrame([*tracks.values()]) if tracks else None)
+                    outputs = outputs or closed_last.enter_context(files.continued(pipeline.endpoint, resume=resume))
+                    outputs.write(TrackedFrame([*tracks.values()]))
+                elif outputs is not None:
+                    outputs.idle()
                 if self._stop.is_set():
                     break
             else:
@@ -194,7 +195,7 @@ class Stream:
     def _destinations(self, pipeline: Pipeline, *, resume: bool) -> RunFiles:
         """The destinations of the tracks. If this node has a log, the run continues its frame numbers."""
         options = self._spec.options
-        check_options(options, self._spec.write, pipeline.size)
+        check_zones(options.zone, pipeline.size)
         origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
         files = RunFiles(origin, None, list(self._spec.write))
         if resume and any(path.exists() for path in map(Path, files.places) if is_log(path)):

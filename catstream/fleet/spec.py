@@ -27,8 +27,8 @@ from catstream.base.names import UNNAMED, boxes_by_name, by_name
 from catstream.base.settings import Settings, flat, read_toml
 from catstream.base.text import listed
 from catstream.errors import CatstreamError, FleetError
-from catstream.jobs.job import Job, SinkOptions, changed_setting
-from catstream.sinks.destinations import redacted
+from catstream.jobs.job import Job, changed_setting
+from catstream.sinks.destinations import SinkOptions, redacted
 from catstream.sinks.options import KEYS, destinations
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")

@@ -32,37 +32,6 @@ _ALL = slice(None)  # frames
 
 
 @dataclass(frozen=True, slots=True)
-class SinkOptions:
-    """Options of destinations beside their addresses, and of the events that some of them send.
-
-    zones         corners x, y of each zone, a polygon, in pixels of the frame, by name
-    margin        pixels by which the centre of a box has to be outside a zone that it was in to leave it
-    events        kinds of events that are sent, see `catstream.sinks.events`
-    lost_seconds  time without a box after which an object is lost
-    rate          messages per second at most about each object, in between its events
-    picture       whether each event has the newest picture of the pipeline
-    key           file of the key that signs what is sent, None to sign nothing
-    folder        folder of a picture of each event, None for none
-    folder_megabytes  limit of its size
-    """
-
-    zones: dict[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
-    margin: float = 10.0
-    events: tuple[str, ...] = ("found", "lost", "returned", "entered", "left", "ended")
-    lost_seconds: float = 2.0
-    rate: float = 1.0
-    picture: bool = False
-    key: Path | None = None
-    folder: Path | None = None
-    folder_megabytes: float = 1000.0
-
-    @property
-    def places(self) -> tuple[str, ...]:
-        """The destinations among them."""
-        return () if self.folder is None else (f"folder://{self.folder}",)
-
-
-@dataclass(frozen=True, slots=True)
 class Results:
     """The files that `catstream track` writes for a run; a resumed run continues the same files.
 
@@ -70,25 +39,22 @@ class Results:
 
     output      folder of the results files
     video       whether an annotated video is among the results files
-    write       further destinations of tracks, see `catstream.sinks.destinations`
+    write       further files of tracks, see `catstream.sinks.destinations`
     models      files for what was learned of each object, by name; a file without a name is for the only object
-    options     options of the further destinations
     """
 
     output: Path | None = None
     video: bool | None = None
-    write: tuple[str, ...] | None = field(default=None, repr=False)  # an address may contain a password
+    write: tuple[Path, ...] | None = None
     models: dict[str, Path] = field(default_factory=dict)
-    options: SinkOptions = field(default_factory=SinkOptions)
 
     def after(self, earlier: Results) -> Results:
-        """These files, and of a kind of which there is none those of the earlier part of the run."""
+        """These files, and of a kind of which there is none the files of the earlier part of the run."""
         return Results(
             output=self.output or earlier.output,
             video=earlier.video if self.video is None else self.video,
             write=earlier.write if self.write is None else self.write,
             models=self.models or earlier.models,
-            options=self.options if self.options != SinkOptions() else earlier.options,
         )
 
 

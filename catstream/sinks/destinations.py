@@ -24,8 +24,8 @@ from catstream.base.box import Box
 from catstream.base.files import check_file, check_unlocked
 from catstream.client.address import Address
 from catstream.errors import VideoError
-from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
+from catstream.sinks.events import WHEN, Point
 from catstream.video.images import IMAGES
 from catstream.video.source import VIDEOS
 
@@ -101,12 +101,32 @@ class Head:
 
 
 @dataclass(frozen=True, slots=True)
+class SinkOptions:
+    """Options of the destinations that receive events; `catstream.sinks.options` has their table.
+
+    zone         corners of each zone, a polygon in pixels of the frame, by name
+    when         kinds of events that are sent, see `catstream.sinks.events.WHEN`
+    rate         messages per second about each object, at most, between its events
+    picture      whether each event has the newest picture of the pipeline
+    secret_file  file of the key that signs what is sent; None to sign nothing
+    megabytes    limit of the size of a folder
+    """
+
+    zone: dict[str, tuple[Point, ...]] = field(default_factory=dict)
+    when: dict[str, float] = field(default_factory=WHEN.copy)
+    rate: float = 1.0
+    picture: bool = False
+    secret_file: Path | None = None
+    megabytes: float = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
 class Origin:
     """The run whose tracks a sink writes.
 
     head      of its log
     address   of the running pipeline, for a sink that receives other messages, too
-    options   of the destinations, beside their addresses
+    options   of the destinations
     attached  whether another program runs the pipeline: its source is not read a second time
     last      last frame of the file if it is a log that is continued; None for a new file
     size      number of bytes up to the end of that frame
@@ -134,18 +154,11 @@ class Sink(Protocol):
         """Complete what was written, which remains; raise VideoError if that is not possible."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A row of the table.
-
-    home     the class of a sink, as module.Class
-    meaning  a line of the help
-    options  fields of `SinkOptions` that it uses; any of them is an error if no destination does
-    """
+class Row(NamedTuple):
+    """A row of the table: the class of a sink, as module.Class, and a line of the help."""
 
     home: str
     meaning: str
-    options: tuple[str, ...] = ()
 
     def load(self) -> Any:
         """Import the class."""
@@ -153,47 +166,47 @@ class Row:
         return getattr(import_module(f"catstream.sinks.{module}"), name)
 
 
-#: Options of the sinks that send events.
-_EVENTS = ("zones", "margin", "events", "lost_seconds")
-
-#: The suffix of a file, the scheme of an address such as "mqtt://", or "-" for standard output -> the sink.
+#: The suffix of a file, the scheme of an address such as "mqtt://", "/" for a folder, or "-" -> the sink.
 SINKS = {
     ".ndjson": Row("track_log.NdjsonSink", "the log: one JSON object per line, after a head"),
     STDOUT: Row("track_log.StdoutSink", "the same, without the head, on standard output"),
     ".csv": Row("track_log.CsvSink", "a row for each object and frame: frame, seconds, state, box, score ..."),
     ".sqlite": Row("database.SqliteSink", "the table tracks of a database, which others read meanwhile"),
     ".mp4": Row("video_sink.open_video", "the frames with their boxes drawn in"),
-    "mqtt://": Row(
-        "mqtt_sink.MqttSink",
-        "HOST/TOPIC: events and states of objects, for a broker",
-        options=(*_EVENTS, "picture", "rate"),
-    ),
-    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS", options=(*_EVENTS, "picture", "rate")),
-    "folder://": Row(
-        "events_folder.EventsFolder",
-        "DIR: a picture of each event, as with --events-folder",
-        options=(*_EVENTS, "folder", "folder_megabytes"),
-    ),
-    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST", options=(*_EVENTS, "picture", "key")),
-    "https://": Row("webhook.Webhook", "the same with TLS", options=(*_EVENTS, "picture", "key")),
+    "mqtt://": Row("mqtt_sink.MqttSink", "HOST/TOPIC: events and states of objects, for a broker"),
+    "mqtts://": Row("mqtt_sink.MqttSink", "the same with TLS"),
+    "http://": Row("webhook.Webhook", "HOST/PATH: each event as JSON, by POST"),
+    "https://": Row("webhook.Webhook", "the same with TLS"),
+    "/": Row("events_folder.EventsFolder", "a folder, DIR/: each event in events.ndjson, and its picture as JPEG"),
 }
 
 
-def sink_of(place: str) -> Row:
-    """Return the row of a sink; raises VideoError if there is none for this suffix or scheme."""
+def kind_of(place: str) -> str:
+    """Return the key of a destination in `SINKS`, or what would be its key.
+
+    >>> kind_of("out/walk.csv"), kind_of("mqtt://host/yard"), kind_of("events/"), kind_of("-")
+    ('.csv', 'mqtt://', '/', '-')
+    """
     scheme, mark, _ = place.partition("://")
-    row = SINKS.get(scheme + mark if mark else place if place == STDOUT else Path(place).suffix)
+    if mark or place == STDOUT:
+        return scheme + mark
+    return "/" if place.endswith("/") else Path(place).suffix
+
+
+def sink_of(place: str) -> Row:
+    """Return the row of a destination; raises VideoError if there is none."""
+    row = SINKS.get(kind_of(place))
     if row is None:
         raise VideoError(
             f"{redacted(place)} is not a destination of tracks: pass a file or address with one of {', '.join(SINKS)}, "
-            "where - is standard output; for other formats use catstream export"
+            "where - is standard output, and / ends the name of a folder; for other formats use catstream export"
         )
     return row
 
 
 def is_file(place: str) -> bool:
-    """Return whether a destination is a file: not standard output, and no address."""
-    return place != STDOUT and "://" not in place
+    """Return whether a destination is a file: not standard output, no address, and no folder."""
+    return place != STDOUT and "://" not in place and not place.endswith("/")
 
 
 def check_result(path: Path, *, overwrite: bool, source: str = "", made: Path | None = None) -> None:

@@ -1,7 +1,7 @@
 """Events of objects, detected in their tracks.
 
 >>> from catstream.base.box import Box
->>> events = Events(SinkOptions(zones={"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, lost_seconds=1))
+>>> events = Events({"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, WHEN | {"lost": 1.0})
 >>> for frame, box in enumerate([Box(0, 40, 20, 20), Box(60, 40, 20, 20), None, None, Box(0, 40, 20, 20)]):
 ...     state = "absent" if box is None else "present"
 ...     for event in events.update([Track(frame, frame / 2, state, box, 0.9, 1)]):
@@ -23,8 +23,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from catstream.errors import SettingsError
-from catstream.jobs.job import SinkOptions
+from catstream.base.names import check_name
+from catstream.errors import ObjectError, SettingsError
 from catstream.messages.kinds import Track
 
 #: x and y, in pixels of the frame.
@@ -36,9 +36,15 @@ KINDS = {
     "lost": "it has had no box for some seconds",
     "returned": "it has a box again after that",
     "entered": "the centre of its box is in a zone",
-    "left": "the centre is outside the zone again, by more than the margin; or the object was lost or ended in it",
+    "left": "the centre is outside the zone again, by more than 10 pixels; or the object was lost or ended in it",
     "ended": "it was forgotten, another object got its name, or the tracks ended",
 }
+
+#: All kinds, with the seconds without a box after which an object is lost.
+WHEN = dict.fromkeys(KINDS, 0.0) | {"lost": 2.0}
+
+#: Pixels by which a centre has to be outside a zone to leave it: hysteresis for a box that stays on the edge.
+MARGIN = 10.0
 
 #: More frames than these, with tracks of other objects, end an object without a track. A subscriber that loses messages
 #: may have no track of an object in two of the frames of which it has any, and in the next one that of another first.
@@ -79,15 +85,17 @@ class _Object:
 class Events:
     """Detects events in the tracks of a run, in their order; it does no I/O, and time is that of the tracks.
 
-    A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `options.margin`
-    pixels outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.
-    SettingsError if a zone cannot be entered, see `check_zones`.
+    A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `MARGIN` pixels
+    outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.
+
+    zones : corners x, y of each polygon, in pixels, by name; SettingsError if one is invalid, see `check_zones`
+    when : kinds of events that are returned; the value of `lost` is the seconds without a box
     """
 
-    def __init__(self, options: SinkOptions) -> None:
-        check_zones(options.zones)
-        self._options = options
-        self._zones = {name: np.array(corners, np.float32) for name, corners in options.zones.items()}
+    def __init__(self, zones: Mapping[str, Sequence[Point]], when: Mapping[str, float] = WHEN) -> None:
+        check_zones(zones)
+        self._zones = {name: np.array(corners, np.float32) for name, corners in zones.items()}
+        self._when, self._lost_seconds = when, when.get("lost", WHEN["lost"])
         self._objects: dict[str, _Object] = {}
         self._frame, self._frames = -1, 0  # number of the newest frame, and how many there were
 
@@ -115,7 +123,7 @@ class Events:
         return {"present": item.box_time is not None and not item.lost, "zones": [*item.zones]}
 
     def _selected(self, events: list[Event]) -> list[Event]:
-        return [event for event in events if event.kind in self._options.events]
+        return [event for event in events if event.kind in self._when]
 
     def _of(self, track: Track) -> Iterator[Event]:
         """Yield the events of a track, except the end of other objects."""
@@ -126,7 +134,7 @@ class Events:
         item = item or self._objects.setdefault(track.object, _Object(track))
         item.track, item.frames = track, self._frames
         if track.box is None:
-            if item.box_time is None or item.lost or track.time - item.box_time < self._options.lost_seconds:
+            if item.box_time is None or item.lost or track.time - item.box_time < self._lost_seconds:
                 return
             item.lost = True
             yield from self._leave_zones(item)
@@ -140,7 +148,7 @@ class Events:
             if name not in item.zones and inside >= 0:
                 item.zones.append(name)
                 yield Event("entered", track, name)
-            elif name in item.zones and inside < -self._options.margin:
+            elif name in item.zones and inside < -MARGIN:
                 item.zones.remove(name)
                 yield Event("left", track, name)
 
@@ -156,13 +164,20 @@ class Events:
 
 
 def check_zones(zones: Mapping[str, Sequence[Point]], size: tuple[int, int] | None = None) -> None:
-    """Raise SettingsError if a zone is no simple polygon in pixels; with the `size` of a frame, if it is outside.
+    """Raise SettingsError if a zone has an invalid name or is no simple polygon in pixels.
+
+    With the `size` of a frame, also if it is outside. The rules for names are those for objects: they are safe in
+    topics, file names and templates.
 
     >>> check_zones({"door": [(0.1, 0.1), (0.9, 0.1), (0.9, 0.9)]})
     Traceback (most recent call last):
     catstream.errors.SettingsError: zone door: all corners are within 0 to 1: use pixels of the frame, not fractions
     """
     for name, corners in zones.items():
+        try:
+            check_name(name or " ")
+        except ObjectError as error:
+            raise SettingsError(f"zone: {error}") from None
         if wrong := _defect(np.array(corners, np.float32), size):
             raise SettingsError(f"zone {name}: {wrong}")
 

@@ -1,7 +1,7 @@
 """An MQTT broker: events, the state of each object, and its discovery by Home Assistant.
 
     TOPIC/availability     "online"; "offline" at the end, and as last will if the connection breaks; retained
-    TOPIC/events           each event, as `EventMessages` makes it
+    TOPIC/events           each event, as `EventStream.to_json` makes it
     TOPIC/objects/NAME     the newest track of an object, with `present`, `zones` and `sent`, as often as the option
                            `rate` says, and as soon as `present` or `zones` changes; retained, and removed if the object
                            ends. NAME is "-" for the object without a name
@@ -16,6 +16,7 @@ import json
 import ssl
 import sys
 import time
+from collections.abc import Iterable
 from enum import Enum, auto
 from hashlib import blake2b
 from typing import Any
@@ -26,9 +27,10 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.jobs.job import SinkOptions
-from catstream.sinks.destinations import Origin, TrackedFrame, redacted
-from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventMessages, Warnings, reason_of, split
+from catstream.messages.kinds import Preview
+from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, redacted
+from catstream.sinks.events import Event
+from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
 
 _LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
 _KEEPALIVE = 30  # seconds without a message after which client and broker test whether the other one is there
@@ -52,7 +54,7 @@ class MqttSink:
     def __init__(self, place: str, origin: Origin) -> None:
         url = _checked(place)
         self._topic, self._options = unquote(url.path)[1:], origin.options
-        self._messages, self._warnings = EventMessages(origin), Warnings(place)
+        self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(place)
         self._availability = f"{self._topic}/availability"
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
         self._published = self._acknowledged = self.missed = 0
@@ -88,8 +90,8 @@ class MqttSink:
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
-        self._publish_events(self._messages.update(frame.tracks))
-        now, status_of = time.monotonic(), self._messages.events.status
+        self._publish_events(self._events.update(frame.tracks))
+        now, status_of = time.monotonic(), self._events.events.status
         for track in frame.tracks:
             if track.object not in self._sent:
                 self._announce(track.object)
@@ -108,11 +110,11 @@ class MqttSink:
 
     def idle(self) -> None:
         """Publish the events that have waited for a picture."""
-        self._publish_events(self._messages.update(()))
+        self._publish_events(self._events.update())
 
     def close(self) -> None:
         """Publish the last events; wait some seconds until the broker has everything, and warn about what it missed."""
-        self._publish_events(self._messages.close())
+        self._publish_events(self._events.close())
         for name in [*self._sent]:
             self._remove(name)
         self._publish(self._availability, "offline", retain=True)
@@ -126,9 +128,9 @@ class MqttSink:
         if self.missed:
             self._warnings.log(f"the broker has not received {counted(self.missed, 'message')}")
 
-    def _publish_events(self, bodies: list[bytes]) -> None:
-        for body in bodies:
-            self._publish(f"{self._topic}/events", body)
+    def _publish_events(self, events: Iterable[tuple[Event, Preview | None]]) -> None:
+        for event, picture in events:
+            self._publish(f"{self._topic}/events", self._events.to_json(event, picture))
 
     def _publish(self, topic: str, payload: bytes | str, *, retain: bool = False) -> None:
         if self._client.publish(topic, payload, 1, retain).rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:
@@ -148,7 +150,7 @@ class MqttSink:
         """Have Home Assistant make the sensors of an object, or remove them if it has ended."""
         state, label = self._state_topic(name), name or "object"
         sensors = {label: "value_json.present"}
-        sensors |= {f"{label} in {zone}": f"'{zone}' in value_json.zones" for zone in self._options.zones}
+        sensors |= {f"{label} in {zone}": f"'{zone}' in value_json.zones" for zone in self._options.zone}
         for sensor, condition in sensors.items():
             number = _id(state + condition)
             config = {

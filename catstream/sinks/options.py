@@ -1,140 +1,179 @@
-"""The options of destinations: their keys in a file, and the check that each of them has an effect."""
+"""THE TABLE of options of the destinations that receive events: options of `catstream sink`, keys of a fleet's file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 from msgspec import Meta
 
 from catstream.base.addresses import without_password
 from catstream.errors import CatstreamError, SettingsError
-from catstream.jobs.job import SinkOptions
-from catstream.sinks.destinations import SINKS, STDOUT, check_sink, is_file, sink_of
-from catstream.sinks.events import KINDS, check_zones
+from catstream.sinks.destinations import STDOUT, SinkOptions, check_sink, kind_of
+from catstream.sinks.events import KINDS, WHEN, Point, check_zones
 
 _LONGEST_SECONDS = 86400.0  # without a box, after which an object is lost
 
-#: The type of each key of a file, and what its value must be.
-KEYS: dict[str, tuple[Any, str]] = {
-    "write": (list[Annotated[str, Meta(min_length=1)]], 'destinations, for example ["tracks/{stream}.ndjson"]'),
-    "zones": (
-        dict[Annotated[str, Meta(min_length=1)], tuple[tuple[float, float], ...]],
-        "polygons in pixels, for example { door = [[300, 80], [420, 80], [420, 400]] }",
+_MQTT, _HTTP, _FOLDER = ("mqtt://", "mqtts://"), ("http://", "https://"), ("/",)
+
+
+def parse_zones(zones: Mapping[str, str]) -> dict[str, tuple[Point, ...]]:
+    """Return the corners of zones; SettingsError if one is invalid.
+
+    >>> parse_zones({"door": "300,80 420,80 420,400"})
+    {'door': ((300.0, 80.0), (420.0, 80.0), (420.0, 400.0))}
+    """
+    parsed = {}
+    for name, text in zones.items():
+        try:
+            parsed[name] = tuple((float(x), float(y)) for x, y in (corner.split(",") for corner in text.split()))
+        except ValueError:
+            raise SettingsError(f"expected the corners of {name} as X,Y X,Y X,Y ..., got {text!r}") from None
+    check_zones(parsed)
+    return parsed
+
+
+def parse_when(text: str) -> dict[str, float]:
+    """Return the kinds of events, with the seconds of `lost`; SettingsError if the text is invalid.
+
+    >>> parse_when("lost=10,entered")
+    {'lost': 10.0, 'entered': 0.0}
+    """
+    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
+    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
+        raise SettingsError(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
+    try:
+        when = {kind: float(seconds or WHEN[kind]) for kind, seconds in kinds.items()}
+    except ValueError:
+        when = {"lost": -1.0}
+    if not 0 <= when.get("lost", 0.0) <= _LONGEST_SECONDS:
+        raise SettingsError(f"expected 0 to {_LONGEST_SECONDS:g} seconds, as in lost=10, got {text!r}")
+    return when
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """A row of the table. Its name is a field of `SinkOptions`, a key of a file, and an option of the command line.
+
+    kind      type of a value
+    expected  what a value must be, for an error
+    metavar   stands for the value in the help; empty for a flag
+    help      a line of the help
+    users     the destinations that it affects, as in `SINKS`
+    convert   makes the field of `SinkOptions` from a value
+    """
+
+    kind: Any
+    expected: str
+    metavar: str
+    help: str
+    users: tuple[str, ...]
+    convert: Callable[[Any], Any] = lambda value: value
+
+
+OPTIONS = {
+    "zone": Option(
+        dict[str, str],
+        'a table of corners in pixels, for example { door = "300,80 420,80 420,400" }',
+        'NAME="X,Y X,Y ..."',
+        "A polygon in pixels; repeatable.",
+        _MQTT + _HTTP + _FOLDER,
+        parse_zones,
     ),
-    "zone_margin": (Annotated[float, Meta(ge=0, le=10000)], "a number of pixels from 0 to 10000"),
-    "when": (str, 'a text, for example "lost=10,entered"'),
-    "rate": (Annotated[float, Meta(gt=0, le=1000)], "a number above 0 and at most 1000"),
-    "picture": (bool, "true or false"),
-    "secret_file": (str, "a text"),
-    "events_folder": (str, 'a text, for example "events/{stream}"'),
-    "events_megabytes": (Annotated[float, Meta(gt=0)], "a number above 0"),
+    "when": Option(
+        str,
+        'a text, for example "lost=10,entered"',
+        "EVENT,...",
+        f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, default: 2.",
+        _MQTT + _HTTP + _FOLDER,
+        parse_when,
+    ),
+    "picture": Option(bool, "true or false", "", "Add the pipeline's newest picture to each event.", _MQTT + _HTTP),
+    "rate": Option(
+        Annotated[float, Meta(gt=0, le=1000)],
+        "a number above 0 and at most 1000",
+        "N",
+        "States of each object per second, for mqtt://; default: 1.",
+        _MQTT,
+    ),
+    "secret_file": Option(
+        str, "the name of a file", "FILE", "File with the key that signs events, for http://.", _HTTP, Path
+    ),
+    "megabytes": Option(
+        Annotated[float, Meta(gt=0)],
+        "a number above 0",
+        "N",
+        "Size of a folder above which its oldest pictures are removed; default: 1000.",
+        _FOLDER,
+    ),
 }
 
-#: Field of `SinkOptions` -> the key that sets it.
-_KEY_OF = {
-    "zones": "zones",
-    "margin": "zone_margin",
-    "events": "when",
-    "lost_seconds": "when",
-    "rate": "rate",
-    "picture": "picture",
-    "key": "secret_file",
-    "folder": "events_folder",
-    "folder_megabytes": "events_megabytes",
+#: Key of the file of a fleet -> its type, and what its value must be.
+KEYS: dict[str, tuple[Any, str]] = {
+    "write": (list[Annotated[str, Meta(min_length=1)]], 'destinations, for example ["tracks/{stream}.ndjson"]'),
+    **{name: (option.kind, option.expected) for name, option in OPTIONS.items()},
 }
+
+
+def parse(values: Mapping[str, Any], places: Sequence[str], name_of: Callable[[str], str] = str) -> SinkOptions:
+    """Return the options of destinations from values by the names in the table.
+
+    SettingsError if a value is invalid or has no effect on these destinations; `name_of` is the name for the user.
+    """
+    kinds, fields = {kind_of(place) for place in places}, {}
+    for name, value in values.items():
+        option = OPTIONS[name]
+        if kinds.isdisjoint(option.users):
+            users = " or ".join(option.users)
+            raise SettingsError(f"{name_of(name)} has no effect on these destinations: omit it, or add {users}")
+        with _errors_of(name_of(name)):
+            try:
+                fields[name] = option.convert(msgspec.convert(value, option.kind, strict=False))
+            except msgspec.ValidationError:
+                raise SettingsError(f"must be {option.expected}, got {value!r}") from None
+    options = SinkOptions(**fields)
+    of_zones = [kind for kind in ("entered", "left") if kind in options.when]
+    if "when" in values and of_zones and not options.zone:
+        when, zone = name_of("when"), name_of("zone")
+        raise SettingsError(f"{when} {','.join(of_zones)} has no effect without a zone: add {zone}")
+    if options.zone and not of_zones and kinds.isdisjoint(_MQTT):  # whose states have zones
+        raise SettingsError(f"{name_of('zone')} has no effect: add entered or left to {name_of('when')}")
+    return options
 
 
 def destinations(
     values: Mapping[str, Any], folder: Path, stream: str, source: str
 ) -> tuple[tuple[str, ...], SinkOptions]:
-    """The destinations of a stream and their options, from keys whose values have their types; see `resolved`."""
-    fields = {field: values[key] for field, key in _KEY_OF.items() if key in values}
-    if "when" in values:
-        with _errors_of("when"):
-            fields["events"], fields["lost_seconds"] = parse_when(values["when"])
-    for field in {"key", "folder"} & fields.keys():
-        fields[field] = Path(fields[field])
-    return resolved(values.get("write", ()), SinkOptions(**fields), folder, stream, source)
+    """Return the destinations of a stream and their options, from the `KEYS` of a file in a folder.
 
-
-def resolved(
-    write: Iterable[str], options: SinkOptions, folder: Path, stream: str, source: str
-) -> tuple[tuple[str, ...], SinkOptions]:
-    """Return the destinations and options of a stream: paths are in `folder`, and `{stream}` is the stream's name.
-
-    SettingsError if one is invalid.
+    Relative paths count from the folder, and `{stream}` is the name of the stream. SettingsError if one is invalid.
     """
 
-    def placed(path: Path | None) -> Path | None:
-        return path and folder / str(path).replace("{stream}", stream)
+    def located(path: str) -> str:
+        return f"{folder / path}/" if path.endswith("/") else str(folder / path)
 
-    options = replace(options, key=placed(options.key), folder=placed(options.folder))
-    named = dict.fromkeys(place.replace("{stream}", stream) for place in write)
-    places = [*(str(folder / place) if is_file(place) else place for place in named), *options.places]
+    named = dict.fromkeys(place.replace("{stream}", stream) for place in values.get("write", ()))
+    places = tuple(place if "://" in place or place == STDOUT else located(place) for place in named)
+    given = {name: value for name, value in values.items() if name != "write"}
+    if "secret_file" in given:
+        given["secret_file"] = located(given["secret_file"].replace("{stream}", stream))
+    options = parse(given, places)
     with _errors_of("write"):
         for place in places:
             if place == STDOUT:
                 raise SettingsError("there is no standard output: pass a file or an address")
             check_sink(place, options, without_password(source))
-    check_options(options, places)
-    return tuple(places), options
+    return places, options
 
 
 @contextmanager
-def _errors_of(key: str) -> Iterator[None]:
-    """Turn each error into a SettingsError that names the key."""
+def _errors_of(name: str) -> Iterator[None]:
+    """Turn each error into a SettingsError that names the option."""
     try:
         yield
     except CatstreamError as error:
-        raise SettingsError(f"{key}: {error}") from None
-
-
-def parse_when(text: str) -> tuple[tuple[str, ...], float]:
-    """Return the kinds of events, and the seconds of `lost`; SettingsError if the text is invalid.
-
-    >>> parse_when("lost=10,entered")
-    (('lost', 'entered'), 10.0)
-    """
-    kinds = dict(part.strip().partition("=")[::2] for part in text.split(","))
-    try:
-        seconds = float(kinds.get("lost") or SinkOptions().lost_seconds)
-    except ValueError:
-        seconds = -1.0
-    if set(kinds) - set(KINDS) or any(kinds[kind] for kind in set(kinds) - {"lost"}):
-        raise SettingsError(f"expected some of {', '.join(KINDS)}, as in lost=10,entered, got {text!r}")
-    if not 0 <= seconds <= _LONGEST_SECONDS:
-        raise SettingsError(f"expected 0 to {_LONGEST_SECONDS:g} seconds, as in lost=10, got {text!r}")
-    return tuple(kinds), seconds
-
-
-def check_options(
-    options: SinkOptions,
-    places: Iterable[str],
-    size: tuple[int, int] | None = None,
-    names: Mapping[str, str] = _KEY_OF,
-) -> None:
-    """Raise SettingsError if an option has no effect on these destinations.
-
-    With the `size` of a frame, also if the margin is larger. `names` are those that the user knows the fields by.
-    """
-    default, used = SinkOptions(), {name for place in places for name in sink_of(place).options}
-    for name, flag in names.items():
-        if getattr(options, name) != getattr(default, name) and name not in used:
-            users = " or ".join(scheme for scheme, row in SINKS.items() if name in row.options)
-            users = users.replace("folder://", names["folder"])
-            raise SettingsError(f"{flag} has no effect on these destinations: add one with {users}, or omit it")
-    zones, when, margin = names["zones"], names["events"], names["margin"]
-    of_zones = [kind for kind in ("entered", "left") if kind in options.events]
-    if of_zones and options.events != default.events and not options.zones:
-        raise SettingsError(f"{when} {','.join(of_zones)} has no effect without a zone: add {zones}")
-    if options.margin != default.margin and not options.zones:
-        raise SettingsError(f"{margin} has no effect without a zone: add {zones}")
-    if options.zones and not of_zones and "rate" not in used:  # states, which it is for, have zones, too
-        raise SettingsError(f"{zones} has no effect: add entered or left to {when}")
-    check_zones(options.zones, size)
-    if size is not None and options.margin > max(size):
-        raise SettingsError(f"{margin} {options.margin:g} is larger than the frame: no object can leave a zone")
+        raise SettingsError(f"{name}: {error}") from None

@@ -63,20 +63,22 @@ class Warnings:
         _log.warning("%s: %s", self._address, text)
 
 
-class PicturedEvents:
-    """Detects events, each with a picture: the first that the pipeline has sent of the frame of the event or later.
+class EventStream:
+    """Detects events, each with a picture if that is wanted: the first one of the frame of the event or a later one.
 
-    If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none.
-
+    If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none. Without pictures,
+    events do not wait.
     """
 
-    def __init__(self, origin: Origin) -> None:
-        self.events = Events(origin.options)
-        self._newest: Preview | None = None
+    def __init__(self, origin: Origin, *, has_pictures: bool) -> None:
+        self.events = Events(origin.options.zone, origin.options.when)
         self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
-        self._previews: Subscription[Preview] = subscribe(origin.address, "previews", timeout=0)
+        self._newest: Preview | None = None
+        self._previews: Subscription[Preview] | None = None
+        if has_pictures:
+            self._previews = subscribe(origin.address, "previews", timeout=0)
 
-    def update(self, tracks: Sequence[Track]) -> list[tuple[Event, Preview | None]]:
+    def update(self, tracks: Sequence[Track] = ()) -> list[tuple[Event, Preview | None]]:
         """Return the events of further tracks, and those that have waited, with their pictures.
 
         Call it without tracks while no frame arrives, so that their wait ends in time.
@@ -84,56 +86,36 @@ class PicturedEvents:
         now = time.monotonic()
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in self.events.update(tracks)]
         with suppress(SilenceError):  # no further picture has arrived
-            for preview in self._previews:
+            for preview in self._previews or ():
                 self._newest = preview
-        newest, ready = self._newest, []
+        ready = []
         while self._waiting:
             event, due = self._waiting[0]
-            if now < due and (newest is None or newest.frame < event.track.frame):
+            is_early = self._newest is None or self._newest.frame < event.track.frame
+            if self._previews is not None and is_early and now < due:
                 break
-            ready.append((self._waiting.popleft()[0], newest))
+            ready.append((self._waiting.popleft()[0], self._newest))
         return ready
 
     def close(self) -> list[tuple[Event, Preview | None]]:
         """Return the last events."""
-        self._previews.close()
-        events = (*(event for event, _ in self._waiting), *self.events.close())
-        return [(event, self._newest) for event in events]
+        if self._previews is not None:
+            self._previews.close()
+        return [(event, self._newest) for event in (*(event for event, _ in self._waiting), *self.events.close())]
 
+    def to_json(self, event: Event, picture: Preview | None) -> bytes:
+        """Return a JSON object: `Event.to_dict`, `id`, `sent` in seconds since 1970, and `picture` if that is wanted.
 
-class EventMessages:
-    """Makes a JSON object of each event: `Event.to_dict`, `id`, `sent` in seconds since 1970, and optionally `picture`.
-
-    The picture is that of `PicturedEvents`: the JPEG file in Base64, the number of its frame, and the width and height
-    of a frame, which may be larger.
-    """
-
-    def __init__(self, origin: Origin) -> None:
-        self._pictured = PicturedEvents(origin) if origin.options.picture else None
-        self.events = self._pictured.events if self._pictured is not None else Events(origin.options)
-
-    def update(self, tracks: Sequence[Track]) -> list[bytes]:
-        """Return the messages of the events of further tracks, and of those that waited for a picture."""
-        if self._pictured is None:
-            return [_message(event) for event in self.events.update(tracks)]
-        return [_message(event, picture=_fields(picture)) for event, picture in self._pictured.update(tracks)]
-
-    def close(self) -> list[bytes]:
-        """Return the messages of the last events."""
-        if self._pictured is None:
-            return [_message(event) for event in self.events.close()]
-        return [_message(event, picture=_fields(picture)) for event, picture in self._pictured.close()]
-
-
-def _message(event: Event, **more: object) -> bytes:
-    return json.dumps({"id": uuid4().hex, "sent": time.time(), **event.to_dict(), **more}).encode()
-
-
-def _fields(picture: Preview | None) -> dict[str, object] | None:
-    if picture is None:
-        return None
-    size = {"width": picture.width, "height": picture.height}
-    return {"frame": picture.frame, **size, "jpeg": b64encode(picture.jpeg).decode()}
+        The picture is the JPEG file in Base64, the number of its frame, and the width and height of a frame, which may
+        be larger.
+        """
+        fields = {"id": uuid4().hex, "sent": time.time(), **event.to_dict()}
+        if self._previews is not None:
+            fields["picture"] = picture and {
+                **{"frame": picture.frame, "width": picture.width, "height": picture.height},
+                "jpeg": b64encode(picture.jpeg).decode(),
+            }
+        return json.dumps(fields).encode()
 
 
 def split(place: str, form: str) -> SplitResult:

@@ -16,14 +16,14 @@ import os
 import sys
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import groupby, pairwise
 from math import isfinite, isnan, nan
 from pathlib import Path
-from typing import IO, get_args
+from typing import IO, Any, get_args
 
 from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
@@ -346,7 +346,7 @@ def places_of(name: str, results: Results) -> list[str]:
     """Return the destinations of a run of this name, each once: the log in both forms, the video, and further ones."""
     kinds = ("ndjson", "csv", *(["mp4"] if results.video else []))
     own = [] if results.output is None else [str(results.output / f"{name}.{kind}") for kind in kinds]
-    return [*dict.fromkeys([*own, *(results.write or ()), *results.options.places])]
+    return [*dict.fromkeys([*own, *map(str, results.write or ())])]
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,7 +366,7 @@ class RunFiles:
     places: list[str]
 
     def check(self, *, overwrite: bool, earlier: list[str], others: Mapping[str, Path] | None = None) -> None:
-        """Raise VideoError or MissingExtraError before the run if a destination cannot be written, or must not be.
+        """Raise VideoError before the run if a destination cannot be written, or must not be.
 
         If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued. All files,
         also the `others` that the run writes, by their purpose, have to be different.
@@ -402,44 +402,30 @@ class RunFiles:
             with writing(self.output, VideoError):
                 self.output.mkdir(parents=True, exist_ok=True)
 
-    @contextmanager
-    def opened(
-        self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False
-    ) -> Iterator[Callable[[TrackedFrame | None], None]]:
-        """Yield a function that writes a frame everywhere, or takes None if none has arrived for a while.
+    def opened(self, endpoint: str, *, resume: bool = False, skip_damaged: bool = False) -> OpenFiles:
+        """Open all destinations beside a pipeline; existing files are replaced.
 
-        At the end, everything is closed.
-
-        If `resume`, the files continue after `position`; otherwise existing ones are replaced. The function and the end
-        raise VideoError if a destination cannot be written any more.
+        If `resume`, they continue after `position`. VideoError if that is not possible.
         """
         origin = replace(self.origin, address=replace(self.origin.address, endpoint=endpoint))
-        path = self._log() if resume else None  # before new ones exist, too
+        path = self._log() if resume else None  # before new ones exist
         log = None if path is None else Log(path, skip_damaged=skip_damaged)
         last, size = (None, 0) if log is None else log.last_whole_frame()
         with ExitStack() as stack:
-
-            def opened(place: str) -> Sink:
+            sinks: list[Sink] = []
+            followers: list[Sink] = []
+            for place in self.places:
                 continued = replace(origin, last=last, size=size) if Path(place) == path else origin
-                return stack.enter_context(closing(open_sink(place, continued)))
-
-            sinks = {place: opened(place) for place in self.places}
-            followers = [sink for place, sink in sinks.items() if is_file(place) and Path(place) != path]
+                sinks.append(stack.enter_context(closing(open_sink(place, continued))))
+                if is_file(place) and Path(place) != path:
+                    followers.append(sinks[-1])
+            # The other files are made again from the log.
             for frame in log.frames() if log is not None and last is not None and followers else ():
                 for sink in followers:
                     sink.write(frame)
+            return OpenFiles(sinks, stack.pop_all())
 
-            def write(frame: TrackedFrame | None) -> None:
-                if frame is None:
-                    idle(sinks.values())
-                    return
-                for sink in sinks.values():
-                    sink.write(frame)
-
-            yield write
-
-    @contextmanager
-    def continued(self, endpoint: str, *, resume: bool) -> Iterator[Callable[[TrackedFrame | None], None]]:
+    def continued(self, endpoint: str, *, resume: bool) -> OpenFiles:
         """The same for a run that nobody watches: a file that is not continued is renamed, and folders are made.
 
         walk.ndjson becomes walk-20261128T133015.ndjson, by the time of its last change.
@@ -451,10 +437,28 @@ class RunFiles:
                     changed = datetime.fromtimestamp(place.stat().st_mtime)
                     place.rename(place.with_stem(f"{place.stem}-{changed:%Y%m%dT%H%M%S}"))
         self.check(overwrite=True, earlier=[])
-        with self.opened(endpoint, resume=resume) as write:
-            yield write
+        return self.opened(endpoint, resume=resume)
 
     def _log(self) -> Path | None:
         """Return the log that is continued, None if there is to be none."""
         logs = (Path(place) for place in self.places if is_log(Path(place)))
         return min(logs, key=lambda log: (not log.exists(), LOGS.index(log.suffix)), default=None)
+
+
+class OpenFiles(AbstractContextManager["OpenFiles"]):
+    """All destinations of a run while it goes on. VideoError if one cannot be written any more, or completed."""
+
+    def __init__(self, sinks: Sequence[Sink], stack: ExitStack) -> None:
+        self._sinks, self._stack = sinks, stack
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Write a frame everywhere."""
+        for sink in self._sinks:
+            sink.write(frame)
+
+    def idle(self) -> None:
+        """Tell the destinations that no frame has arrived for a while."""
+        idle(self._sinks)
+
+    def __exit__(self, *details: Any) -> None:
+        self._stack.__exit__(*details)

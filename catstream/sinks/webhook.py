@@ -1,6 +1,6 @@
 """A webhook: each event as JSON, by POST to an address of the user's.
 
-The body is that of `EventMessages`. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256 of
+`EventStream.to_json` makes the body. With a key, the header `X-Catstream-Signature` is `sha256=` and the HMAC-SHA256 of
 the body in hexadecimal digits. After an answer 408, 425, 429 or 5xx, or none, an event is sent again with the same
 `id`, not before `Retry-After`, and the events behind it wait. Any other answer but 2xx refuses it.
 """
@@ -10,18 +10,21 @@ from __future__ import annotations
 import hmac
 import time
 from base64 import b64encode
+from collections.abc import Iterable
 from contextlib import suppress
 from email.utils import parsedate_to_datetime
 from http.client import HTTPConnection, HTTPException, HTTPSConnection, responses
 from queue import SimpleQueue
-from threading import Event, Thread
+from threading import Event as Flag
+from threading import Thread
 from urllib.parse import unquote, urlunsplit
 
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.jobs.job import SinkOptions
-from catstream.sinks.destinations import Origin, TrackedFrame
-from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventMessages, Warnings, reason_of, split
+from catstream.messages.kinds import Preview
+from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame
+from catstream.sinks.events import Event
+from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
 
 _FORM = "https://[USER:PASSWORD@]HOST[:PORT]/PATH"
 _TIMEOUT = 10.0  # seconds for a connection, and for an answer
@@ -38,10 +41,10 @@ class Webhook:
 
     def __init__(self, place: str, origin: Origin) -> None:
         self._url, self._key = split(place, _FORM), _key(origin.options)
-        self._messages, self._warnings = EventMessages(origin), Warnings(place)
+        self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(place)
         self._bodies: SimpleQueue[bytes | None] = SimpleQueue()
-        self._events = self._delivered = self.missed = 0
-        self._hurry, self._closed = Event(), False  # the event ends a pause
+        self._count = self._delivered = self.missed = 0
+        self._hurry, self._closed = Flag(), False  # the event ends a pause
         self._retry_after, self._is_working = 0.0, False  # what the last answer says
         self._thread = Thread(target=self._deliver_all, name="webhook", daemon=True)
         self._thread.start()
@@ -56,29 +59,29 @@ class Webhook:
         """Queue the events of a frame."""
         if self._is_working:
             self._warnings.working()
-        self._queue(self._messages.update(frame.tracks))
+        self._queue(self._events.update(frame.tracks))
 
     def idle(self) -> None:
         """Queue the events that have waited for a picture."""
-        self._queue(self._messages.update(()))
+        self._queue(self._events.update())
 
     def close(self) -> None:
         """Queue the last events, and deliver for some seconds what waits; warn about what was missed."""
-        self._queue(self._messages.close())
+        self._queue(self._events.close())
         self._bodies.put(None)
         self._hurry.set()
         self._thread.join(CLOSE_SECONDS)
         self._closed = True
         self._hurry.set()
-        self.missed = self._events - self._delivered
+        self.missed = self._count - self._delivered
         if self.missed:
-            self._warnings.log(f"{counted(self.missed, 'event')} of {self._events} were not delivered")
+            self._warnings.log(f"{counted(self.missed, 'event')} of {self._count} were not delivered")
 
-    def _queue(self, bodies: list[bytes]) -> None:
-        for body in bodies:
-            self._events += 1
+    def _queue(self, events: Iterable[tuple[Event, Preview | None]]) -> None:
+        for event, picture in events:
+            self._count += 1
             if self._bodies.qsize() < QUEUED:
-                self._bodies.put(body)
+                self._bodies.put(self._events.to_json(event, picture))
 
     def _deliver_all(self) -> None:
         """Deliver in order, until all has arrived or the sink is closed."""
@@ -137,12 +140,12 @@ def _seconds(retry_after: str) -> float:
 
 def _key(options: SinkOptions) -> bytes:
     """Return the key; empty to sign nothing."""
-    if options.key is None:
+    if options.secret_file is None:
         return b""
     try:
-        key = options.key.read_bytes().strip()
+        key = options.secret_file.read_bytes().strip()
     except OSError as error:
-        raise VideoError(f"cannot read the key {options.key}: {error.strerror}") from None
+        raise VideoError(f"cannot read the key {options.secret_file}: {error.strerror}") from None
     if not key:
-        raise VideoError(f"{options.key} is empty: write the key of the receiver to it")
+        raise VideoError(f"{options.secret_file} is empty: write the key of the receiver to it")
     return key

@@ -196,6 +196,8 @@ REJECTED = {
     "a value that does not fit": (["--set", "coreset.size=x"], "coreset.size cannot be 'x'"),
     "a preset that does not exist": (["--preset", "cat11"], "cat11"),
     "a settings file that is not there": (["--settings", "none.toml"], "cannot read none.toml"),
+    "a broker": (["--write", "mqtt://me:s3cret@10.0.0.7/yard"], "catstream sink mqtt://10.0.0.7/yard"),
+    "a folder of events": (["--write", "events/"], "catstream sink events/"),
     "an endpoint on the network": (["--set", "run.endpoint=tcp://0.0.0.0:5700"], "other machines"),
 }
 

@@ -130,7 +130,6 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "keeps its objects": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
         "missing SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
         "missing --state DIR": ["track", source, "--continue"],
-        "--no-write has no effect on a new run": ["track", source, "--box", box, "--no-write"],
         "--continue and --overwrite are": [
             "track",
             source,
@@ -217,13 +216,15 @@ def test_new_results_of_a_resumed_run_have_all_frames_also_after_its_end(killed,
     assert frames(killed / "new") == [*range(32)]
 
 
-def test_a_resumed_run_drops_a_video_and_destinations_if_it_is_told_so(killed, succeed):
-    kept, table = killed / "kept", killed / "more.csv"
-    succeed("track", "--resume", kept, "--write", table)
-    assert str(table) in Job.load(kept).results.write
-    succeed("track", "--resume", kept, "--no-video", "--no-write")
+def test_a_resumed_run_drops_a_video_and_files_if_it_is_told_so(killed, succeed):
+    kept, first, second = killed / "kept", killed / "first.csv", killed / "second.csv"
+    succeed("track", "--resume", kept, "--write", first)
+    assert Job.load(kept).results.write == (first,)
+    first.unlink()
+    succeed("track", "--resume", kept, "--no-video", "--write", second)
     results = Job.load(kept).results
-    assert (results.output, results.video, results.write) == (killed / "out", False, ())
+    assert (results.output, results.video, results.write) == (killed / "out", False, (second,))
+    assert (first.exists(), second.exists()) == (False, True)
 
 
 @pytest.mark.parametrize("words", [["track", "--resume"], ["save", "one", "--state"]], ids=" ".join)

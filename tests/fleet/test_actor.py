@@ -13,7 +13,7 @@ from catstream.fleet import actor as module
 from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
-from catstream.jobs.job import SinkOptions
+from catstream.sinks.destinations import SinkOptions
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
 from catstream.wire import discovery
@@ -107,7 +107,7 @@ def test_a_stream_that_begins_anew_keeps_the_log_before(spec, store, until, tmp_
 
 
 def test_a_zone_outside_the_frame_is_the_trouble_of_a_stream(spec, store, until):
-    options = SinkOptions(zones={"door": ((4000, 10), (4900, 10), (4900, 90))})
+    options = SinkOptions(zone={"door": ((4000, 10), (4900, 10), (4900, 90))})
     with started(replace(spec, write=("http://127.0.0.1:9/hook",), options=options), store) as stream:
         until(lambda: stream.report()[0].state == "failed")
     assert "zone door: it is outside the frame of 320x240 pixels" in stream.report()[0].trouble

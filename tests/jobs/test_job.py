@@ -14,18 +14,15 @@ from hypothesis import strategies as st
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.errors import ProtocolError, ServiceError
-from catstream.jobs.job import Job, Results, SinkOptions
+from catstream.jobs.job import Job, Results
 from catstream.jobs.state import files, locked, locked_for_run, restore
 from catstream.messages import storage
 
-JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240),
-          results=Results(write=("mqtt://me:secret@10.0.0.7/yard",)))  # fmt: skip
+JOB = Job("rtsp://me:secret@10.0.0.7/one", {"anna": Box(1, 2, 30, 40)}, part=slice(0, None, 1), size=(320, 240))
 
 numbers = st.none() | st.integers(0, 10**6) | st.integers(0, 10**6).map(np.int64)
 paths = st.none() | st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).map(Path)
 model_files = st.dictionaries(st.sampled_from(["ben", "carl"]), st.text("ab/.", min_size=1).map(Path))
-zones = st.dictionaries(st.sampled_from(["door", "yard"]), st.just(((0.0, 1.5), (2.0, 3.0), (4.0, 5.0))))
-options = st.builds(SinkOptions, zones, events=st.just(("lost",)), key=paths)
 jobs = st.builds(
     Job,
     source=st.text(),
@@ -34,7 +31,9 @@ jobs = st.builds(
     part=st.builds(slice, numbers, numbers, numbers),
     settings=st.builds(lambda lag: Settings(run={"lag_frames": lag}), st.integers(0, 100)),
     size=st.none() | st.tuples(st.integers(1, 9000), st.integers(1, 9000)),
-    results=st.builds(Results, paths, st.booleans(), st.lists(st.text(min_size=1)).map(tuple), model_files, options),
+    results=st.builds(
+        Results, paths, st.booleans(), st.lists(st.text("ab/.", min_size=1).map(Path)).map(tuple), model_files
+    ),
     state=paths,
     since=st.none() | st.floats(0, 1e9),
     resume=st.booleans(),
@@ -142,11 +141,11 @@ def test_a_state_is_restored_with_its_searched_models_and_newest_checkpoint(tmp_
     assert all((tmp_path / "new" / name).read_text() == name for name in names)
 
 
-def test_a_resumed_run_keeps_the_options_of_its_destinations_unless_some_are_given():
-    earlier = Results(write=("mqtt://host/yard",), options=SinkOptions(rate=5.0))
+def test_a_resumed_run_writes_its_own_list_of_files_or_else_the_earlier_one():
+    earlier = Results(Path("out"), video=True, write=(Path("a.csv"), Path("b.sqlite")))
     assert Results().after(earlier) == earlier
-    assert Results(video=False, write=()).after(Results(video=True, write=("-",))) == Results(video=False, write=())
-    assert Results(options=SinkOptions(events=("lost",))).after(earlier).options == SinkOptions(events=("lost",))
+    assert Results(write=(Path("c.csv"),)).after(earlier).write == (Path("c.csv"),)
+    assert Results(video=False, write=()).after(earlier) == Results(Path("out"), video=False, write=())
 
 
 def test_a_state_folder_without_its_job_is_not_said_to_be_resumable(tmp_path):

@@ -63,9 +63,9 @@ def test_a_database_alone_is_continued_after_the_last_frame_of_a_run_that_was_ki
     run.check(overwrite=False, earlier=run.places)
     assert run.position() == 2
     more = replace(run, places=[*run.places, str(tmp_path / "t.ndjson")])
-    with more.opened("", resume=True) as write:
+    with more.opened("", resume=True) as files:
         assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS[:2]]
-        write(TrackedFrame(TRACKS[2:]))
+        files.write(TrackedFrame(TRACKS[2:]))
     assert read(path) == read(tmp_path / "t.ndjson") == [[each] for each in TRACKS]
 
 
@@ -78,8 +78,8 @@ def test_a_run_that_was_killed_before_its_database_had_a_table_continues(tmp_pat
     run = RunFiles(Origin(), None, [str(path)])
     run.check(overwrite=False, earlier=run.places)
     assert run.position() == 0
-    with run.opened("", resume=True) as write:
-        write(TrackedFrame(TRACKS[:1]))
+    with run.opened("", resume=True) as files:
+        files.write(TrackedFrame(TRACKS[:1]))
     assert read(path) == [TRACKS[:1]]
 
 

@@ -3,8 +3,7 @@
 import pytest
 
 from catstream.errors import VideoError
-from catstream.jobs.job import SinkOptions
-from catstream.sinks.destinations import check_sink
+from catstream.sinks.destinations import SinkOptions, check_sink
 
 
 @pytest.mark.parametrize(

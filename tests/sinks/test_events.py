@@ -6,9 +6,8 @@ from hypothesis import strategies as st
 
 from catstream.base.box import Box
 from catstream.errors import SettingsError
-from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
-from catstream.sinks.events import Events, check_zones
+from catstream.sinks.events import WHEN, Events, check_zones
 
 #: A square of x and y from 40 to 60.
 DOOR = {"door": ((40, 40), (60, 40), (60, 60), (40, 60))}
@@ -55,17 +54,17 @@ def told(events):
     ],
 )
 def test_a_history_of_an_object(history, expected):
-    events = Events(SinkOptions(DOOR, margin=10, lost_seconds=3))
+    events = Events(DOOR, WHEN | {"lost": 3.0})
     assert told([*events.update([*tracks(history)]), *events.close()]) == expected
 
 
 def test_only_the_events_that_are_wanted_are_told():
-    events = Events(SinkOptions(DOOR, events=("lost", "entered"), lost_seconds=1))
+    events = Events(DOOR, {"lost": 1.0, "entered": 0.0})
     assert told([*events.update([*tracks("5.1")]), *events.close()]) == ["0 entered door", "1 lost"]
 
 
 def test_another_object_of_the_same_name_ends_the_one_before():
-    events = Events(SinkOptions(DOOR))
+    events = Events(DOOR)
     assert told(events.update([*tracks("5"), *tracks("1", began=1, first=1)])) == [
         "0 found", "0 entered door", "0 left door", "0 ended", "1 found",
     ]  # fmt: skip
@@ -73,7 +72,7 @@ def test_another_object_of_the_same_name_ends_the_one_before():
 
 @pytest.mark.parametrize("together", [True, False])
 def test_an_object_that_was_forgotten_ends_once_the_others_have_four_frames_more(together):
-    events = Events(SinkOptions())
+    events = Events({})
     ben = [[track] for track in tracks("1111", "ben")]
     anna = [[track] for track in tracks("11111111", "anna")]
     frames = [each + more for each, more in zip(anna, ben + [[]] * 4, strict=True)]
@@ -90,12 +89,12 @@ def test_an_object_of_which_a_subscriber_loses_messages_has_not_ended():
     names = ("anna", "ben", "carl")
     frames = [*zip(*(tracks("1111111", name) for name in names), strict=True)]
     came = [*frames[0], frames[1][0], frames[4][2], *frames[5], *frames[6]]
-    events = Events(SinkOptions())
+    events = Events({})
     assert [event.kind for track in came for event in events.update([track])] == ["found"] * 3
 
 
 def test_status_is_what_the_events_have_told():
-    events = Events(SinkOptions(DOOR, lost_seconds=2))
+    events = Events(DOOR)
     seen = [(events.update([track]), events.status(""))[1] for track in tracks(".5..5")]
     assert [status["present"] for status in seen] == [False, True, True, False, True]
     assert [status["zones"] for status in seen] == [[], ["door"], ["door"], [], ["door"]]
@@ -104,7 +103,7 @@ def test_status_is_what_the_events_have_told():
 
 
 def test_an_event_has_its_track():
-    (event,) = Events(SinkOptions()).update([*tracks("1", "anna")])
+    (event,) = Events({}).update([*tracks("1", "anna")])
     fields = event.to_dict()
     assert fields.pop("track") == event.track.to_dict()
     assert fields == {"event": "found", "object": "anna", "time": 0.0, "zone": None}
@@ -112,7 +111,7 @@ def test_an_event_has_its_track():
 
 @given(st.text(".0123456789", max_size=60))
 def test_whatever_begins_ends(history):
-    events = Events(SinkOptions(DOOR, lost_seconds=2))
+    events = Events(DOOR)
     kinds = [event.kind for event in (*events.update([*tracks(history)]), *events.close())]
     assert kinds.count("entered") == kinds.count("left")
     assert kinds.count("ended") == bool(history)
@@ -122,7 +121,7 @@ def test_whatever_begins_ends(history):
 
 @given(st.text(".0123456789", max_size=60))
 def test_an_object_is_in_the_zones_that_it_entered_and_in_none_while_it_is_lost(history):
-    events, inside = Events(SinkOptions(DOOR, lost_seconds=2)), set()
+    events, inside = Events(DOOR), set()
     for track in tracks(history):
         for event in events.update([track]):
             {"entered": inside.add, "left": inside.discard}.get(event.kind, lambda _: None)(event.zone)
@@ -157,6 +156,12 @@ def test_a_zone_that_nothing_can_enter_is_an_error(corners, words):
     points = tuple(tuple(map(float, corner.split(","))) for corner in corners.split())
     with pytest.raises(SettingsError, match=f"zone door: .*{words}"):
         check_zones({"door": points}, FRAME)
+
+
+@pytest.mark.parametrize("name", ["it's", "", "a b", "a/b", "a#", "{{x}}"])
+def test_a_zone_whose_name_is_not_safe_in_a_template_a_topic_or_a_file_name_is_an_error(name):
+    with pytest.raises(SettingsError, match=r"^zone: .* is not a name: expected text of 1 to 64 letters, digits"):
+        check_zones({name: ((0, 0), (90, 0), (90, 90))})
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,9 @@ import paho.mqtt.client as mqtt
 import pytest
 
 from catstream.base.box import Box
-from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Track
 from catstream.sinks import mqtt_sink
-from catstream.sinks.destinations import Origin, TrackedFrame, open_sink
+from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, open_sink
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
 needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
@@ -118,7 +117,7 @@ def lost(time):
 def test_a_subscriber_gets_events_states_and_availability(broker, until):
     broker.start()
     got = broker.subscriber()
-    with opened(broker.url, zones=DOOR, rate=1e-3) as sink:
+    with opened(broker.url, zone=DOOR, rate=1e-3) as sink:
         online(sink, until)
         late = broker.subscriber()  # who gets what is retained
         until(lambda: len(late) == 4)
@@ -159,7 +158,7 @@ def test_states_come_at_the_chosen_rate(broker, until):
 def test_the_sensors_of_an_object_that_was_forgotten_are_removed(broker, until):
     broker.start()
     got = broker.subscriber()
-    with opened(broker.url, events=("lost",)) as sink:
+    with opened(broker.url, when={"lost": 2.0}) as sink:
         online(sink, until)
         for frame in range(1, 5):
             sink.write(TrackedFrame([replace(ANNA, frame=frame, object="ben")]))

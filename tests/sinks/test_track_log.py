@@ -102,10 +102,10 @@ def run_in(folder, *more):
 def add(run, history, first=0, resume=False):
     """Write the frames of a run from the first one on; a history has the names of the objects in each frame."""
     run.make_folder()
-    with run.opened("", resume=resume) as keep:
+    with run.opened("", resume=resume) as files:
         for number, names in enumerate(history):
             if number >= first:
-                keep(TrackedFrame([track(number, name) for name in names], 0.01))
+                files.write(TrackedFrame([track(number, name) for name in names], 0.01))
 
 
 def rows_of(run):

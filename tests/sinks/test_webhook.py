@@ -15,11 +15,10 @@ import pytest
 from catstream.base.box import Box
 from catstream.client.address import Address
 from catstream.errors import VideoError
-from catstream.jobs.job import SinkOptions
 from catstream.messages.kinds import Preview, Track
 from catstream.pipeline import Pipeline
 from catstream.sinks import remote, webhook
-from catstream.sinks.destinations import Origin, TrackedFrame, check_sink, open_sink
+from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, check_sink, open_sink
 from catstream.sinks.track_log import RunFiles
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.newest import Publisher
@@ -101,7 +100,7 @@ ALL = [("found", 0.0), ("lost", 10.0), ("returned", 11.0), ("ended", 11.0)]
 
 def test_each_event_is_posted_as_json_that_is_signed(receiver, tmp_path):
     (tmp_path / "key").write_text("a secret\n")
-    with sending(receiver.port, "a/b?c=d", "me:p%40ss@", key=tmp_path / "key") as sink:
+    with sending(receiver.port, "a/b?c=d", "me:p%40ss@", secret_file=tmp_path / "key") as sink:
         lose(sink, 1)
     assert told(receiver) == ALL
     for path, headers, body in receiver.requests:
@@ -118,7 +117,7 @@ def test_each_event_is_posted_as_json_that_is_signed(receiver, tmp_path):
 
 
 def test_an_event_has_a_picture_of_its_frame_or_a_later_one_if_that_is_wanted(receiver, endpoint, until):
-    options = SinkOptions(picture=True, events=("found", "ended"))
+    options = SinkOptions(picture=True, when={"found": 0.0, "ended": 0.0})
     with Publisher(PREVIEWS, endpoint) as previews:
         url = f"http://127.0.0.1:{receiver.port}"
         with closing(open_sink(url, Origin(address=Address(str(endpoint)), options=options))) as sink:
@@ -133,9 +132,9 @@ def test_an_event_has_a_picture_of_its_frame_or_a_later_one_if_that_is_wanted(re
 def test_events_wait_for_a_picture_for_some_seconds_only_even_if_frames_stop(receiver, endpoint, monkeypatch, until):
     monkeypatch.setattr(remote, "_PICTURE_SECONDS", 0.1)
     files = RunFiles(Origin(options=SinkOptions(picture=True)), None, [f"http://127.0.0.1:{receiver.port}"])
-    with files.opened(str(endpoint)) as write:
-        write(TrackedFrame([FOUND]))
-        until(lambda: receiver.requests, lambda: write(None))
+    with files.opened(str(endpoint)) as outputs:
+        outputs.write(TrackedFrame([FOUND]))
+        until(lambda: receiver.requests, outputs.idle)
     assert [body["picture"] for body in receiver.bodies] == [None, None]
 
 
@@ -147,7 +146,7 @@ def test_a_receiver_is_not_asked_again_before_the_time_that_it_states(receiver, 
             pauses.append(timeout)
             return False
 
-    monkeypatch.setattr(webhook, "Event", Pause)
+    monkeypatch.setattr(webhook, "Flag", Pause)
     receiver.answers += [(503, "120"), (429, "1e9"), (503, "soon"), (503, "Fri, 31 Dec 9999 23:59:59 GMT"), (500,)]
     with sending(receiver.port):
         until(lambda: len(receiver.requests) == 6)
@@ -240,73 +239,14 @@ def test_a_key_that_cannot_be_used_is_an_error_before_the_run(tmp_path, text, wo
     if text is not None:
         (tmp_path / "key").write_text(text)
     with pytest.raises(VideoError, match=re.escape(str(tmp_path / "key")) + f".*{words}"):
-        check_sink("http://host/hook", SinkOptions(key=tmp_path / "key"))
-
-
-def test_a_run_tells_a_webhook_its_events_and_nobody_the_address(receiver, demo_video, succeed):
-    video, boxes = demo_video(32)
-    url = f"http://me:secret@127.0.0.1:{receiver.port}/T0/secret"
-    frame = "all=0,0 320,0 320,240 0,240"
-    _, errors = succeed(
-        "track", video, "--box", f"flower={boxes[0]}", "--write", url, "--zone", frame, "--when", "entered,left"
-    )
-    assert [(body["event"], body["zone"], body["track"]["frame"]) for body in receiver.bodies] == [
-        ("entered", "all", 0), ("left", "all", 31),
-    ]  # fmt: skip
-    assert f"results: http://127.0.0.1:{receiver.port}/..." in errors
-    assert "secret" not in errors
-
-
-@pytest.mark.parametrize(
-    ("words", "error"),
-    [
-        (["--zone", "door=1,2 3,four 5,6"], "expected NAME="),
-        (["--zone", "1,2 3,4 5,6"], "expected NAME="),
-        (["--zone", "a=1,2 9,4 5,9", "--zone", "a=1,2 9,4 5,9"], "with a new name"),
-        (["--when", "gone"], "expected some of found, lost, returned"),
-        (["--when", "found=3"], "expected some of found, lost, returned"),
-        (["--when", ""], "expected some of found, lost, returned"),
-        (["--when", "lost=soon"], "expected 0 to 86400 seconds, as in lost=10, got 'lost=soon'"),
-        (["--when", "lost=inf"], "expected 0 to 86400 seconds"),
-        (["--rate", "0"], "is not in the range 0<x<=1000"),
-    ],
-)
-def test_an_option_that_is_not_valid_is_an_error_of_one_line_before_the_run(demo_video, fail, words, error):
-    video, boxes = demo_video(32)
-    assert error in fail("track", video, "--box", boxes[0], "--write", "http://127.0.0.1:9/hook", *words)
-
-
-YARD, HOOK, DOOR = "mqtt://127.0.0.1:9/yard", "http://127.0.0.1:9/hook", "door=10,10 90,10 90,90"
-
-
-@pytest.mark.parametrize(
-    ("words", "error"),
-    [
-        (["t.csv", "--when", "lost=10"], "--when has no effect on these destinations: add one with mqtt://"),
-        (["t.csv", "--picture"], "--picture has no effect"),
-        ([HOOK, "--rate", 5], "--rate has no effect on these destinations: add one with mqtt:// or mqtts://"),
-        ([YARD, "--secret-file", "key"], "--secret-file has no effect .* http:// or https://"),
-        ([HOOK, "--when", "entered"], "--when entered has no effect without a zone: add --zone"),
-        ([YARD, "--when", "lost,left"], "--when left has no effect without a zone"),
-        ([HOOK, "--zone-margin", 5], "--zone-margin has no effect without a zone"),
-        ([HOOK, "--zone", DOOR, "--when", "lost"], "--zone has no effect: add entered or left to --when"),
-        (["t.csv", "--zone", DOOR], "--zone has no effect on these destinations"),
-    ],
-)
-def test_an_option_without_effect_is_an_error_before_the_run(fail, words, error):
-    assert re.search(error, fail("sink", *words))
-
-
-def test_a_zone_outside_the_frame_is_an_error_before_the_run(demo_video, fail):
-    video, boxes = demo_video(32)
-    words = ["track", video, "--box", boxes[0], "--write", HOOK, "--zone"]
-    assert "zone door: it is outside the frame of 320x240 pixels" in fail(*words, "door=400,10 490,10 490,90")
-    assert "--zone-margin 999 is larger than the frame" in fail(*words, DOOR, "--zone-margin", 999)
+        check_sink("http://host/hook", SinkOptions(secret_file=tmp_path / "key"))
 
 
 def test_a_zone_outside_the_frame_of_a_running_pipeline_ends_the_sink(endless, catstream):
     with Pipeline(endless, "20,20,60,60", {"run.unstored_frames": 1}) as pipeline:
-        sink = catstream("sink", HOOK, "--endpoint", pipeline.endpoint, "--zone", "door=4000,10 4900,10 4900,90")
+        sink = catstream(
+            "sink", "http://127.0.0.1:9/hook", "--endpoint", pipeline.endpoint, "--zone", "door=4000,10 4900,10 4900,90"
+        )
         for _ in pipeline:
             if sink.poll() is not None:
                 break
