@@ -38,5 +38,5 @@ class FrameContext:
         return ScoreMap.within(self.pyramid, region, window, self.model)
 
     def scores_of_frame(self, window: Window) -> ScoreMap:
-        """Scores of all windows of a size in the frame: see `ScoreMap.whole`."""
-        return ScoreMap.whole(self.pyramid, window, self.model)
+        """The same in the frame, or in as large a part around the window as can be searched in time."""
+        return self.scores_within(self.pyramid.region_around(window), window)

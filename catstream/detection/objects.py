@@ -158,14 +158,13 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
     boxes = {name: detections[name].window.box() for name in names}
     scores = {name: detections[name].score for name in names}
     uncertain = {name for name in names if states[name].level != "confident" or detections[name].redetected}
-    certain = {  # and not clearly outscored at its position
+    # Step 1: the others are certain, unless an uncertain object scores clearly higher at their position.
+    certain = {
         name
-        for name in names
-        if name not in uncertain
-        and all(
-            scores[name] >= scores[other] - _LEAD or not _conflict(boxes[name], boxes[other]) for other in uncertain
-        )
+        for name in set(names) - uncertain
+        if not any(scores[name] < scores[other] - _LEAD and _conflict(boxes[name], boxes[other]) for other in uncertain)
     }
+    # Step 2: an object gives way to the certain ones, and if it is not certain itself, to those that score higher.
     exclusive = {
         name: [other for other in names if other != name and not _are_together(states, name, other)] for name in names
     }
@@ -186,6 +185,8 @@ def assign(detections: Mapping[str, Detection], states: Mapping[str, DetectorSta
         occupied = [positions[other] for other in exclusive[name] if other in positions]
         return _best_elsewhere(detections[name], occupied, name in uncertain)
 
+    # Step 3: objects without a conflict keep their positions. Of the rest, the certain ones come first, then those
+    # that would lose most; each keeps its position if that is free, or gets the best one near it.
     conflicts = [name for name in names if in_conflict(name, boxes)]
     loss = {name: scores[name] - elsewhere(name, boxes).score for name in conflicts}
     assigned = {name: box for name, box in boxes.items() if name not in conflicts}

@@ -9,7 +9,7 @@ or aspect ratio. The initial model is trained on the rows of the first frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -311,24 +311,16 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
     The windows are cut from shifted and rotated copies of the object, most of which are on another background.
     """
     kinds = extent.trials(window, settings.extent)
-    if not kinds:
-        return {}
-    cuts = [cut for kind in kinds for cut in _first_cuts(frame, window, [extent.Trial(window), *kind], rng, settings)]
-    trials, patches = zip(*cuts, strict=True)
-    return {EXTENT: _fits(trials, window_rows(patches), 1 / len(kinds), settings.training)}
-
-
-def _first_cuts(
-    frame: Pyramid, window: Window, trials: list[extent.Trial], rng: np.random.Generator, settings: Settings
-) -> Iterator[tuple[extent.Trial, np.ndarray]]:
-    """Yield trials at copies of the object in the first frame, with their patches."""
-    for number in range(math.ceil(settings.coreset.size / len(trials))):
-        right, down, turn = rng.normal(size=3) if number else np.zeros(3)
-        copy = _shifted(window, right, down)
-        offset = _random_offset(window, rng) if _is_moved(number, _moved_share(settings.training)) else None
-        for trial in trials:
-            cut = trial.window.centred(*copy.centre)
-            yield trial, _patch(frame, cut, _TURN * turn, copy.box(), offset)
+    trials, patches = [], []
+    for kind in kinds:
+        for number in range(math.ceil(settings.coreset.size / (1 + len(kind)))):
+            right, down, turn = rng.normal(size=3) if number else np.zeros(3)
+            copy = _shifted(window, right, down)
+            offset = _random_offset(window, rng) if _is_moved(number, _moved_share(settings.training)) else None
+            for trial in (extent.Trial(window), *kind):
+                trials.append(trial)
+                patches.append(_patch(frame, trial.window.centred(*copy.centre), _TURN * turn, copy.box(), offset))
+    return {EXTENT: _fits(trials, window_rows(patches), 1 / len(kinds), settings.training)} if kinds else {}
 
 
 def _fits(trials: Sequence[extent.Trial], cuts: np.ndarray, weight: float, options: TrainingSettings) -> TrainingRows:

@@ -85,7 +85,7 @@ class Cells:
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
         """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7)."""
         scores = self._cell_scores(weights, bias)
-        add_colour_scores(self.shades, weights[COLOURS], scores)
+        kernels.add_colour_scores(self.shades, writable(weights[COLOURS]), _LOWEST, scores)
         return scores
 
     def respond_above(self, weights: np.ndarray, bias: float, threshold: float) -> np.ndarray:
@@ -97,7 +97,7 @@ class Cells:
         colour_threshold = threshold - highest_colour_score(weights[COLOURS])
         scores = self._cell_scores(weights, bias)
         hopeless = scores < colour_threshold
-        add_colour_scores(self.shades, weights[COLOURS], scores, colour_threshold)
+        kernels.add_colour_scores(self.shades, writable(weights[COLOURS]), colour_threshold, scores)
         scores[hopeless | (scores < threshold)] = -np.inf
         return scores
 
@@ -164,19 +164,6 @@ def shades(planes: np.ndarray) -> np.ndarray:
     table = np.empty((planes.shape[1] // 2, planes.shape[2] // 2), np.uint16)
     kernels.look_up_shades(planes, _SHADES_OF, table)
     return table
-
-
-def add_colour_scores(colours: np.ndarray, weights: np.ndarray, scores: np.ndarray, threshold: float = _LOWEST) -> None:
-    """Add the scores of the histograms of all windows, in constant time per window.
-
-    Parameters
-    ----------
-    colours : uint16, from `shades`
-    weights : float32 (SHADES,)
-    scores : float32 (rows - 7, columns - 7), of the window whose first cell has the same index
-    threshold : the score of a window with a lower score is not changed
-    """
-    kernels.add_colour_scores(colours, writable(weights), threshold, scores)
 
 
 def highest_colour_score(weights: np.ndarray) -> float:

@@ -47,11 +47,6 @@ class ScoreMap:
         cells = Cells.of(image)
         return cls(cells, cells.respond(model.weights, model.bias), (float(region.left), float(region.top)), step)
 
-    @classmethod
-    def whole(cls, frame: Pyramid, window: Window, model: Model) -> ScoreMap:
-        """All windows of a size in a frame, or in as large a part around the window as can be searched in time."""
-        return cls.within(frame, frame.region_around(window), window, model)
-
     def window(self, row: float, column: float) -> Window:
         """The window at (row, column), which may lie between cells."""
         (x, y), (w, h) = self.origin, self.step

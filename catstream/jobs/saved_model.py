@@ -267,15 +267,22 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
         raise SettingsError(f"a merge takes saved models, got {wrong[0]!r}: read a file with catstream.SavedModel.load")
     if len(parts) < 2:
         raise SettingsError(f"too few saved models ({len(parts)}): a merge needs two or more")
-    first, origins = parts[0], set(parts[0].origins)
-    named = next((part for part in parts if part.object), first)
+    first, streams = parts[0], [origin for part in parts for origin in set(part.origins)]
+    name, *others = dict.fromkeys(part.object for part in parts if part.object) or [""]
+    if others:
+        raise SettingsError(
+            f"the saved models are of different objects ({name!r}, {others[0]!r}): merge models of the same object"
+        )
     for part in parts[1:]:
-        _check_merge(named if part.object else first, part, origins)
-        origins.update(part.origins)
+        _check_same(first.settings, part.settings, "one saved model was trained", "another")
+    if len(set(streams)) < len(streams):
+        raise SettingsError(
+            "two of the models were trained on the same frames, which would count twice: "
+            "merge models from different videos"
+        )
     if not force:
         _check_alike(parts)
     trees = {name: reduce(CoresetTree.merged, [part.trees[name] for part in parts]) for name in TREES}
-    name = next((part.object for part in parts if part.object), "")
     centres = next((part.centres for part in parts if len(part.centres)), first.centres)
     version = max(part.model.version for part in parts)
     width, height = np.exp(np.mean(np.log([part.box[2:] for part in parts]), axis=0))  # the geometric means
@@ -290,25 +297,10 @@ def merge(parts: Iterable[SavedModel], *, force: bool = False) -> SavedModel:
     )
 
 
-def _check_merge(one: SavedModel, other: SavedModel, origins: set[str]) -> None:
-    """Raise SettingsError if a saved model cannot be merged; `origins` are those of all before it."""
-    if one.object and other.object and one.object != other.object:
-        raise SettingsError(
-            f"the saved models are of different objects ({one.object!r}, {other.object!r}): "
-            "merge models of the same object"
-        )
-    _check_same(one.settings, other.settings, "one saved model was trained", "another")
-    if origins & set(other.origins):
-        raise SettingsError(
-            "two of the models were trained on the same frames, which would count twice: "
-            "merge models from different videos"
-        )
-
-
 def _check_alike(parts: Sequence[SavedModel]) -> None:
     """Raise SettingsError, or warn, if the models do not look like those of one object.
 
-    The models are connected by their highest similarityes, as in a maximum spanning tree; the lowest of these decides.
+    The models are connected by their highest similarities, as in a maximum spanning tree; the lowest of these decides.
     """
     measures = [part.similarity() for part in parts]
     means = [(tree.sum / tree.rows_seen).astype(np.float32) for tree in (part.trees["object"] for part in parts)]
