@@ -1,4 +1,4 @@
-"""Types of arrays by dtype; the docstrings say their shapes. And whether an array is finite, or can be written."""
+"""Types of arrays by dtype; the docstrings say their shapes. And whether an array is finite."""
 
 from __future__ import annotations
 
@@ -24,8 +24,3 @@ def is_finite(array: np.ndarray) -> bool:
     """
     # The sum of the squares is finite only if all numbers are; otherwise it may have overflown.
     return math.isfinite(np.vdot(array, array)) or bool(np.isfinite(array).all())
-
-
-def writable(array: np.ndarray) -> np.ndarray:
-    """The array, or a copy if it cannot be written, as one that came over the wire: a kernel takes none of those."""
-    return array if array.flags.writeable else array.copy()

@@ -21,12 +21,3 @@ def counted(number: float, noun: str) -> str:
     ('1 frame', '0 frames')
     """
     return f"{number:.0f} {noun}" if number == 1 else f"{number:.0f} {noun}s"
-
-
-def cause_of(error: Exception) -> str:
-    """The cause of an error, without the number and the path that a message of the system repeats.
-
-    >>> cause_of(FileNotFoundError(2, "No such file or directory", "walk.txt")), cause_of(ValueError("no number"))
-    ('No such file or directory', 'no number')
-    """
-    return (isinstance(error, OSError) and error.strerror) or str(error)

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from catstream.base.arrays import Bool, Float64, UInt8
-from catstream.base.text import cause_of, counted
+from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.video.images import natural_order
 from catstream.video.source import open_source
@@ -259,8 +259,9 @@ def _text(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8-sig").rstrip()
     except (OSError, UnicodeDecodeError) as error:
+        cause = getattr(error, "strerror", None) or error
         raise VideoError(
-            f"{str(file)!r} cannot be read ({cause_of(error)}): expected a text file with one line for each frame"
+            f"{str(file)!r} cannot be read ({cause}): expected a text file with one line for each frame"
         ) from None
 
 

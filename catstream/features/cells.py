@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from catstream.base.arrays import writable
 from catstream.features import kernels
 from catstream.features.layout import CELL, CHANNELS, CHROMA, COLOURS, LIGHT, MARGIN, ROW_LENGTH, WINDOW
 from catstream.features.pyramid import planes_of
@@ -85,7 +84,7 @@ class Cells:
     def respond(self, weights: np.ndarray, bias: float) -> np.ndarray:
         """Score of every window by weights float32 (d,), float32 (rows - 7, columns - 7)."""
         scores = self._cell_scores(weights, bias)
-        kernels.add_colour_scores(self.shades, writable(weights[COLOURS]), _LOWEST, scores)
+        kernels.add_colour_scores(self.shades, _writable(weights[COLOURS]), _LOWEST, scores)
         return scores
 
     def respond_above(self, weights: np.ndarray, bias: float, threshold: float) -> np.ndarray:
@@ -97,7 +96,7 @@ class Cells:
         colour_threshold = threshold - highest_colour_score(weights[COLOURS])
         scores = self._cell_scores(weights, bias)
         hopeless = scores < colour_threshold
-        kernels.add_colour_scores(self.shades, writable(weights[COLOURS]), colour_threshold, scores)
+        kernels.add_colour_scores(self.shades, _writable(weights[COLOURS]), colour_threshold, scores)
         scores[hopeless | (scores < threshold)] = -np.inf
         return scores
 
@@ -106,7 +105,7 @@ class Cells:
         rows, columns = self.shape
         scores = np.empty((rows - WINDOW + 1, columns - WINDOW + 1), np.float32)
         scores.fill(bias)
-        of_cells = writable(weights[: COLOURS.start]).reshape(WINDOW, -1)
+        of_cells = _writable(weights[: COLOURS.start]).reshape(WINDOW, -1)
         kernels.add_cell_scores(self.grid.reshape(rows, -1), of_cells, scores)
         return scores
 
@@ -200,3 +199,8 @@ def _shade_table() -> np.ndarray:
 
 
 _SHADES_OF = _shade_table()
+
+
+def _writable(array: np.ndarray) -> np.ndarray:
+    """The array, or a copy if it is read-only, like weights that arrived over the wire: the kernels reject those."""
+    return array if array.flags.writeable else array.copy()
