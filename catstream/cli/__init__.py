@@ -104,9 +104,9 @@ def main() -> None:
 
         name_process("catstream", shown)
     os.environ["PYTHONSAFEPATH"] = "1"  # no child of this process imports a file of the current folder
-    # FFmpeg asks a proxy, if the environment names one, for cameras on this machine too.
+    # FFmpeg asks a proxy, if the environment names one, even for cameras on this machine.
     os.environ["no_proxy"] = ",".join(filter(None, ("127.0.0.1,localhost", os.environ.get("no_proxy"))))
-    if sys.stdout is None:  # it was closed before the start (>&-): what is printed is dropped
+    if sys.stdout is None:  # it was closed before the start (>&-): the output is dropped
         sys.stdout = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
     cast(io.TextIOWrapper, sys.stdout).reconfigure(errors="surrogateescape")  # names of files need not be UTF-8
     try:

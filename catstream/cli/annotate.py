@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 )
 @click.option("--boxes", "csv_file", type=PATH, help="CSV file of boxes: frame,object,x,y,w,h.")
 @click.option("--output", type=FOLDER, help="Folder for the results; by default, NAME-annotation.")
-@click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, that of the cores.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, one for each core.")
 @with_listen
 @with_token()
 @with_overwrite
@@ -160,7 +160,7 @@ def wait_for(session: Session, server: Server) -> bool:
 
 def _show(bar: Progress, work: str, done: int, total: int | None) -> None:
     (task,) = bar.tasks
-    if task.description != work:  # the remaining time is that of this part of the work
+    if task.description != work:  # the remaining time counts for this part of the work
         bar.reset(task.id)
     bar.update(task.id, description=work, completed=done, total=total)
 

@@ -34,11 +34,10 @@ from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
-from catstream.wire.channels import CHANNELS, PUBLIC
+from catstream.wire.channels import PUBLIC
 
 _SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
-_OLD_SECONDS = 5.0  # age of what is read, from which they say that the reader is slow
-_PROCESSES = CHANNELS["health"].senders
+_OLD_SECONDS = 5.0  # age of the newest message from which they say that the reader is slow
 
 
 def _not_empty(_: click.Context, parameter: click.Parameter, text: str | None) -> str:
@@ -48,16 +47,18 @@ def _not_empty(_: click.Context, parameter: click.Parameter, text: str | None) -
     return text or ""
 
 
-_with_fleet = click.option(
-    "--fleet",
-    callback=_not_empty,
-    metavar="ADDRESS",
-    help="HOST:PORT or name of the fleet; not needed if only one runs here.",
-)
-
 #: Adds the options that select a fleet by its registry, as an `Address` without a stream: the argument `address`.
-with_fleet_address = combined("address", lambda fleet, keys: Address(fleet=fleet, keys=keys), _with_fleet, with_keys)
-
+with_fleet_address = combined(
+    "address",
+    lambda fleet, keys: Address(fleet=fleet, keys=keys),
+    click.option(
+        "--fleet",
+        callback=_not_empty,
+        metavar="ADDRESS",
+        help="HOST:PORT or name of the fleet; not needed if only one runs here.",
+    ),
+    with_keys,
+)
 
 #: Adds the options that select a running pipeline or a stream of a fleet, as the argument `address`.
 with_address = combined(

@@ -141,7 +141,7 @@ INTERRUPTS = Interrupts()
 
 
 def stopped(result: str = "") -> NoReturn:
-    """End a command that was interrupted; say what is there so far, and how to continue."""
+    """End an interrupted command; print the results so far, and how to continue."""
     click.echo(f"stopped: {result}" if result else "stopped", err=True)
     raise SystemExit(INTERRUPTS.exit_code)
 

@@ -66,13 +66,13 @@ def _token_of_user() -> str:
             return file.read_text(encoding="ascii").strip()
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_atomically(file, f"{token}\n".encode(), mode=0o600)
-    except (OSError, ServiceError, ValueError):  # no home, or one that cannot be written to; not what is written here
+    except (OSError, ServiceError, ValueError):  # no home, no permission, or a file with other content
         pass
     return token
 
 
 def with_token(prefix: str = "") -> Decorator:
-    """Add --PREFIXtoken; the argument `token` is that of the user if none is given, and None for "none"."""
+    """Add --PREFIXtoken; the argument `token` is by default the token of the user, and None for "none"."""
     return combined(
         "token",
         lambda token: None if token == _OPEN else token or _token_of_user(),
@@ -148,7 +148,7 @@ def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
     """Watch all streams of a fleet in a browser.
 
     The page is a wall of pictures, those in trouble first, and a table of the
-    nodes. Each stream links to its own page, which is that of catstream view.
+    nodes. Each stream links to its own page, as of catstream view.
     If the fleet does not answer, the page keeps its last state and waits.
     Ctrl-C ends the server; the fleet continues. Token and encryption are as
     for catstream view.

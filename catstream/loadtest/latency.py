@@ -105,7 +105,7 @@ class Measures:
     track            seconds from the due time of each frame to the track of this frame or a newer one; at most to the
                      end of the run
     model            seconds to the model trained on this frame or a newer one
-    totals           those of the pipeline at its end; empty if the stream has not ended
+    totals           totals of the pipeline at its end; empty if the stream has not ended
     """
 
     due: Float64

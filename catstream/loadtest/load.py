@@ -36,7 +36,7 @@ class Video(NamedTuple):
     """The video that is sent over and over.
 
     units  access units of H.264; the first one is a keyframe
-    still  those of the first image, which are sent before
+    still  access units of the first image, which are sent before
     boxes  boxes of all objects in the first image, by name; the first object is the one whose tracks are measured
     """
 

@@ -93,7 +93,7 @@ def _cost(cores: float, memory: float | None) -> dict[str, str]:
 
 
 def to_json(load_test: LoadTest) -> dict[str, object]:
-    """Return the figures of the decisive run, those of the search steps, the version and the settings.
+    """Return the figures of the decisive run and of the search steps, the version and the settings.
 
     Units are seconds, bytes, and shares from 0 to 1.
     """
@@ -152,7 +152,7 @@ def write_report(path: Path, load_test: LoadTest) -> Path:
         verdicts=verdicts,
         about=(
             f"{result.plan}, {result.seconds:.1f} s{', interrupted' * load_test.interrupted}. Latency counts from the "
-            "due time of a frame; that of a skipped frame ends with the track of a newer one. The camera was at most "
+            "due time of a frame, and ends for a skipped frame with the track of a newer one. The camera was at most "
             f"{milliseconds(result.camera_late)} ms late, and other processes of this machine kept "
             f"{result.other_load:.2f} cores busy."
         ),

@@ -180,7 +180,7 @@ def run_load_test(
 ) -> LoadTest:
     """Run a load test. After Ctrl-C, the measurements so far are returned.
 
-    find : search for the highest number of streams that meets the limits, beginning with that of the plan
+    find : search for the highest number of streams that meets the limits, beginning with the number in the plan
     report, done : functions that are called with the progress, and after each run
     """
     load_test = LoadTest(limits, find)

@@ -145,7 +145,7 @@ class AnnotationSite:
 class Edit:
     """A change of the page.
 
-    server  that of the state of the page
+    server  id of the server, from the state of the page
     verb    "draw" a box at a frame, none if the object is absent; "undo" the last one; "rename" an object; "done"
     object  name of the object
     frame   number of the frame

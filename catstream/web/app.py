@@ -47,7 +47,7 @@ RETRY_SECONDS = 1.0  #: after which a page whose connection broke connects again
 _MAX_BODY = 4096  # bytes
 _MJPEG = "multipart/x-mixed-replace; boundary=picture"
 
-#: Status code of the answer to a request that ends with an error: that of its first class here.
+#: Status code of the answer to a request that ends with an error, by the first class that fits.
 _CODES = {
     CommandRejectedError: 409,
     ProtocolError: 400,

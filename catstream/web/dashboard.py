@@ -43,7 +43,7 @@ class TrackedObject:
     """One of the objects that a pipeline tracks.
 
     colour         colour of its box, #rrggbb
-    state, score   those of its newest track
+    state, score   from its newest track
     version        version of the model that scored it
     began          number of its first frame, None before its first track
     seq            number of its newest track, 0 before the first
@@ -158,7 +158,7 @@ class Dashboard:
 
     @property
     def state(self) -> tuple[str, str]:
-        """The state of the pipeline, as a name and in words: that of its run while it runs, otherwise the phase."""
+        """The state of the pipeline, as a name and in words: of the run while it runs, otherwise the phase."""
         if self.phase != "running":
             return {
                 "waiting": ("none", "no pipeline runs"),

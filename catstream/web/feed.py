@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 SILENCE_SECONDS = 4.0  #: without a health report, after which a process is silent; each sends one every second
 DRAIN_SECONDS = 2.0  #: for the last messages to arrive after the end
 PAUSE_SECONDS = 0.5  #: before a pipeline is looked up again
-READ_SECONDS = 0.03  #: between two looks at the other channels than that of the tracks, which are waited for
+READ_SECONDS = 0.03  #: between two reads of all channels but the tracks, which are awaited
 STOP_SECONDS = 2.0  #: for the thread to end
 PICTURE_SECONDS = 5.0  #: after a request for a picture, for which pictures are received
 

@@ -56,7 +56,7 @@ class Server:
     """The web server of a site, with access control. Its constructor begins to listen; port 0 is a free one.
 
     Clients must have the token; None, which is possible on 127.0.0.1 only, lets every user of this machine watch and
-    give commands. `url` is for a browser on this machine, with the token; `urls` has one for other machines, too, if
+    give commands. `url` is for a browser on this machine, with the token; `urls` has another one for other machines if
     the server listens on all interfaces. If the port is in use, `attempts - 1` next ones are tried. ServiceError if the
     page would be public without a token, the token is too short, or the ports are in use.
     """

@@ -87,13 +87,13 @@ class AnnotatePage {
   go(frame, name = this.missing(frame)) {
     this.stage.cancel();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
-    this.boxes = {}; // those of another frame cannot be taken
+    this.boxes = {}; // the proposals of another frame cannot be taken
     if (name !== this.chosen) this.choose(name);
     this.show();
     this.load();
   }
 
-  /** The object to draw in the first frame of a video: the first one without a box but one that was drawn now. */
+  /** The object to draw in the first frame of a video: the first one without a box, except the one drawn now. */
   missing(frame, drawn = null) {
     const { state, chosen } = this;
     const missing = state?.videos.length ? state.objects.find(({ name, keyframes }) => name !== drawn && !keyframes.includes(frame)) : null;

@@ -110,7 +110,7 @@ export class BoxForm {
     this.name.disabled = this.name.parentElement.hidden = this.role.value !== "new";
   }
 
-  /** Whether a new object has a name that no other has; if not, the browser says what is wrong. */
+  /** Whether a new object has a name that no other has; if not, the browser shows the error. */
   check() {
     this.name.value = this.name.value.trim().normalize("NFC");
     const taken = this.objects.get(this.name.value);

@@ -133,7 +133,7 @@ export class Stage {
     if (found.length) this.objects.choose(found[0][0]);
   }
 
-  /** The boxes of the picture, by name; those of objects that were dropped are left out, and the chosen one is last. */
+  /** The boxes of the picture, by name; without dropped objects, the chosen one last. */
   get shown() {
     const boxes = Object.entries(this.picture?.boxes ?? {}).filter(([name]) => this.objects.get(name));
     return boxes.sort(([name], [other]) => (name === this.objects.chosen) - (other === this.objects.chosen));
