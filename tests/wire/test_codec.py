@@ -168,12 +168,6 @@ def test_arrays_and_bytes_are_copied_once_on_arrival(kind):
         tracemalloc.stop()
 
 
-def test_arrays_arrive_read_only():
-    arrived = decode(encode(EXAMPLES["features"]), Features)
-    with pytest.raises(ValueError, match="read-only"):
-        arrived.objects["anna"].training["appearance"].rows[0, 0] = 1
-
-
 def test_arrays_travel_row_by_row_whatever_their_layout():
     rows = TrainingRows(np.asfortranarray(array(3, 5)), array(3), array(3))
     arrived = decode(encode(features(rows)), Features)
@@ -207,26 +201,20 @@ REJECTED = {
     "set-box with a box and several": packed("command", boxes={"anna": [1, 2, 3, 4]}),
     "a dtype that is not allowed": retrained(rows=plain("<f8", [3, 5], bytes(120))),
     "objects": retrained(rows=plain("|O", [3, 5], bytes(120))),
-    "another width of its labels": retrained(labels=plain("<f4", [2], bytes(8))),
     "rows in one dimension": retrained(rows=plain("<f4", [15], bytes(60))),
-    "rows in three dimensions": retrained(rows=plain("<f4", [1, 3, 5], bytes(60))),
     "a negative side": retrained(rows=plain("<f4", [-3, -5], bytes(60))),
     "less data than its shape": retrained(rows=plain("<f4", [3, 5], bytes(59))),
     "a side of 2**63": retrained(rows=plain("<f4", [0, 2**63], b"")),
     "sides whose product is huge": retrained(rows=plain("<f4", [2**32, 2**32], bytes(60))),
     "NaN in an array": retrained(rows=plain("<f4", [3, 5], struct.pack("<f", np.nan) * 15)),
-    "infinity in an array": packed("model", weights=plain("<f4", [1], struct.pack("<f", np.inf))),
     "NaN as a number": packed("track", score=np.nan),
-    "infinity as a counter": packed("health", counters={"rate": np.inf}),
     "a label below 0": retrained(labels=plain("<f4", [3], struct.pack("<3f", 0, 1, -0.5))),
-    "a label above 1": retrained(labels=plain("<f4", [3], struct.pack("<3f", 0, 1, 1.5))),
     "a weight of 0": retrained(weights=plain("<f4", [3], bytes(12))),
     "a tree of another width": packed("sample", trees=TREES_SENT | {"loss": TREES_SENT["object"]}),
     "a sample without the object's tree": packed("sample", trees={"loss": TREES_SENT["loss"]}),
     "a tree of no head": packed("sample", trees=TREES_SENT | {"unknown": TREES_SENT["loss"]}),
     "training rows of no group": of_anna(training={"unknown": {}}),
     "a name that is no name": packed("features", objects={"an na": {}}),
-    "a track of a name that is no name": packed("track", about="../x", object="../x"),
     "another object in the envelope": packed("track", about="ann"),
     "an object in the envelope, and none in the fields": packed("position", about="anna"),
     "lists in lists, as object": b"\x95\x05\xa3end" + b"\x91" * 1015 + b"\x90\xa0\x80",
@@ -235,7 +223,6 @@ REJECTED = {
     "rows of another width in another group": retrained(rows=plain("<f4", [3, 4], bytes(48))),
     "a picture that is no JPEG": packed("preview", jpeg=b"<svg onload=...>"),
     "a picture above its limit": packed("preview", jpeg=b"\xff\xd8\xff" + bytes(1 << 19)),
-    "a frame without width": packed("preview", width=0),
     "a box without width": packed("track", box=[1.0, 2.0, 0.0, 4.0]),
     "a box of three numbers": packed("track", box=[1.0, 2.0, 3.0]),
     "a state that does not exist": packed("track", state="asleep"),
@@ -245,7 +232,6 @@ REJECTED = {
     "a missing field": msgpack.packb([VERSION, "track", "", "", {"frame": 1}]),
     "another version": msgpack.packb([VERSION + 1, "track", "", "", {}]),
     "a kind that does not exist": msgpack.packb([VERSION, "orders", "", "", {}]),
-    "a number as run": msgpack.packb([VERSION, "end", "", 7, fields_of("end")]),
     "no envelope": msgpack.packb({"frame": 1}),
     "nothing": b"",
     "half a message": encode(EXAMPLES["features"])[:-20],
@@ -258,18 +244,10 @@ REJECTED = {
     "a list longer than any message's": msgpack.packb([VERSION, "end", "", "", [None] * 257]),
     "a reason longer than a page": packed("end", reason="x" * (LONGEST_TEXT + 1)),
     "an extension type": b"\x95\x05\xa3end\xa0\xa0\xd4\x05\x00",
-    "an extension type without bytes": b"\x95\x05\xa3end\xa0\xa0\xc7\x00\x05",
     "a text for bytes": packed("modelfile", file="YSBmaWxl"),
     "a text for the bytes of an array": retrained(labels=plain("<f4", [3], "AAAA" * 4)),
-    "bytes for a text": packed("end", reason=b"over"),
-    "a map for a list": packed("track", box={"x": 1.0, "y": 2.0, "w": 3.0, "h": 4.0}),
-    "a list for a map": packed("health", counters=[1.0]),
-    "a list as a name in a map": b"\x95\x05\xa3end\xa0\xa0\x81\x90\x01",
     "a text that is not UTF-8": b"\x95\x05\xa3end\xa0\xa0\x81\xa6reason\xa1\xff",
     "a byte that msgpack does not use": b"\x95\x05\xa3end\xa0\xa0\xc1",
-    "a timestamp": b"\x95\x05\xa3end\xa0\xa0\xd6\xff\x00\x00\x00\x00",
-    "lists in lists, as version": b"\x95" + b"\x91" * 1015 + b"\x90\xa3end\xa0\xa0\x80",
-    "lists in lists, as kind": b"\x95\x05" + b"\x91" * 1015 + b"\x90\xa0\xa0\x80",
     "lists in lists, as fields": b"\x95\x05\xa3end\xa0\xa0" + b"\x91" * 1015 + b"\x90",
     "lists in lists without end": b"\x91" * 100_000,
 }

@@ -163,16 +163,6 @@ def test_of_a_flood_of_commands_64_wait_others_are_rejected_and_stop_passes(endp
     assert {(answer.done, answer.reason) for answer in answers[:36]} == {(False, reason)}
 
 
-def test_control_sends_each_command_with_an_id_of_its_own(endpoint, answering):
-    with answering() as heard, Control(endpoint, timeout=20) as control:
-        for answer in (control.set_box((1, 2, 3, 4), keep=True), control.pause(), control.resume(), control.stop()):
-            assert (answer.done, answer.frame) == (True, 7)
-    assert len({command.id for command in heard}) == 4
-    assert [(command.verb, command.box, command.keep) for command in heard] == [
-        ("set-box", Box(1, 2, 3, 4), True), ("pause", None, False), ("resume", None, False), ("stop", None, False),
-    ]  # fmt: skip
-
-
 def test_a_rejected_command_raises_an_error_with_the_reason(endpoint, answering):
     def refuse(command):
         return Answer(command.id, False, "it is no time for that")
