@@ -19,7 +19,6 @@ from rich.console import Console
 from catstream.base.box import Box
 from catstream.cli import track as track_module
 from catstream.cli.track import RunProgress
-from catstream.errors import VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
 from catstream.sinks.track_log import LineSink, Log
@@ -137,26 +136,6 @@ def running():
     return found
 
 
-def test_a_damaged_video_is_followed_up_to_the_break_or_over_it_if_requested(video, fail, succeed, tmp_path):
-    source, box = video
-    damaged = tmp_path / "damaged.mpg"
-    data = bytearray(encoded(source, damaged).read_bytes())
-    middle = len(data) // 2
-    data[middle : middle + 3000] = bytes(3000)
-    damaged.write_bytes(data)
-    with open_source(damaged, skip_damaged=True) as whole:
-        good = sum(1 for _ in whole)
-    before = []
-    with open_source(damaged) as film, pytest.raises(VideoError, match="is damaged at frame"):
-        before.extend(frame.number for frame in film)
-    command = ["track", damaged, "--box", box, "--output"]
-    assert f"is damaged at frame {len(before)}" in fail(*command, tmp_path / "out")
-    assert frames_of(tmp_path / "out", "damaged") == before
-    _, errors = succeed(*command, tmp_path / "all", "--skip-damaged")
-    assert "frames could not be decoded, and skipped" in errors
-    assert 0 < len(before) < len(frames_of(tmp_path / "all", "damaged")) == good < 32
-
-
 def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succeed, tmp_path):
     source, box = video
     images = tmp_path / "walk"
@@ -220,28 +199,6 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     (tmp_path / "file").write_text("mine\n")
     assert "an existing folder that you may write to" in fail("track", source, "--box", box, "--output", folder)
     assert (tmp_path / "file").read_text() == "mine\n"
-
-
-def test_a_second_start_at_the_same_place_is_rejected_and_writes_nothing(video, fail, tmp_path):
-    source, box = video
-    place = tmp_path / "run"
-    with Pipeline(source, box, {"run.endpoint": str(place)}):
-        words = ["--output", tmp_path / "two", "--set", f"run.endpoint={place}"]
-        assert "already running" in fail("track", source, "--box", box, *words)
-    assert not (tmp_path / "two").exists()
-
-
-def encoded(source, path):
-    """A video as MPEG: a stream that can be cut anywhere, as old cameras wrote it."""
-    import av
-
-    with av.open(str(path), "w") as container, open_source(source) as film:
-        stream = container.add_stream("mpeg1video", rate=30)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 320, 240, "yuv420p", 4_000_000
-        for frame in film:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame.image, format="bgr24")))
-        container.mux(stream.encode(None))
-    return path
 
 
 def test_a_path_without_permission_is_an_error_of_one_line(said, monkeypatch, tmp_path):

@@ -17,7 +17,6 @@ from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import CHECKPOINTS
 from catstream.pipeline import Pipeline
-from catstream.video.source import open_source
 
 UNITS = Path(__file__).parents[2] / "services"
 UNIT = UNITS / "catstream@.service"
@@ -106,17 +105,6 @@ def test_a_run_that_cannot_continue_is_not_said_to_continue(killed, video, fail)
         assert "continues" not in fail(*command)
     (kept / "job.safetensors").write_bytes(b"damaged")
     assert "continues" not in fail(*command)
-
-
-def test_rows_left_incomplete_by_a_power_failure_are_removed_and_written_again(killed, succeed):
-    out = killed / "out"
-    for file, cut in [("demo.ndjson", 60), ("demo.csv", 100)]:
-        path = out / file
-        path.write_bytes(path.read_bytes()[:-cut] + bytes(9))
-    succeed("track", "--resume", killed / "kept")
-    assert frames(out) == list(range(32))
-    with open_source(out / "demo.mp4") as film:
-        assert sum(1 for _ in film) == 32, "the video is drawn again, whole"
 
 
 def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, fail, tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.base.settings import Settings
 from catstream.compression.checkpoint_store import CheckpointStore
-from catstream.errors import CatstreamError, ServiceError
+from catstream.errors import CatstreamError
 from catstream.jobs.job import Job
 from catstream.jobs.state import CHECKPOINTS
 from catstream.messages.kinds import End, Track
@@ -120,22 +120,6 @@ def test_an_error_that_a_restart_cannot_resolve_is_reported_and_not_retried(fold
     error, restarts = failed(job, folder)
     assert ("no video or folder" in error, restarts) == (True, 0)
     assert "detector died" not in caplog.text  # another process may hang on a busy machine
-
-
-def test_processes_that_have_started_end_if_one_after_them_cannot_start(video, folder, monkeypatch, alive):
-    start, pids = Child.start, []
-
-    def start_two(child, after):
-        if child.name == NAMES[-1]:
-            raise OSError(24, "Too many open files")
-        start(child, after)
-        pids.append(child.process.pid)
-
-    monkeypatch.setattr(Child, "start", start_two)
-    with pytest.raises(ServiceError, match="Too many open files"):
-        Supervisor(Job(video[0], {"": video[1][0]}, endpoint=str(folder)), folder)
-    assert len(pids) == 2
-    assert not any(map(alive, pids))
 
 
 def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder, monkeypatch):

@@ -102,13 +102,6 @@ class Numbers(Source):
         pass
 
 
-def test_frames_are_yielded_in_order_from_another_thread():
-    source = Numbers(5)
-    assert [frame.number for frame in read_ahead(source)] == [0, 1, 2, 3, 4]
-    assert len(source.readers) == 1
-    assert threading.current_thread().name not in source.readers
-
-
 def test_an_error_of_the_source_is_raised_after_the_frames_before_it():
     frames = read_ahead(Numbers(2, VideoError("it breaks at frame 2")))
     assert [next(frames).number, next(frames).number] == [0, 1]
