@@ -40,26 +40,32 @@ def started(stack, example, *words):
     return process
 
 
-def tracked_beside(pipeline, process):
-    """The tracks of a pipeline by frame, and the lines that an example beside it prints until both end."""
-    tracks, speaks = {}, False
-    for track in pipeline:
-        tracks[track.frame] = track
-        speaks = speaks or select.select([process.stdout], [], [], 0.3)[0]  # while it starts, few frames pass
-    printed, _ = process.communicate(timeout=150)
-    assert process.returncode == 0
-    return tracks, printed.splitlines()
+@pytest.fixture
+def beside(demo_video):
+    """Runs an example beside a pipeline; returns the tracks by frame, and the lines that the example printed."""
+
+    def run(example, *words, keys=""):
+        source, boxes = demo_video(60)
+        tracks, speaks = {}, False
+        with ExitStack() as stack:
+            pipeline = stack.enter_context(Pipeline(str(source), boxes[0], EACH_FRAME | {"run.keys": str(keys)}))
+            process = started(stack, example, *(pipeline.endpoint if word == "ENDPOINT" else word for word in words))
+            for track in pipeline:
+                tracks[track.frame] = track
+                speaks = speaks or select.select([process.stdout], [], [], 0.3)[0]  # while it starts, few frames pass
+            printed, _ = process.communicate(timeout=150)
+        assert process.returncode == 0
+        return tracks, printed.splitlines()
+
+    return run
 
 
 @pytest.mark.parametrize("example", ["subscriber.py", "subscriber.mjs"])
-def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(demo_video, keys, example):
+def test_a_subscriber_prints_the_tracks_and_the_models_until_the_end(beside, keys, example):
     modules = [EXAMPLES / "node_modules" / name for name in ("zeromq", "@msgpack/msgpack")]
     if example.endswith(".mjs") and not (shutil.which("node") and all(module.exists() for module in modules)):
         pytest.skip("Node.js or its modules are missing: npm ci --prefix examples")
-    source, boxes = demo_video(60)
-    with ExitStack() as stack:
-        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], EACH_FRAME | {"run.keys": str(keys)}))
-        found, printed = tracked_beside(pipeline, started(stack, example, pipeline.endpoint, keys))
+    found, printed = beside(example, "ENDPOINT", keys, keys=keys)
     assert printed[-1] == "end: the source has ended, 0 tracks missed"
     tracks = [text.split() for text in printed if text.startswith("track ")]
     assert [int(frame) for _, frame, *_ in tracks] == list(range(60 - len(tracks), 60))
@@ -134,12 +140,8 @@ def test_a_ground_station_selects_an_object_and_is_told_where_it_is(demo_video, 
         assert "no longer tracked" in camera.communicate(timeout=150)[0]
 
 
-def test_the_zone_counter_counts_beside_a_run(demo_video):
-    source, boxes = demo_video(60)
-    with ExitStack() as stack:
-        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], EACH_FRAME))
-        zones = "all=0,0 320,0 320,240 0,240", "none=0,0 3,0 3,3"
-        _, printed = tracked_beside(pipeline, started(stack, "zone_counter.py", pipeline.endpoint, *zones))
+def test_the_zone_counter_counts_beside_a_run(beside):
+    _, printed = beside("zone_counter.py", "ENDPOINT", "all=0,0 320,0 320,240 0,240", "none=0,0 3,0 3,3")
     entered, left, everywhere, nowhere = printed
     assert entered.endswith("the object entered all, 1 inside")
     assert left.endswith("the object left all, 0 inside")
@@ -147,12 +149,8 @@ def test_the_zone_counter_counts_beside_a_run(demo_video):
     assert nowhere == "none: 0 visits, 0.0 s in all"
 
 
-def test_the_collector_stores_the_tracks_of_a_pipeline_although_another_is_missing(demo_video, tmp_path):
-    source, boxes = demo_video(60)
-    with ExitStack() as stack:
-        pipeline = stack.enter_context(Pipeline(str(source), boxes[0], EACH_FRAME))
-        words = tmp_path / "tracks.sqlite", pipeline.endpoint, "tcp://127.0.0.1"
-        found, printed = tracked_beside(pipeline, started(stack, "asyncio_collector.py", *words))
+def test_the_collector_stores_the_tracks_of_a_pipeline_although_another_is_missing(beside, tmp_path):
+    found, printed = beside("asyncio_collector.py", tmp_path / "tracks.sqlite", "ENDPOINT", "tcp://127.0.0.1")
     with closing(sqlite3.connect(tmp_path / "tracks.sqlite")) as database:
         stored = {frame: rest for frame, *rest in database.execute("SELECT frame, state, score FROM tracks")}
     assert max(stored) == 59

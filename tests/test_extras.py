@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from catstream.errors import EXTRAS, MissingExtraError, install_command, require_extra
+from catstream.errors import EXTRAS, MissingExtraError, require_extra
 
 #: Blocks the modules of all extras, then imports all that following a video needs.
 BASE = f"""
@@ -30,8 +30,3 @@ def test_a_missing_extra_is_an_error_with_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r'a fleet needs packages .* \(ray\): .* "catstream\[fleet\]"'):
         require_extra("fleet")
-
-
-def test_the_install_command_is_that_of_this_environment(monkeypatch):
-    monkeypatch.setenv("PATH", "/nowhere")
-    assert install_command("fleet") == f'{sys.executable} -m pip install "catstream[fleet]"'
