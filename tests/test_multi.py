@@ -174,36 +174,6 @@ def test_a_search_that_cannot_begin_changes_nothing(frames, cleo):
     assert [tracker.update(frame) for frame in frames[1:4]] == [other.update(frame) for frame in frames[1:4]]
 
 
-@pytest.fixture(scope="module")
-def lookalike():
-    """Frames, and boxes: `short` leaves the picture by frame 11, and the lower part of `tall` looks like it."""
-    background = np.kron(np.random.default_rng(4).integers(100, 150, (24, 32, 3), np.uint8), np.ones((10, 10, 1)))
-    short = np.full((64, 32, 3), (30, 40, 60))
-    short[24:32] = (90, 60, 60)
-    tall = np.vstack([np.full((40, 32, 3), (60, 160, 220)), short])
-
-    def drawn(number):
-        boxes = {"tall": Box(180 - 2 * number, 30 + number % 3, 32, 104), "short": Box(30 - 6 * number, 150, 32, 64)}
-        frame = background.astype(np.uint8)
-        for (x, y, w, h), patch in zip(boxes.values(), (tall, short), strict=True):
-            left = max(x, 0)
-            frame[y : y + h, left : max(x + w, 0)] = patch[:, left - x :][:, : max(x + w, 0)]
-        return frame, boxes
-
-    return [drawn(number) for number in range(40)]
-
-
-@pytest.mark.parametrize("starts", [{"tall": 0, "short": 0}, {"tall": 0, "short": 2}, {"short": 0, "tall": 1}])
-def test_an_object_that_left_is_absent_where_a_part_of_another_one_resembles_it(lookalike, starts):
-    tracker = MultiTracker()
-    for number, (frame, boxes) in enumerate(lookalike):
-        begin = {name: boxes[name] for name, start in starts.items() if start == number}
-        tracks = tracker.update(frame, begin=begin) if number else tracker.init(frame, begin) or tracker.tracks
-        if number > 11:
-            assert tracks["short"].state == "absent"
-            assert tracks["tall"].box.overlap(boxes["tall"]) > 0.8
-
-
 def test_objects_are_together_from_their_first_frame_until_they_are_apart(frames):
     """They are so if they begin in one frame, and if one begins after the other."""
     for later in (0, 2):

@@ -43,7 +43,7 @@ class SparseCollaborativeModel:
 
     Parameters
     ----------
-    image : uint8 (h, w, 3) BGR, or (h, w) grey: the first frame
+    image : uint8 (h, w, 3) BGR, the first frame
     box : the object in it, in pixels
     rng : generator of templates and particles
     particles : number of boxes that are scored in a frame
@@ -204,7 +204,7 @@ class _Generative:
 
 
 def _grey(image: np.ndarray) -> Pyramid:
-    return Pyramid(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    return Pyramid(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
 
 def _squares(rows: np.ndarray) -> np.ndarray:

@@ -162,7 +162,11 @@ def test_centres_are_sent_in_whole_blocks_with_nan_for_absent_objects(settings, 
 
 @pytest.mark.parametrize("names", [[""], ["anna", "ben"]], ids=["one", "two"])
 @pytest.mark.parametrize("count", [0, 1, 37])
-def test_a_saved_forest_continues_bit_for_bit(settings, messages, names, count, tmp_path):
+def test_a_saved_forest_continues_bit_for_bit(settings, messages, names, count, rng, tmp_path):
+    motion, centre = Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4))
+    windows = [Window(*rng.random(4)) for _ in range(3)]
+    detector = DetectorState(7, "lost", *windows, False, 2, motion=motion, centre=centre)
+    messages = (changed(message, detector=detector) for message in messages)
     stream = (merged(seq, **{name: next(messages) for name in names}) for seq in itertools.count(1))
     forest = Forest(settings)
     take(forest, stream, count)
@@ -171,6 +175,9 @@ def test_a_saved_forest_continues_bit_for_bit(settings, messages, names, count, 
     assert list(loaded.compressors) == (names if count else [])
     assert loaded.counters() == forest.counters()
     assert loaded.versions == forest.versions
+    for name, state in loaded.states_at(count).items():
+        assert_equal(dataclasses.asdict(state), dataclasses.asdict(detector))
+        assert_equal(dataclasses.asdict(loaded.compressors[name].detector), dataclasses.asdict(detector))
     for message in itertools.islice(stream, 40):
         for sample, again in zip(forest.take(message), loaded.take(message), strict=True):
             assert_same(sample, again)
@@ -184,20 +191,6 @@ def test_the_last_sample_can_be_had_again_though_the_trees_have_grown(settings, 
     assert not take(forest, messages, 2)
     forest.save(tmp_path / "state")
     assert_same(Forest.load(tmp_path / "state", settings).last_samples[0], samples[-1])
-
-
-@pytest.mark.parametrize("moving", [False, True])
-def test_the_detector_state_of_the_last_message_is_stored_bit_for_bit(settings, messages, moving, rng, tmp_path):
-    motion, centre = (Motion(rng.normal(size=(4, 4)), rng.normal(size=(2, 2))), rng.normal(size=(5, 4)))
-    detector = DetectorState(7, "lost", *(Window(*rng.random(4)) for _ in range(3)), False, 2)
-    if moving:
-        detector = dataclasses.replace(detector, motion=motion, centre=centre)
-    forest = Forest(settings)
-    forest.take(changed(next(messages), detector=detector))
-    forest.save(tmp_path / "state")
-    loaded = Forest.load(tmp_path / "state", settings)
-    for state in (loaded.compressors[""].detector, loaded.states_at(1)[""]):
-        assert_equal(dataclasses.asdict(state), dataclasses.asdict(detector))
 
 
 def test_a_checkpoint_has_the_detector_states_after_the_last_256_messages(settings, tmp_path):

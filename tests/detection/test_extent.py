@@ -64,11 +64,7 @@ def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(d
         assert (row @ weights + bias - 0.5) * 16 == pytest.approx(steps, abs=0.7)
 
 
-def test_if_the_belief_is_low_only_the_place_is_followed():
-    found = WINDOW.scaled(1.1).centred(90, 80)
-    assert extent.smooth(WINDOW, found, resize=False) == pytest.approx(WINDOW.centred(90, 80))
-
-
-def test_a_far_larger_change_is_a_redetection_and_used_unchanged():
-    found = WINDOW.scaled(1.5).centred(90, 80)
-    assert extent.smooth(WINDOW, found, resize=False) == found
+def test_if_the_belief_is_low_only_the_place_is_followed_unless_the_window_is_redetected():
+    near, elsewhere = (WINDOW.scaled(factor).centred(90, 80) for factor in (1.1, 1.5))
+    assert extent.smooth(WINDOW, near, resize=False) == pytest.approx(WINDOW.centred(90, 80))
+    assert extent.smooth(WINDOW, elsewhere, resize=False) == elsewhere

