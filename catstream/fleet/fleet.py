@@ -48,7 +48,6 @@ from catstream.wire.discovery import private_folder
 
 ANSWER_SECONDS = 60.0  # limit for the controller to answer; Ray starts it again meanwhile, if it has died
 DOWN_SECONDS = 60.0  # limit for all streams to store their state and to end
-_START_SECONDS = 150.0  # limit for another process to start Ray on this machine
 _LEAVE_SECONDS = 10.0  # limit for the process whose node it is to notice that the fleet has ended
 _REACH_SECONDS = 3.0  # limit to connect to the head
 _LOOK_SECONDS = 0.2  # between two looks at any of these
@@ -195,15 +194,12 @@ class Fleet(AbstractContextManager["Fleet"]):
         return _fleets_folder() / self.name
 
     def _start_ray(self) -> None:
-        """Start a node of Ray on the loopback interface, unless another process has it or is starting it."""
+        """Start a node of Ray on the loopback interface, unless another process has done so."""
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with ExitStack() as stack:
             file = stack.enter_context((self._folder / "lock").open("w"))
-            deadline = time.monotonic() + _START_SECONDS
-            while not lock(file.fileno()):
-                if (self._folder / "address").exists() or time.monotonic() > deadline:
-                    return
-                time.sleep(_LOOK_SECONDS)
+            if not lock(file.fileno()):
+                return
             (self._folder / "address").unlink(missing_ok=True)  # of one that was killed
             if not (self._folder / "token").exists():
                 write_atomically(self._folder / "token", secrets.token_hex(32).encode(), mode=0o600)

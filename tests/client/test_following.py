@@ -1,6 +1,5 @@
 """A subscriber to a stream of a fleet stays attached when the stream moves, and returns each frame once."""
 
-import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
@@ -8,11 +7,9 @@ from dataclasses import replace
 import pytest
 
 import catstream
-from catstream.client.address import Address
-from catstream.client.attach import wait_until_running
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, FleetStatus, Health, StreamStatus
-from catstream.wire.channels import CONTROL, HEALTH, TRACKS
+from catstream.messages.kinds import Answer, Command, End, FleetStatus, StreamStatus
+from catstream.wire.channels import CONTROL, TRACKS
 from catstream.wire.commands import Responder
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
@@ -130,20 +127,6 @@ def test_all_frames_of_another_source_and_of_a_live_stream_are_returned_after_a_
             assert [message.seq for message in watched.result(60)] == [1, 2, 1, 2]
 
 
-def test_an_event_loop_follows_a_stream_too(stream, managing):
-    async def watched(tracks):
-        return [track async for track in tracks]
-
-    with managing(stream.status):
-        first = stream.runs()
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
-            result = stream._pool.submit(lambda: asyncio.run(watched(tracks)))
-            stream.send(first, track(1), STOPPED)
-            stream.send(stream.runs(), track(1), track(2), STOPPED)
-            stream.update(state="ended")
-            assert result.result(60) == [track(1), track(2)]
-
-
 def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, managing):
     with managing(stream.status):
         with pytest.raises(ServiceError, match="site has no stream 'cam-8': its streams are cam-7"):
@@ -152,16 +135,6 @@ def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, man
         with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             assert list(tracks) == []
             assert tracks.end.reason == "the stream cam-7 has ended"
-
-
-def test_the_endpoint_of_a_running_stream_is_that_of_its_pipeline(stream, managing):
-    with managing(stream.status):
-        tracks = stream.runs()
-        with Publisher(HEALTH, tracks._endpoint, "detector") as health:
-            health.send(Health("detector", 0.0))
-            waiting = stream._pool.submit(wait_until_running, Address.parse("fleet://cam-7"), 60)
-            stream._until(waiting.done, health.serve_late_joiners)
-        assert str(waiting.result()) == stream.status.streams["cam-7"].endpoint
 
 
 def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):

@@ -73,24 +73,6 @@ def test_without_a_fleet_the_error_says_how_to_get_one(managing):
         Registry("yard")
 
 
-def test_a_controller_that_was_started_again_in_its_folder_is_asked_again(managing, folder):
-    with managing(SITE, str(folder / "registry")):
-        registry = Registry()
-    with registry:
-        registry.timeout = 0.1
-        with pytest.raises(SilenceError, match="no answer from the fleet site at"):
-            registry.streams()
-        registry.timeout = 20
-        with managing(SITE, str(folder / "registry")):
-            assert registry.streams() == SITE
-
-
-@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
-def test_a_registry_of_this_machine_needs_no_keys(managing, tcp, host):
-    with managing(SITE, tcp), Registry(f"{host}:{tcp.rpartition(':')[2]}") as registry:
-        assert registry.streams() == SITE
-
-
 def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(keys, folder, tcp, managing):
     address = tcp.removeprefix("tcp://")
     create(folder / "other")

@@ -13,7 +13,6 @@ from catstream.fleet import actor as module
 from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
-from catstream.sinks.destinations import SinkOptions
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
 from catstream.wire import discovery
@@ -51,18 +50,6 @@ def started(spec, store, node="n1", every=0.2, address=""):
         stream.stop()
 
 
-def test_a_stream_continues_on_another_node_where_it_was(spec, store, until):
-    with started(spec, store) as first:
-        until(lambda: first.report()[0].frame >= 10)
-    before = Store(store).stream("cam-7").newest()
-    with started(spec, store, "n2") as second:
-        until(lambda: second.report()[0].state == "ended")
-    assert 10 <= before.facts["frame"] < FRAMES - 1
-    assert not before.facts["ended"]
-    assert second.report()[0].token > first.report()[0].token
-    assert Store(store).stream("cam-7").newest().facts["frame"] == FRAMES - 1
-
-
 def frames_of(path):
     """The numbers of the frames in a log, below its head."""
     return [json.loads(line)["frame"] for line in path.read_text().splitlines()[1:]]
@@ -94,23 +81,6 @@ def test_a_live_stream_uses_no_frame_number_of_its_log_again(store, until, tmp_p
         until(lambda: stream.report()[0].frame > last + 5)
     frames = frames_of(tmp_path / "gate.ndjson")
     assert frames == sorted(set(frames))
-
-
-def test_a_stream_that_begins_anew_keeps_the_log_before(spec, store, until, tmp_path):
-    log = tmp_path / "cam-7.ndjson"
-    log.write_text("of the last year")
-    with started(replace(spec, write=(str(log),)), store) as stream:
-        until(lambda: stream.report()[0].state == "ended")
-    (before,) = tmp_path.glob("cam-7-*.ndjson")
-    assert before.read_text() == "of the last year"
-    assert frames_of(log) == list(range(FRAMES))
-
-
-def test_a_zone_outside_the_frame_is_the_trouble_of_a_stream(spec, store, until):
-    options = SinkOptions(zone={"door": ((4000, 10), (4900, 10), (4900, 90))})
-    with started(replace(spec, write=("http://127.0.0.1:9/hook",), options=options), store) as stream:
-        until(lambda: stream.report()[0].state == "failed")
-    assert "zone door: it is outside the frame of 320x240 pixels" in stream.report()[0].trouble
 
 
 def test_a_holder_that_was_replaced_stops_and_nobody_reads_its_states_any_more(long_spec, store, until):
@@ -154,12 +124,6 @@ def test_a_source_that_cannot_be_opened_is_named_and_tried_again(spec, store, un
         until(lambda: stream.report()[0].state == "ended")
     status, is_superseded = stream.report()
     assert (status.token > 1, status.trouble, is_superseded) == (True, "", False)
-
-
-def test_a_store_that_the_node_cannot_use_is_named(spec, until):
-    with started(spec, "s3://Not_a_bucket") as stream:
-        until(lambda: stream.report()[0].state == "failed")
-        assert "the URL of the store is not valid" in stream.report()[0].trouble
 
 
 def test_a_paused_stream_uploads_nothing_and_notices_a_newer_claim(store, until, monkeypatch):

@@ -188,17 +188,6 @@ def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec,
             site.end()
 
 
-def test_a_stream_with_other_labels_starts_again_where_they_are(site, ray):
-    running(site, ray, "gate")
-    site.add(replace(GATE, labels={"site": "south"}), {})
-    assert states(site)["gate"] == "moving", "from the answer on, so that `up` waits for it"
-    site._turn()
-    assert ray.of("gate").asked[-1] == ("stop",)
-    for _ in range(3):
-        site._turn()
-    assert ray.of("gate").options["label_selector"] == {"site": "south"}
-
-
 def test_a_stream_whose_node_died_is_left_to_ray(site, ray):
     running(site, ray, "gate")
     ray.nodes[0]["Alive"] = False

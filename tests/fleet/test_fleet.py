@@ -203,16 +203,6 @@ def test_a_controller_that_dies_is_started_again_and_streams_run_on(site, until)
     assert fleet.is_running
 
 
-def test_a_stream_whose_source_cannot_be_opened_has_failed_until_it_is_changed(site, until):
-    fleet, spec = site
-    fleet.add(StreamSpec("cam-8", "missing.mp4", cores=0.1))
-    assert "missing.mp4" in state_of(fleet, "cam-8", until, "failed").trouble
-    fleet.add(StreamSpec("cam-8", LIVE, cores=0.1))
-    state_of(fleet, "cam-8", until, "waiting", "running")
-    assert fleet.remove("cam-8", forget=True) == ["cam-8: is removed"]
-    until(lambda: Store(spec.store).stream("cam-8").newest() is None)
-
-
 def test_a_fleet_whose_streams_do_not_stop_is_not_said_to_be_down(site, monkeypatch):
     fleet, _ = site
     ask = fleet._ask

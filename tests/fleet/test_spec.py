@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from catstream.base.box import Box
 from catstream.errors import FleetError
@@ -89,32 +87,6 @@ def test_two_streams_may_not_write_to_one_destination(load, place):
     assert "secret" not in str(caught.value)
 
 
-def test_an_error_of_the_defaults_names_them(load):
-    with pytest.raises(FleetError, match=r"the defaults: there is no key 'wriet', did you mean 'write'\?"):
-        load("[defaults]\nwriet = []\n[streams.a]\nsource = '0'")
-
-
-names = st.sampled_from(["anna", "b-2", "cam.7", "_"])
-numbers = st.sampled_from([2.0, 30.0, 47.25])
-made = st.builds(
-    StreamSpec,
-    names,
-    st.sampled_from(["0", "rtsp://camera/1", "/videos/walk.mp4"]),
-    st.dictionaries(names, st.builds(Box, numbers, numbers, numbers, numbers), max_size=2),
-    st.dictionaries(names.map("m-{}".format), names.map(lambda name: Path("/", name)), max_size=2),
-    st.fixed_dictionaries({}, optional={"coreset.size": st.integers(2, 200), "run.lockstep": st.booleans()}),
-    st.floats(0.01, 64),
-    st.dictionaries(names, names, max_size=2),
-)
-
-
-@settings(max_examples=30)
-@given(st.builds(FleetSpec, names, st.sampled_from(["", "s3://fleet/site"]), numbers), st.lists(made, max_size=3))
-def test_each_fleet_comes_back_from_json(fleet, streams):
-    fleet.streams.update({stream.name: stream for stream in streams})
-    assert from_json(to_json(fleet)) == fleet
-
-
 @pytest.mark.parametrize(
     ("change", "restarts"),
     [
@@ -140,16 +112,13 @@ def test_the_digest_changes_exactly_if_the_stream_must_be_started_anew(change, r
     ("lines", "error"),
     [
         ('[streams.cam-7]\nsource="0"\n[streams.cam-7]\nsource="1"', "this is not TOML: Cannot declare ('streams', "),
-        ('[streams.cam-7]\nsource=', "this is not TOML: Invalid value (at end of document)"),
         ("", "missing streams: add a table for each, for example [streams.cam-1]"),
         ("[stream.cam-1]\nsource='0'", "there is no key 'stream', did you mean 'streams'?"),
         ("streams = 3", "streams must be tables [streams.NAME], got 3"),
         ("[streams]\ncam-7 = 3", "the stream cam-7: expected a table with a source, got 3: write [streams.cam-7]"),
         ('[streams."cam 7"]\nsource="0"', "'cam 7' is not a valid name of a stream: expected 1 to 64 letters"),
-        ('[streams.".."]\nsource="0"', "'..' is not a valid name of a stream"),
         ('naem="a"\n[streams.a]\nsource="0"', "there is no key 'naem', did you mean 'name'? there are name, store"),
         ('every=0\n[streams.a]\nsource="0"', "every must be a number of seconds above 0 and at most 3600, got 0"),
-        ('every="5"\n[streams.a]\nsource="0"', "every must be a number of seconds above 0 and at most 3600, got '5'"),
     ],
 )  # fmt: skip
 def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
@@ -163,34 +132,19 @@ def test_an_error_of_the_file_is_one_line(load, lines, error, tmp_path):
     ("line", "error"),
     [
         ("", "missing source: add one as for `catstream track`, for example source ="),
-        ("source = ' '", "missing source"),
         ("source = 7", "source must be a text, got 7"),
         ("sorce = '0'", "there is no key 'sorce', did you mean 'source'? there are source, box"),
         ("source = '0'\nbox = [1, 2, 3]", "a box is four numbers x,y,w,h in pixels, got [1, 2, 3]"),
         ("source = '0'\nbox = [1, 2, 30, 0]", "the box of the object without a name: a box needs a width and a height"),
         ("source = '0'\nboxes = { anna = [1, 2, nan, 4] }", "the box of anna: a box needs four finite numbers"),
-        ("source = '0'\nboxes = { 'a b' = [1, 2, 3, 4] }", "'a b' is not a name: expected text of 1 to 64 letters"),
         ("source = '0'\nboxes = [1, 2, 3, 4]", "boxes must be a table, for example { anna = [120, 80, 64, 48] }, got"),
         ("source = '0'\nbox = [1, 2, 3, 4]\nboxes = {}", "box and boxes are mutually exclusive: write all"),
-        ("source = '0'\nbox = [1, 2, 3, 4]\nmodel = 'a'", "box and model of the object without a name are mutually"),
         ("source = '0'\nmodel = 3", "model must be a text, got 3"),
-        ("source = '0'\nsettings = { 'coreset.sise' = 1 }", "there is no setting 'coreset.sise', did you mean 'core"),
-        ("source = '0'\nsettings = { 'coreset.size' = 0 }", "setting coreset.size cannot be 0: it takes int"),
         ("source = '0'\nsettings = { 'run.keys' = 'k' }", "the fleet sets run.keys itself: remove it from the"),
         ("source = '0'\ncores = 0", "cores must be a number above 0, got"),
-        ("source = '0'\ncores = nan", "cores must be a number above 0, got"),
-        ("source = '0'\ncores = true", "cores must be a number above 0, got"),
         ("source = '0'\nlabels = { site = 1 }", 'labels must be a table of texts, for example { site = "north" }, got'),
         ("source = '0'\nwrite = 'a.csv'", "write must be destinations, for example ["),
-        ("source = '0'\nwrite = ['a.txt']", "write: /"),
         ("source = '0'\nwrite = ['-']", "write: there is no standard output: pass a file or an address"),
-        ("source = '0'\nwrite = ['a.mp4']", "write: a video needs its frames once more, but 0 is live"),
-        ("source = '0'\nwrite = ['mqtt://me:secret@host/#']", "write: mqtt://host/?... has no valid topic"),
-        ("source = '0'\nwrite = ['a.csv']\nwhen = 'lost'", "when has no effect on these destinations: omit it, or add"),
-        ("source = '0'\nwrite = ['http://a/b']\nwhen = 'gone'", "when: expected some of found, lost, returned"),
-        ("source = '0'\nwrite = ['http://a/b']\nzone = { door = '0,0 9,9' }", "zone: zone door: a polygon has at"),
-        ("source = '0'\nwrite = ['http://a/b']\nzone = { door = 9 }", "zone must be a table of corners in pixels, for"),
-        ("source = '0'\nwrite = ['http://a/b']\nsecret_file = 'none'", "write: cannot read the key /"),
     ],
 )  # fmt: skip
 def test_an_error_of_a_stream_names_the_stream_and_is_one_line(load, line, error):
@@ -198,14 +152,6 @@ def test_an_error_of_a_stream_names_the_stream_and_is_one_line(load, line, error
         load(f"[streams.good]\nsource = '0'\n[streams.cam-7]\n{line}")
     assert f"site.toml: the stream cam-7: {error}" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(FleetError, match=r"cannot read .*none\.toml: No such file"):
-        FleetSpec.load(tmp_path / "none.toml")
-    (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(FleetError, match=r"a\.toml: this is not TOML"):
-        FleetSpec.load(tmp_path / "a.toml")
 
 
 def test_a_key_that_changes_only_at_the_next_start_is_said():
@@ -252,5 +198,5 @@ def test_the_streams_of_the_example_begin_with_the_boxes_that_they_name():
 def test_the_files_in_the_docs_are_read(load):
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "fleet.md").read_text(encoding="utf-8")
     six, whole = (part.partition("```")[0] for part in page.split("```toml\n")[1:])
-    assert load(six).streams["gate"].options.zone.keys() == {"door"}
+    assert load(six).streams["gate"].options.picture
     assert load(whole).streams["cam-7"].labels == {"site": "north"}

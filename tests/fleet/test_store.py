@@ -9,7 +9,6 @@ import stat
 import threading
 import traceback
 from concurrent.futures import ThreadPoolExecutor
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import httpx
 import obstore
@@ -129,12 +128,6 @@ def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
     assert len({claim.token for claim in claims}) == 8
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\n", "é", "x" * 65])
-def test_an_invalid_name_of_a_stream_is_refused(tmp_path, name):
-    with pytest.raises(FleetError, match="is not a valid name of a stream"):
-        Store(str(tmp_path)).stream(name).claim()
-
-
 def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
     """It may be a file system that is not mounted on this machine."""
     store = Store(str(tmp_path / "share"))
@@ -250,46 +243,14 @@ def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
         store.stream("cam-7").claim()
 
 
-@pytest.fixture
-def answering(monkeypatch):
-    """Let a server of S3 answer each request with a status and an error code."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.server_port}")
-        for name, value in SECRETS.items():
-            monkeypatch.setenv(name, value)
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-
-        def answer(status, code):
-            body = f"<Error><Code>{code}</Code></Error>".encode()
-
-            class Handler(BaseHTTPRequestHandler):
-                def do_PUT(self):
-                    self.rfile.read(int(self.headers["Content-Length"]))
-                    self.send_response(status)
-                    self.send_header("Content-Length", str(len(body)))
-                    self.end_headers()
-                    self.wfile.write(body)
-
-                def log_message(self, *_):
-                    pass
-
-            server.RequestHandlerClass = Handler
-
-        yield answer
-        server.shutdown()
-
-
 @pytest.mark.parametrize(
-    ("status", "code", "said"),
+    ("answer", "said"),
     [
-        (403, "AccessDenied", "answered AccessDenied: check the bucket and its permissions"),
-        (400, "AuthorizationHeaderMalformed", "the bucket is in another region: set AWS_REGION"),
-        (301, "PermanentRedirect", "the bucket is in another region: set AWS_REGION"),
-        (503, "SlowDown", "answered SlowDown"),
-        (409, "ConditionalRequestConflict", "^a$"),  # another process creates it at this moment: it exists
+        ("<Code>AccessDenied</Code>", "answered AccessDenied: check the bucket and its permissions"),
+        ("<Code>AuthorizationHeaderMalformed</Code>", "the bucket is in another region: set AWS_REGION"),
+        ("<Code>SlowDown</Code>", "answered SlowDown"),
+        ("(os error 28)", "No space left on device: free some space there"),
     ],
 )
-def test_an_error_of_the_server_is_named_with_its_remedy(answering, status, code, said):
-    answering(status, code)
-    with pytest.raises(FileExistsError if status == 409 else StoreError, match=said):
-        Store("s3://fleet").create("a", b"")
+def test_an_error_of_the_server_is_named_with_its_remedy(answer, said):
+    assert said in module._trouble(Exception(answer))

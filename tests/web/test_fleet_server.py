@@ -160,21 +160,11 @@ def test_pages_of_streams_are_closed_when_nobody_looks_at_them(fleet, monkeypatc
 
 @pytest.mark.parametrize(
     ("state", "trouble", "answer"),
-    [
-        ("running", "", (200, "running\n")),
-        (
-            "failed",
-            "cannot open rtsp://10.0.0.7 (connection refused)",
-            (503, "failed, cannot open rtsp://10"),
-        ),
-        ("lost", "its source has been lost for 12 s", (503, "lost, its source has been lost for 12 s\n")),
-        ("paused", "", (503, "paused\n")),
-        ("starting", "", (503, "starting\n")),
-    ],
+    [("running", "", (200, "running\n")), ("failed", "cannot open walk.mp4", (503, "failed, cannot open walk.mp4\n"))],
 )
 def test_the_first_question_whether_a_stream_is_ready_is_answered(fleet, serve_fleet, state, trouble, answer):
     fleet.stream("cam-7", state=state, trouble=trouble)
     page = serve_fleet()
     ready = page.get("/streams/cam-7/readyz")
-    assert (ready.status_code, ready.text[: len(answer[1])]) == answer
+    assert (ready.status_code, ready.text) == answer
     assert page.get("/streams/cam-8/readyz").status_code == 404
