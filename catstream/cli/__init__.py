@@ -24,7 +24,7 @@ COMMANDS = {
     "batch": ("batch", "Track objects in many videos."),
     "demo": ("measure", "Track an object in a rendered demo video."),
     "find": ("models", "Find the objects of saved models in videos, folders and images."),
-    "evaluate": ("measure", "Measure accuracy on annotated sequences, also of other trackers."),
+    "evaluate": ("measure", "Measure the accuracy on annotated sequences."),
     "loadtest": ("loadtest", "Run pipelines under load, and measure latency and losses."),
     "watch": ("attach", "Print the messages of a running pipeline."),
     "view": ("view", "Watch and control a running pipeline in a browser."),
