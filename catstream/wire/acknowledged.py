@@ -87,7 +87,7 @@ class Sender(ChannelSocket[Message]):
     def poll(self, seconds: float) -> None:
         """Process acknowledgements, waiting at most this long for the first; retransmit what is missing.
 
-        Errors are those of `SendWindow.receive`.
+        Raises the errors of `SendWindow.receive`.
         """
         while self._wait(seconds):
             position = self._decode(self._socket.recv(), Position)

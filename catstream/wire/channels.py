@@ -8,10 +8,10 @@
                sees by `frame` how many
     results    the tracks again, one message a frame, for the program that started the pipeline, its owner
     health     the newest of each process
-    previews   small pictures of the newest frame; none is made while nobody subscribes
+    previews   small pictures of the newest frame, made only for a subscriber
     control    commands and their answers; a command without an answer is sent again, and executed once
-    saved-models   the coreset trees of each object as a file, the newest; none is made while nobody subscribes
-    features   a copy of these messages, to any number of subscribers; nothing is sent while there is none
+    saved-models   the newest coreset trees of each object as a file, made only for a subscriber
+    features   a copy of the training rows, sent only if there is a subscriber
 
 The controller of a fleet has an endpoint of its own, with one channel:
 

@@ -11,8 +11,8 @@ A message is one frame of msgpack, `[version, kind, object, run, fields]`:
     a box     [x, y, w, h]
     an array  {"dtype": "<f4" | "<f8", "shape": [...], "data": bytes, row by row, little-endian}
 
-Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may take one kind of
-message, or that of one object.
+Version, kind and object are the first bytes of a message, and thus its topic: a subscriber may select one kind of
+message, and one object.
 
 msgpack packs and unpacks the bytes, within limits on the length of every text, list and map and on the number of all
 entries; msgspec converts the values to the fields of their kind, and skips what is not one of them. A sender checks
@@ -38,14 +38,14 @@ Message = TypeVar("Message")
 #: Version of the envelope and of the meaning of the fields.
 VERSION = 5
 
-#: Kinds of message, by their name on the wire: those of the channels, and the reply on an acknowledged one.
+#: Kinds of message on all channels, and the reply on an acknowledged one, by their name on the wire.
 KINDS: dict[str, type] = {
     kind.__name__.lower(): kind for channel in (*CHANNELS.values(), REGISTRY) for kind in channel.messages
 } | {"position": Position}
 
 _MOST_ENTRIES = 1 << 18  # of all lists and maps of a message, which take 25 MB at most; the schema allows 2**17
 _TOPIC_BYTES = 512  # that contain version, kind and object
-_BYTES = (bytes, memoryview)  # msgspec leaves them as they are; it would take a text for bytes, too
+_BYTES = (bytes, memoryview)  # msgspec leaves them as they are; by default it would accept text for bytes
 
 
 class Topic(NamedTuple):
@@ -162,7 +162,7 @@ def _unpack(data: bytes | memoryview) -> _Envelope:
             max_ext_len=0,
         )
         return msgspec.convert(values, _Envelope)
-    except ValueError as error:  # msgpack raises no other, and that of msgspec is one
+    except ValueError as error:  # msgpack raises no other, and the error of msgspec is a ValueError
         raise ProtocolError(
             f"expected [version, kind, object, run, fields] in msgpack: {str(error) or type(error).__name__}"
         ) from None

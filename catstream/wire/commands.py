@@ -49,7 +49,7 @@ class Requester(ChannelSocket[Question | Answer], Generic[Question, Answer]):
         # With ZMQ_IMMEDIATE, which queues nothing before there is a connection, libzmq would also drop an answer that
         # was not read yet if the connection ends, as after "stop".
         self._is_connected = False
-        self._socket.set(zmq.LINGER, 0)  # a question that nobody received is given up
+        self._socket.set(zmq.LINGER, 0)  # a question without a receiver is dropped
         self._connect()
 
     def ask(self, question: Question, seconds: float) -> Answer | None:
@@ -131,7 +131,7 @@ class Responder(ChannelSocket[Question | Answer], Generic[Question, Answer]):
             self._send(peer, data)
 
     def _accept(self, question: Question, peer: bytes) -> bool:
-        """Note who asks; returns whether the question has to be answered. One that was answered is answered again."""
+        """Note the peer; returns whether the question is new. An earlier answer is repeated."""
         if (answer := self._answers.get(question.id)) is not None:
             self._send(peer, answer)
             return False

@@ -1,6 +1,6 @@
-"""How processes of a user find one another: private folders with notes of the pipelines and fleets that run.
+"""How processes of a user find one another: private folders with notes of the running pipelines and fleets.
 
-A note is a file that is locked as long as its process lives, so that what a killed process left is recognised.
+A note is a file that is locked as long as its process lives, so that stale notes of killed processes are detected.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ PORTS = range(21000, 32000, 1 + max(channel.port + len(channel.senders) for chan
 _PREFIX = "catstream-"  # of private folders
 _OWNER = "owner"  # file in a private folder, locked while its owner lives
 _NOTE = "endpoint"  # note in the private folder of a running pipeline: its endpoint, folder of keys, and source
-_FLEET_NOTE = "fleet-endpoint"  # note in that of the controller of a fleet: its endpoint, folder of keys, and name
+_FLEET_NOTE = "fleet-endpoint"  # the same of the controller of a fleet: its endpoint, folder of keys, and name
 _ANY_BYTES = "surrogateescape"  # in notes: the name of a file need not be UTF-8
 
 
 @contextlib.contextmanager
 def private_folder() -> Iterator[Path]:
-    """A new folder that only this user may enter, removed afterwards; also removes those of killed processes.
+    """A new folder that only this user may enter, removed afterwards; also removes the folders of killed processes.
 
     It is locked, as programs that remove old temporary files leave a locked folder alone (systemd-tmpfiles).
     """
@@ -165,7 +165,7 @@ def _notes(folders: Iterable[Path], pattern: str) -> Iterator[tuple[Path, str | 
     """This user's notes of a pattern: path and text of each, None as the text if the process that locked it is dead."""
     for folder in folders:
         for path in folder.glob(pattern):
-            # It may be removed by now, or belong to another user.
+            # It may have been removed, or belong to another user.
             with contextlib.suppress(OSError), path.open(encoding="utf-8", errors=_ANY_BYTES) as file:
                 if os.fstat(file.fileno()).st_uid == os.geteuid():
                     yield path, file.read() if is_locked(file.fileno()) else None

@@ -108,7 +108,7 @@ class Endpoint:
         protocol, _, rest = address.partition("://")
         host, _, port = rest.rpartition(":")
         if protocol == "ipc" or not (numbers := _resolved(host)):
-            return address  # ZeroMQ reports what is wrong with it
+            return address  # ZeroMQ reports the error
         number = numbers.get(socket.AF_INET) or f"[{numbers[socket.AF_INET6]}]"
         return f"tcp://{number}:{port}"
 
@@ -172,5 +172,5 @@ def is_too_long(folder: Path) -> bool:
 
 
 def socket_files(folder: Path) -> Iterator[Path]:
-    """The socket of each channel in a folder, that of the registry too."""
+    """The socket of each channel in a folder, and of the registry."""
     return (folder / _file(channel, sender) for channel in (*CHANNELS.values(), REGISTRY) for sender in channel.senders)

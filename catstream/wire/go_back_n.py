@@ -6,10 +6,10 @@ connects the machines to sockets.
 The sender numbers its messages 1, 2, 3 ... (`seq`). It keeps a copy of each until the receiver acknowledges
 it: at most `size` copies, and no further one once they take 256 MiB. The receiver delivers each message to the
 application once and in order, and replies with a `Position` once the application has processed it: the sender drops its
-copies of what is stored.
+copies of stored messages.
 
-If a message is missing, or a sender asks for the position on another connection than that of the last message, the
-reply says `again`: the sender transmits all messages after `processed` again. On the same connection none is lost; for
+If a message is missing, or a sender asks for the position on another connection than the last message, the reply
+says `again`: the sender transmits all messages after `processed` again. On the same connection none is lost; for
 the same reason the sender goes back once for several such replies. It asks if it was restarted, and after
 `PATIENCE_SECONDS` without a reply while messages wait. So either side may be restarted, any connection may break, and
 any reply may be lost: each message is still delivered once, in order. The end of the stream is delivered at any `seq`

@@ -1,13 +1,12 @@
-"""Published channels, all that no single process receives: any number of subscribers.
+"""Publish/subscribe channels with any number of subscribers.
 
 The publisher binds an XPUB socket, subscribers connect SUB sockets. They subscribe to everything (the empty topic), to
 one kind of message, or to the messages of one kind about one object (the bytes that these messages begin with, see
-`catstream.wire.codec.opening`). The publisher never waits for a subscriber: one that falls too far behind misses
-messages.
+`catstream.wire.codec.opening`). The publisher never waits for a subscriber: a slow one misses messages.
 
-If a channel keeps the newest message, it keeps that of each object. They are sent to late joiners, and every second to
-all: a burst may have cost a subscriber the last ones. A `Subscriber` drops repeats. No more are repeated at once than
-half the queue of a subscriber holds; the others take their turn.
+If a channel keeps the newest message, the newest of each object is sent to late joiners, and once per second to all
+subscribers, because a burst may have cost one of them the last messages. A `Subscriber` drops repeats. At most half as
+many messages as fit into the queue of a subscriber are repeated at once.
 
 The number of topics that a peer can make either side remember is limited.
 """
@@ -39,16 +38,16 @@ Message = TypeVar("Message")
 
 
 class Publisher(ChannelSocket[Message]):
-    """Sends to all subscribers, and waits for none; `sender` is one of the channel's senders if there are several."""
+    """Publishes without blocking on slow subscribers; `sender` is one of the channel's senders if there are several."""
 
     def __init__(self, channel: Channel[Message], endpoint: Endpoint, sender: str | None = None) -> None:
         self._newest = channel.keeps == "newest"
         super().__init__(zmq.XPUB, channel, endpoint, channel.high_water_mark)
         self._socket.set(zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES)
-        self._socket.set(zmq.XPUB_VERBOSE, 1)  # report every subscription, also one that another subscriber has
+        self._socket.set(zmq.XPUB_VERBOSE, 1)  # report every subscription, not only the first of a topic
         self._kinds = tuple(map(opening, channel.messages))  # the beginnings of topics that may be subscribed to
         self._subscribed: set[bytes] = set()
-        self._last: dict[Topic, bytes] = {}  # the messages for late joiners; the one that was sent last is the last
+        self._last: dict[Topic, bytes] = {}  # the messages for late joiners, in the order of sending
         self._repeat_at = 0.0
         self._bind(sender)
 
@@ -58,7 +57,7 @@ class Publisher(ChannelSocket[Message]):
         return not self._subscribed <= {_END}
 
     def send(self, message: Message) -> None:
-        """Send to all subscribers; on a channel that keeps the newest message, later to late joiners too."""
+        """Send to all subscribers; on a channel that keeps the newest message, also to late joiners."""
         self.serve_late_joiners()
         if not (self._newest or self._subscribed):
             return
@@ -114,7 +113,7 @@ class Publisher(ChannelSocket[Message]):
 
 
 class Subscriber(ChannelSocket[Message]):
-    """Receives what is published from now on; if the channel keeps the newest message, the last ones first.
+    """Receives messages that are published from now on; if the channel keeps the newest message, the last ones first.
 
     If the channel keeps the newest message, older ones of the same object are passed over. The objects take turns: the
     message of the object that has waited longest is received first. `only` limits it to one kind of message, and
@@ -144,7 +143,7 @@ class Subscriber(ChannelSocket[Message]):
         return bool(self._arrived) or super().pending()
 
     def receive(self, seconds: float) -> Message | None:
-        """The next message, None if none arrived in time; repeats and what is rejected are passed over."""
+        """The next message, None if none arrived in time; repeats and invalid messages are skipped."""
         deadline = monotonic() + seconds
         while (data := self._next_data(deadline)) is not None:
             message = self._decode(data, *self.channel.messages)

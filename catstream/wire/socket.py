@@ -51,7 +51,7 @@ Message = TypeVar("Message")
 Kind = TypeVar("Kind")
 
 _OPEN: WeakSet[ChannelSocket[Any]] = WeakSet()  # sockets that were not closed yet
-_ZAP = ZapHandler()  # libzmq asks one for each context
+_ZAP = ZapHandler()  # ZAP handlers are per context
 
 
 @cache
@@ -63,7 +63,7 @@ def context() -> zmq.Context[zmq.Socket[bytes]]:
 
 
 def _begin_copy() -> None:
-    """Begin without the context and the threads of the process of which this one is a copy."""
+    """Drop the ZeroMQ context and threads inherited through fork."""
     global _ZAP
     context.cache_clear()
     _OPEN.clear()
@@ -74,7 +74,7 @@ after_fork(_begin_copy)
 
 
 def _too_many(error: zmq.ZMQError) -> ServiceError:
-    """The error for a socket that ZeroMQ could not make: it has its files, and those of its monitor."""
+    """The error for a socket that ZeroMQ could not make: each socket and its monitor need files."""
     return ServiceError(
         f"cannot open a socket ({error.strerror}): close the subscriptions and pipelines that are not needed, "
         "or raise the limit of open files (ulimit -n)"
@@ -129,7 +129,7 @@ class ChannelSocket(Generic[Message]):
         return int(self._socket.get(zmq.FD))
 
     def close(self) -> None:
-        """Transmit what is queued, then close; the address is free for the next socket."""
+        """Transmit queued messages, then close; the address is free for the next socket."""
         if forked(self._generation):  # this process lacks ZeroMQ's threads
             return
         if self._listens:
@@ -174,7 +174,7 @@ class ChannelSocket(Generic[Message]):
                 self._socket.set(zmq.CURVE_SERVER, 1)
                 self._domain = _ZAP.register(context(), self.channel, keys)
                 self._socket.set(zmq.ZAP_DOMAIN, self._domain)
-                self._socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without a ZAP handler nobody may connect
+                self._socket.set(zmq.ZAP_ENFORCE_DOMAIN, 1)  # without a ZAP handler, all clients are rejected
             if self._endpoint.is_in_use(self.channel, sender):
                 raise zmq.ZMQError(zmq.EADDRINUSE)
             self._monitor = Monitor(self._socket)
