@@ -22,7 +22,7 @@ from catstream.base.names import split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import CommandGroup, screen, table
 from catstream.cli.options import PATH, with_json
-from catstream.cli.view import HostPort, fleet_view, with_token, with_view
+from catstream.cli.view import HostPort, fleet_view, token_of_page, with_view
 from catstream.client.address import Address
 from catstream.errors import FleetError
 from catstream.messages.kinds import FleetStatus, StreamStatus
@@ -78,9 +78,8 @@ def with_fleet(command: Callable[..., None]) -> Callable[..., None]:
 @fleet.command(short_help="Start the streams of a file, or apply its changes.")
 @click.argument("file", type=PATH)
 @with_view
-@with_token("view-")
 @with_fleet
-def up(running: Fleet, view: HostPort | None, token: str | None) -> None:
+def up(running: Fleet, view: HostPort | None) -> None:
     """Start the streams of FILE, or apply its changes to a fleet that runs.
 
     On a cluster of Ray (--address), or if the fleet runs already, the command
@@ -100,13 +99,13 @@ def up(running: Fleet, view: HostPort | None, token: str | None) -> None:
         click.echo(line)
     with ExitStack() as stack, suppress(KeyboardInterrupt):
         if view is not None:
-            _serve(running, view, token, stack)
+            _serve(running, view, stack)
         _watch(screen(), running)
     if running.is_owner and running.is_running:
         _down(running)
 
 
-def _serve(fleet: Fleet, view: HostPort, token: str | None, stack: ExitStack) -> None:
+def _serve(fleet: Fleet, view: HostPort, stack: ExitStack) -> None:
     """Serve the page of a fleet that ends with this command until the stack is left."""
     from catstream.web.server import Server
     from catstream.web.wall import Wall
@@ -114,7 +113,7 @@ def _serve(fleet: Fleet, view: HostPort, token: str | None, stack: ExitStack) ->
     if not fleet.is_owner:
         raise click.UsageError("--view needs a fleet that ends with this command: use catstream fleet view")
     server = Server(
-        Wall(Address(fleet=fleet.name)), host=view.host, port=view.port, token=token, attempts=view.attempts
+        Wall(Address(fleet=fleet.name)), host=view.host, port=view.port, token=token_of_page(), attempts=view.attempts
     )
     stack.enter_context(server.in_background())
     for url in server.urls:

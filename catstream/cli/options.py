@@ -45,7 +45,7 @@ with_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 with_keys = click.option(
     "--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline or fleet requires keys."
 )
-with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video file.")
+with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video.")
 
 
 def _collect(flag: str, convert: _Converter) -> Callable[..., object]:
@@ -76,14 +76,14 @@ def with_files(flag: str, argument: str, help: str) -> Decorator:
     return _by_name(flag, argument, "[NAME=]FILE", lambda files: {name: Path(files[name]) for name in files}, help)
 
 
-with_model = with_files("--model", "models", "Model of an object, written by `catstream save`.")
+with_model = with_files("--model", "models", "Search for the object of a saved model.")
 
 #: Adds boxes as the argument `boxes`, a dict by name.
 with_boxes = click.argument(
     "boxes", nargs=-1, required=True, metavar="[NAME=]X,Y,W,H...", callback=_collect("", boxes_by_name)
 )
 
-_HELP = "An object in the first frame, in pixels; may be repeated with names."
+_HELP = "An object in the first frame; repeatable."
 _with_box = _by_name("--box", "boxes", "[NAME=]X,Y,W,H", boxes_by_name, _HELP)
 
 
@@ -128,7 +128,7 @@ with_overrides = combined(
     "overrides",
     lambda file, preset, pairs: Settings.collect(preset=preset, file=file, overrides=pairs),
     click.option("--settings", "file", type=PATH, help="TOML file of settings."),
-    click.option("--preset", type=click.Choice(list(PRESETS)), help="A named set of settings."),
+    click.option("--preset", type=click.Choice(list(PRESETS)), metavar="NAME", help=f"Settings: {', '.join(PRESETS)}."),
     click.option("--set", "pairs", multiple=True, metavar="GROUP.NAME=VALUE", help="Set one setting; repeatable."),
 )
 
@@ -136,16 +136,9 @@ with_overrides = combined(
 with_settings = combined("settings", lambda overrides: Settings.from_values(overrides), with_overrides)
 
 
-def _reading(overrides: dict[str, object], fps: float | None, skip_damaged: bool, resize: bool) -> dict[str, object]:
-    values = {"run.image_rate": fps, "run.skip_damaged": skip_damaged or None, "run.resize": resize or None}
-    return overrides | {name: value for name, value in values.items() if value is not None}
-
-
-#: Adds `--fps`, `--skip-damaged` and `--resize`, settings for reading a source, to the argument `overrides`.
+#: Adds `--skip-damaged`, a setting for reading a source, to the argument `overrides`.
 with_reading = combined(
     "overrides",
-    _reading,
-    click.option("--fps", type=float, metavar="N", help="Frames per second of a folder of images; 25 by default."),
+    lambda overrides, skip_damaged: overrides | ({"run.skip_damaged": True} if skip_damaged else {}),
     with_skip_damaged,
-    click.option("--resize", is_flag=True, help="Scale frames of another size to the first size."),
 )

@@ -71,14 +71,19 @@ def _token_of_user() -> str:
     return token
 
 
-def with_token(prefix: str = "") -> Decorator:
-    """Add --PREFIXtoken; the argument `token` is by default the token of the user, and None for "none"."""
+def token_of_page(token: str | None = None) -> str | None:
+    """Return a token, or else the variable VIEW_TOKEN, or the token of the user; None for "none"."""
+    token = token or os.environ.get("VIEW_TOKEN")
+    return None if token == _OPEN else token or _token_of_user()
+
+
+def with_token() -> Decorator:
+    """Add --token, as the argument `token` of `token_of_page`."""
     return combined(
         "token",
-        lambda token: None if token == _OPEN else token or _token_of_user(),
+        token_of_page,
         click.option(
-            f"--{prefix}token",
-            "token",
+            "--token",
             envvar="VIEW_TOKEN",
             show_envvar=True,
             metavar="TOKEN",
@@ -95,7 +100,7 @@ with_view = click.option(
     is_flag=False,
     flag_value=f"{PORT}+",
     metavar="[[HOST:]PORT]",
-    help=f"Serve a web page; default: port {PORT}, or the next free one.",
+    help=f"Serve a web page; default: port {PORT} or the next.",
 )
 
 #: Adds `--listen`.

@@ -266,7 +266,7 @@ def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: 
         return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
     raise VideoError(
         f"all images of a source need one size: {str(path)!r} (frame {number}) is {image.shape[1]}x{image.shape[0]}, "
-        f"the first {shape[1]}x{shape[0]}: --resize (run.resize=true) scales it to that"
+        f"the first {shape[1]}x{shape[0]}: --set run.resize=true scales it to that"
     )
 
 

@@ -4,53 +4,51 @@ import os
 import signal
 import subprocess
 import sys
-from io import StringIO
 from types import SimpleNamespace
 
 import pytest
-from rich.console import Console
 
 from catstream.base.box import Box
 from catstream.cli.common import Interrupts
-from catstream.cli.track import RunProgress
+from catstream.cli.progress import RunProgress
 from catstream.messages.kinds import Track
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
-def shown(width, seen, **pipeline):
-    """What the line of a pipeline shows while the tracks of some frames come, and its run."""
-    pipeline = SimpleNamespace(lost_seconds=0, holding="", totals={}, restarts=0, **pipeline)
-    written, run = StringIO(), RunProgress(pipeline)
-    console = Console(file=written, width=width, force_terminal=True, color_system=None, soft_wrap=True)
-    with run.line(console) as progress:
-        for tracks in seen:
-            run.show(progress, tracks)
-        progress.refresh()
-    return written.getvalue(), run
+def counted(seen, **pipeline):
+    """The progress of a run after the tracks of some frames."""
+    progress = RunProgress(SimpleNamespace(lost_seconds=0, holding="", totals={}, restarts=0, **pipeline))
+    for tracks in seen:
+        progress.count(tracks)
+    return progress
 
 
 @pytest.mark.parametrize("live", [False, True], ids=["file", "live"])
-@pytest.mark.parametrize("width", [40, 80, 200])
-def test_line_fits_and_begins_with_the_state_and_the_frames(width, live):
+def test_line_begins_with_the_state_and_the_frames(live):
     health = {"detector": {"skipped": 1234.0}, "compressor": {"leaves": 456.0}}
     track = Track(0, 0.0, "bootstrapping", None, -12.25, 12345)
-    written, _ = shown(width, [{"": track}], live=live, frames=None if live else 30000, health=health)
-    lines = [part for part in written.replace("\x1b[2K", "\r").split("\r") if "bootstrapping" in part]
-    line = lines[-1].split("\n")[0].split("\x1b")[0].rstrip()
-    assert len(line) <= width
-    assert line.startswith("bootstrapping")
-    assert ("1/30000" in line) != live
-    assert ("12345" in line) == (width >= 80)
+    line = counted([{"": track}], live=live, frames=None if live else 30000, health=health).line()
+    assert line.startswith("bootstrapping 1  " if live else "bootstrapping 1/30000  ")
+    assert line.endswith(f"{'  1234 skipped' * live}  score -12.25  model 12345  456 leaves")
+
+
+def test_line_says_why_no_frame_is_tracked():
+    progress = counted([], live=True, frames=None, health={})
+    assert progress.line() == "starting"
+    progress._pipeline.holding = "paused"
+    assert progress.line() == "paused"
+    progress._pipeline.lost_seconds = 12.0
+    assert progress.line() == "lost 12 s"
 
 
 def test_of_several_objects_the_line_has_the_scores_and_the_summary_a_line_for_each():
     anna = [Track(0, 0.0, "present", box, 0.9, 7, object="anna") for box in (Box(1, 2, 30, 40), None)]
     ben = Track(0, 0.0, "absent", None, 0.1, 4, object="ben")
-    written, run = shown(120, [{"anna": each, "ben": ben} for each in anna], live=False, frames=9, health={})
-    assert "1/2 present" in written
-    assert "anna +0.90  ben +0.10" in written
-    assert run.summary([]).splitlines()[1:] == [
+    progress = counted([{"anna": each, "ben": ben} for each in anna[::-1]], live=False, frames=9, health={})
+    assert progress.line().startswith("1/2 present   2/9")
+    assert "anna +0.90  ben +0.10" in progress.line()
+    assert progress.summary([]).splitlines()[1:] == [
         "  anna: present in 1 of 2 frames, model version 7",
         "  ben: present in 0 of 2 frames, model version 4",
     ]

@@ -14,11 +14,10 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from rich.console import Console
 
 from catstream.base.box import Box
-from catstream.cli import track as track_module
-from catstream.cli.track import RunProgress
+from catstream.cli import progress as progress_module
+from catstream.cli.progress import RunProgress
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
 from catstream.sinks.track_log import LineSink, Log
@@ -144,10 +143,10 @@ def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succee
         for frame, _ in zip(film, range(12), strict=False):
             cv2.imwrite(str(images / f"{frame.number}.png"), frame.image[: -8 if frame.number == 10 else None])
     error = fail("track", images, "--box", box, "--output", tmp_path / "out")
-    assert all(word in error for word in ("one size", "10.png", "--resize"))
+    assert all(word in error for word in ("one size", "10.png", "--set run.resize=true"))
     assert len(frames_of(tmp_path / "out", "walk")) == 10
     files = ["--output", tmp_path / "all", "--video"]
-    succeed("track", images, "--box", box, *files, "--resize")
+    succeed("track", images, "--box", box, *files, "--set", "run.resize=true")
     assert len(frames_of(tmp_path / "all", "walk")) == 12
     with open_source(tmp_path / "all" / "walk.mp4") as film:
         assert sum(1 for _ in film) == 12
@@ -234,7 +233,7 @@ def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, s
         tracking.extend(running())
         close(sink)
 
-    monkeypatch.setattr(RunProgress, "show", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(RunProgress, "count", lambda *_: signal.raise_signal(signal.SIGINT))
     monkeypatch.setattr(LineSink, "close", closed)
     source, box = video
     code, _, errors = said("track", source, "--box", box, "--write", tmp_path / "t.ndjson")
@@ -274,15 +273,14 @@ def test_a_run_that_starts_paused_says_how_to_resume_it(video, succeed, monkeypa
 
 def test_time_in_which_a_run_waits_counts_neither_for_its_first_track_nor_its_rate(monkeypatch):
     seconds = [100.0]
-    monkeypatch.setattr(track_module.time, "perf_counter", lambda: seconds[0])
+    monkeypatch.setattr(progress_module.time, "perf_counter", lambda: seconds[0])
     pipeline = SimpleNamespace(holding="", live=False, frames=9, health={}, totals={}, restarts=0)
-    progress, console = RunProgress(pipeline), Console(quiet=True)
+    progress = RunProgress(pipeline)
     track = SimpleNamespace(box=None, model_version=1, state="lost", score=0.0)
-    with progress.line(console) as line:
-        for passed, holding in [(0.5, ""), (190.0, "waiting"), (0.5, ""), (2.0, None), (60.0, "paused"), (2.0, None)]:
-            seconds[0] += passed
-            pipeline.holding = holding or ""
-            progress.idle() if holding is not None else progress.show(line, {"": track})
+    for passed, holding in [(0.5, ""), (190.0, "waiting"), (0.5, ""), (2.0, None), (60.0, "paused"), (2.0, None)]:
+        seconds[0] += passed
+        pipeline.holding = holding or ""
+        progress.idle() if holding is not None else progress.count({"": track})
     assert "2 frames, present in 0, 0 frames/s, first track after 3.00 s" in progress.summary([])
     assert progress._seconds() == pytest.approx(2.0)
 

@@ -442,7 +442,10 @@ def test_a_folder_opens_by_its_only_video(video, tmp_path):
 
 HUGE = bytes.fromhex("424d") + bytes(8) + struct.pack("<IIiiHHIIIIII", 54, 40, 40000, 40000, 1, 24, *(0,) * 6)
 UNREADABLE = {
-    "of another size": (cv2.imencode(".png", numbered(3, width=150))[1].tobytes(), ["150x120", "160x120", "--resize"]),
+    "of another size": (
+        cv2.imencode(".png", numbered(3, width=150))[1].tobytes(),
+        ["150x120", "160x120", "run.resize=true"],
+    ),
     "a text": (b"nothing", ["cannot read the image", "(frame 3): replace or remove it"]),
     "empty": (b"", ["cannot read the image"]),
     "a JPEG that is cut off": (cv2.imencode(".jpg", numbered(3))[1].tobytes()[:-500], ["cannot read the image"]),

@@ -73,10 +73,9 @@ def test_a_malformed_address_is_an_error(text):
         HostPortType().convert(text, None, None)
 
 
-@pytest.mark.parametrize("prefix", ["", "view-"])
-def test_the_token_of_a_page_is_from_an_option_or_a_variable_or_that_of_the_user(prefix, tmp_path, monkeypatch):
+def test_the_token_of_a_page_is_from_an_option_or_a_variable_or_that_of_the_user(tmp_path, monkeypatch):
     @click.command()
-    @with_token(prefix)
+    @with_token()
     def command(token):
         click.echo(str(token))
 
@@ -93,8 +92,8 @@ def test_the_token_of_a_page_is_from_an_option_or_a_variable_or_that_of_the_user
     assert says() != made[0], "others may have read it"
     monkeypatch.setenv("XDG_STATE_HOME", "/dev/null")
     assert says() != says(), "it cannot be kept"
-    assert says(f"--{prefix}token", "none") == "None\n"
-    assert says(f"--{prefix}token", "given-on-the-line", VIEW_TOKEN="from-a-variable-1") == "given-on-the-line\n"
+    assert says("--token", "none") == "None\n"
+    assert says("--token", "given-on-the-line", VIEW_TOKEN="from-a-variable-1") == "given-on-the-line\n"
     assert says(VIEW_TOKEN="from-a-variable-1") == "from-a-variable-1\n"
 
 
