@@ -111,7 +111,7 @@ def test_objects_that_come_and_go_do_not_affect_one_another(frames, lives):
     ],
     ids=["outside", "an old one and an empty one", "a bad name", "too many"],
 )
-def test_if_one_box_of_several_is_refused_it_is_named_and_nothing_changes(frames, begin, error, why):
+def test_invalid_box_of_several_is_named_and_changes_nothing(frames, begin, error, why):
     tracker, other = started(frames, settings={"run.max_objects": 4}), started(frames)
     with pytest.raises(error, match=why):
         tracker.update(frames[1], begin=begin)

@@ -38,7 +38,7 @@ def test_an_object_that_is_easy_to_track_is_checked_from_two_boxes(demo, both_en
     assert both_ends.next_frame() is None
 
 
-def test_after_one_box_the_rest_is_tracked_unchecked_and_the_last_frame_is_asked_for(demo):
+def test_single_box_leaves_the_other_frames_unchecked(demo):
     video, truth = demo
     with annotate(video, {3: truth[3]}, jobs=1) as annotation:
         assert all(track.box is not None for track in annotation.tracks[""])
@@ -87,7 +87,7 @@ def test_the_model_of_a_box_is_trained_once(both_ends, monkeypatch):
     assert second_pass() == trained
 
 
-def test_where_an_object_is_absent_it_has_no_box(demo):
+def test_absent_object_has_no_box(demo):
     video, truth = demo
     with annotate(video, {0: truth[0], FRAMES - 1: None}, jobs=1) as annotation:
         assert annotation.tracks[""][-1].state == "absent"

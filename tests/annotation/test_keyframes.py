@@ -37,7 +37,7 @@ def test_the_error_of_a_malformed_file_names_its_line(tmp_path, line):
         read_keyframes(tmp_path / "boxes.csv")
 
 
-def test_a_file_that_does_not_exist_is_an_error_of_one_line(tmp_path):
+def test_missing_file_of_keyframes_is_an_error_of_one_line(tmp_path):
     with pytest.raises(VideoError, match="cannot read the boxes"):
         read_keyframes(tmp_path / "boxes.csv")
 

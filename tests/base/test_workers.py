@@ -51,7 +51,7 @@ def test_workers_remain_between_tasks_and_end_when_they_are_closed():
     assert not multiprocessing.active_children()
 
 
-def test_after_a_caller_stopped_early_others_are_started():
+def test_workers_are_started_again_after_a_caller_stopped_early():
     with closing(Workers(1)) as workers:
         stopped = workers.run(os.getpid, [(), ()])
         first = next(stopped)

@@ -73,7 +73,8 @@ def test_run_without_a_box_waits_for_set_box_and_resume(video, catstream, steer,
     assert status()["state"] == "paused"
     until(lambda: steer("save", tmp_path / "one")[0] == 0)  # once there is a model of the frame of the box
     assert SavedModel.load(tmp_path / "one").model.frame == 0
-    assert steer("resume") == (0, "resumed after frame 0")
+    assert steer("set-box", box, "--keep") == (0, f"the same object continues at {box} in frame 1")
+    assert steer("resume") == (0, "resumed after frame 1")
     errors = run.communicate(timeout=120)[1]
     assert run.returncode == 0, errors
     (hint,) = (line for line in errors.splitlines() if line.startswith("waiting for a box: "))

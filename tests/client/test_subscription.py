@@ -256,7 +256,7 @@ def test_a_reader_that_is_slow_knows_how_old_its_tracks_are(endpoint, tracks, un
         assert subscription.behind == 0
 
 
-def test_who_asks_for_the_newest_gets_that_of_each_object_and_then_the_end(endpoint, tracks):
+def test_newest_subscription_yields_the_last_track_of_each_object_and_the_end(endpoint, tracks):
     with attached(endpoint, tracks, newest=True) as subscription:
         for seq in range(2, 50):
             for name in ("anna", "ben"):

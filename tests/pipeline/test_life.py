@@ -26,7 +26,7 @@ def pipeline(video):
     return Pipeline(path, str(boxes[0]), SETTINGS, part=PART)
 
 
-def test_it_is_iterated_without_with_and_leaves_no_process(pipeline):
+def test_pipeline_iterated_without_with_leaves_no_process(pipeline):
     assert [track.frame for track in pipeline] == list(range(20))
     assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (20, 20)
     assert not pipeline.pids
@@ -45,7 +45,7 @@ def test_a_loop_that_is_left_ends_the_run(pipeline, alive):
     prints_well_and_is_ready_for_json(first)
 
 
-def test_in_a_with_it_is_iterated_piece_by_piece_and_afterwards_no_more(pipeline):
+def test_pipeline_is_iterated_in_parts_inside_a_with(pipeline):
     with pipeline:
         first = next(iter(pipeline))
         assert [first.frame, *(track.frame for track in pipeline)] == list(range(20))

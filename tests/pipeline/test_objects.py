@@ -39,9 +39,7 @@ def expected(video, objects):
 
 
 @pytest.mark.parametrize("victims", [{}, {5: "detector", 12: "compressor", 20: "trainer"}], ids=["none", "each"])
-def test_in_lockstep_three_objects_are_as_in_one_process_whichever_process_dies(
-    video, objects, expected, folder, tcp, victims
-):
+def test_lockstep_gives_the_tracks_of_one_process_if_processes_die(video, objects, expected, folder, tcp, victims):
     create(folder / "keys")
     settings = Settings(run={"lockstep": True, "keys": str(folder / "keys"), "endpoint": tcp})
     tracks = []

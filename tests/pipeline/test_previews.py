@@ -43,13 +43,13 @@ def test_a_preview_shows_the_frame_small_and_contains_its_size(previews, looks):
     assert cv2.PSNR(shown, cv2.resize(image, (640, 360), interpolation=cv2.INTER_AREA)) > 28
 
 
-def test_none_is_made_while_nobody_looks(previews, monkeypatch):
+def test_preview_is_not_encoded_without_subscribers(previews, monkeypatch):
     monkeypatch.setattr("catstream.processes.outputs.jpeg", None)  # to call it is an error
     for frame in range(5):
         previews.show(frame, Frame(frame, frame / 25, np.zeros((48, 64, 3), np.uint8)), {})
 
 
-def test_frames_are_shown_while_no_object_is_tracked_although_their_number_stays(previews, looks, until):
+def test_previews_continue_while_no_object_is_tracked(previews, looks, until):
     seen = []
     with looks() as reader:
         reader.timeout = 0
@@ -59,7 +59,7 @@ def test_frames_are_shown_while_no_object_is_tracked_although_their_number_stays
     assert [_grey(preview) for preview in seen] == [0, 255]
 
 
-def test_the_frames_of_the_pictures_of_five_seconds_are_kept_while_somebody_looks(endpoint, until, monkeypatch):
+def test_frames_of_previews_are_kept_for_five_seconds_while_there_are_subscribers(endpoint, until, monkeypatch):
     monkeypatch.setattr("catstream.processes.outputs._PREVIEW_SECONDS", 0.0)
     with Previews(endpoint, stores=True) as previews:
         with subscribe(str(endpoint), "previews", timeout=150):

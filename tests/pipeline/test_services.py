@@ -136,7 +136,7 @@ def test_a_process_that_dies_repeatedly_ends_the_pipeline(video, folder, monkeyp
     assert restarts == 6
 
 
-def test_processes_that_hang_are_detected_and_replaced_while_the_program_waits_too(video, until):
+def test_hanging_processes_are_replaced_while_the_program_waits(video, until):
     path, boxes = video
     with Pipeline(path, boxes[0], Settings(run={"unstored_frames": 16})) as pipeline:
         tracks = list(islice(pipeline, 5))

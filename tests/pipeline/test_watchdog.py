@@ -15,7 +15,7 @@ from catstream.processes.process import Process
 from catstream.processes.shared import LONG_SECONDS, RUNNING_SECONDS, SharedMemory
 
 
-def test_a_watchdog_counts_turns_and_only_an_announced_long_step_may_take_long():
+def test_watchdog_counts_iterations_and_allows_announced_long_steps():
     with closing(SharedMemory()) as memory:
         watchdog = memory.watchdog
         assert watchdog.patience == LONG_SECONDS, "a start takes long"

@@ -57,13 +57,13 @@ def test_the_object_of_the_job_begins_in_the_first_frame_alone(stream):
     assert [stream.frame() for _ in range(3)] == [["anna"], [], []]
 
 
-def test_while_held_only_a_box_lets_objects_begin(stream):
+def test_objects_begin_in_a_paused_run_only_with_a_box(stream):
     assert stream.frame(held=True) == []
     stream.commands.boxes.append(set_box("1", "ben"))
     assert stream.frame(held=True) == ["ben", "anna"]
 
 
-def test_of_two_boxes_for_one_name_the_second_waits_for_the_next_frame(stream):
+def test_second_box_for_one_name_waits_for_the_next_frame(stream):
     stream.frame()
     stream.commands.boxes += [set_box("1", "ben"), set_box("2", "ben", BOX), set_box("3", "carl")]
     assert stream.frame() == ["ben", "carl"]
@@ -90,7 +90,7 @@ def test_a_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
     assert not stream.commands.hold
 
 
-def test_after_a_resume_an_object_without_a_state_begins_again_where_it_was(stream):
+def test_resumed_object_without_a_state_begins_again_where_it_was(stream):
     objects = {"anna": DesiredObject(BOX, begins=8), "ben": DesiredObject(OTHER, begins=20)}
     start = Start(7, 7, DesiredState(objects), {})
     stream.detectors.seq = start.seq

@@ -92,7 +92,7 @@ def test_a_restarted_detector_loses_no_frame_and_learns_from_none_twice(
         assert replace(each, begins=0, box=BOX) == replace(desired.objects[name], begins=0, box=BOX)
 
 
-def test_without_a_model_a_restart_tracks_from_the_first_frame_of_an_object_again():
+def test_restart_without_a_model_tracks_from_the_first_frame_of_the_object():
     desired = DesiredState({"anna": DesiredObject(BOX, 3), "ben": DesiredObject(BOX, 5)})
     position = Position(0, 8, states={"anna": STATE})
     start = resume_at(position, 6, desired, live=False)
@@ -178,5 +178,5 @@ TestStoring.settings = settings(max_examples=60)
 
 
 @given(took=st.integers(0, 60), interval=st.integers(1, 20), since=st.integers(0, 1000))
-def test_at_most_a_tenth_of_the_time_is_spent_writing(took, interval, since):
+def test_checkpoints_take_at_most_a_tenth_of_the_time(took, interval, since):
     assert checkpoint_is_due(since, took, interval) == (since >= interval and took * 10 <= took + since)

@@ -37,7 +37,7 @@ def test_a_detector_is_no_more_frames_ahead_of_its_owner_than_may_be_unstored(pr
         assert [owner.receive(60).seq for _ in range(7)] == list(range(1, 8))
 
 
-def test_after_a_signal_a_detector_does_not_wait_and_sends_nothing_after_a_drop(process):
+def test_signalled_detector_does_not_wait_and_sends_nothing_after_a_drop(process):
     process.ending._handle()
     with Outputs(process, lambda: pytest.fail("it waits"), lambda *_: None) as outputs:
         for seq in range(1, 9):

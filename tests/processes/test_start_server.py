@@ -64,7 +64,7 @@ def has_ended(process):
     return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
-def test_a_process_is_a_fork_in_the_folder_of_its_program_with_nothing_of_the_server(start, tmp_path, monkeypatch):
+def test_process_is_forked_in_the_folder_of_its_program_without_files_of_the_server(start, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     started, _, log = start()
     process, server = psutil.Process(started.pid), start_server()
@@ -178,7 +178,7 @@ def test_a_program_without_an_interpreter_gets_one_clear_error(monkeypatch, name
         start_server()
 
 
-def test_new_lines_are_those_of_the_process_itself_and_a_line_without_an_end_waits(tmp_path):
+def test_log_yields_the_whole_lines_of_the_process_itself(tmp_path):
     with (tmp_path / "log").open("w+b") as file, closing(ProcessLog("detector", file)) as log:
         file.write(b"detector: an earlier one\n")
         file.flush()

@@ -109,7 +109,7 @@ def test_an_error_of_the_source_is_raised_after_the_frames_before_it():
         next(frames)
 
 
-def test_at_most_one_frame_is_read_ahead_and_the_thread_ends_with_the_generator():
+def test_read_ahead_prefetches_one_frame_and_ends_its_thread():
     source = Numbers(50)
     with closing(read_ahead(source)) as frames:
         for frame in frames:

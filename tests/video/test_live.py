@@ -83,7 +83,7 @@ def test_every_frame_is_returned_or_counted_as_skipped_and_the_last_is_the_newes
 
 
 @pytest.mark.parametrize(("ago", "rate"), [(None, None), (1000, 12.5)])
-def test_frame_numbers_increase_by_one_and_times_count_from_the_first_frame_or_a_moment(camera, ago, rate):
+def test_live_frames_are_numbered_from_the_start_and_timed_from_a_moment(camera, ago, rate):
     since = None if ago is None else time.monotonic() - ago
     with open_source(camera(numbered).url, start=7, since=since, rate=rate) as source:
         frames = [next(source) for _ in range(10)]

@@ -27,7 +27,7 @@ def read(source, clock, seconds):
     return next(source)
 
 
-def test_it_begins_with_its_first_image_whenever_it_is_read(clock):
+def test_live_demo_begins_with_its_first_image_whenever_it_is_read(clock):
     with open_source("demo:1") as source:
         clock.now += 3600
         first = next(source)
@@ -45,7 +45,7 @@ def test_frames_that_are_not_read_in_time_are_skipped_and_counted(clock):
         assert frames[2].time == pytest.approx(0.241)
 
 
-def test_it_runs_forwards_and_backwards_without_end(clock):
+def test_live_demo_runs_forwards_and_backwards_without_end(clock):
     with open_source("demo:1") as source:
         first = next(source).image
         again = read(source, clock, 2 * 124 / 25 + 0.001)
@@ -63,7 +63,7 @@ def test_a_later_start_continues_with_the_image_of_that_number(clock):
         assert np.array_equal(frame.image, read(whole, clock, 0.121).image)
 
 
-def test_a_reader_that_waits_is_asked_whether_to_go_on_and_a_closed_source_ends(clock):
+def test_idle_function_ends_iteration_and_a_closed_source_ends(clock):
     with open_source("demo:1", idle=lambda: True, image_rate=1.0) as source:
         next(source)
         assert next(source, None) is None

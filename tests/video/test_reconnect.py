@@ -67,6 +67,6 @@ def test_the_backoff_doubles_up_to_a_limit_until_a_frame_arrives():
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 @pytest.mark.parametrize("frames", [0, 1, 90])
-def test_after_at_most_one_more_connection_there_is_a_pause(kind, frames):
+def test_reconnection_pauses_after_at_most_one_immediate_attempt(kind, frames):
     """A source that cannot be read is not asked again and again without a pause."""
     assert "at once" not in {attempt.begin for attempt in attempts([("invalid", 0), (kind, frames)])[1:]}
