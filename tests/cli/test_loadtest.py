@@ -3,10 +3,7 @@
 import json
 import re
 
-import psutil
 import pytest
-
-from catstream.loadtest import load_report, load_test
 
 
 def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
@@ -33,29 +30,6 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     page = (tmp_path / "load" / "report.html").read_text()
     assert "<h2>Streams</h2>" in page
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
-
-
-@pytest.mark.system
-def test_search_for_the_number_of_streams_names_it_first_and_what_each_costs(said, tmp_path, monkeypatch):
-    for module in (load_test, load_report):
-        monkeypatch.setattr(module, "MOST_STREAMS", 2)
-    arguments = ["--find-streams", "--rate", 20, "--duration", 1, "--size", "320x240", "--limit", "p99=60"]
-    code, output, _ = said("loadtest", *arguments, "--output", "load", "--json", "x.json", cwd=tmp_path)
-    assert code == 0
-    steps, _, rest = output.partition(
-        "This machine serves at least 2 streams of 320x240 pixels, 20 frames/s due in each; "
-    )
-    assert re.findall(r"^(\d) streams?, .* cores, .* MB: met$", steps, re.MULTILINE) == ["1", "2"]
-    assert re.match(r"a stream takes \d\.\d\d cores and \d+ MB\.\n", rest)
-
-    figures = json.loads((tmp_path / "x.json").read_text())
-    assert figures["highest_streams"] == 2
-    for stream in figures["streams"]:
-        assert 0 < stream["cores"] < psutil.cpu_count()
-        assert 10e6 < stream["memory"] < 2e9
-    page = (tmp_path / "load" / "report.html").read_text()
-    places = [page.index(part) for part in ("This machine serves", "Steps of the search", "<h2>Streams</h2>")]
-    assert places == sorted(places)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,5 @@
 """Limits and plans, and real runs: pipelines on a camera that does not wait, also if they are ended early."""
 
-import subprocess
-import time
-
 import psutil
 import pytest
 from hypothesis import given
@@ -11,18 +8,9 @@ from hypothesis import strategies as st
 from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
 from catstream.loadtest import load_test as module
-from catstream.loadtest.latency import REST, Usage
 from catstream.loadtest.load_report import to_json
 from catstream.loadtest.load_test import find_highest, run_load_test
 from catstream.loadtest.result import Limit, Plan, violations
-
-
-@pytest.fixture
-def sleeper():
-    child = subprocess.Popen(["sleep", "600"])
-    yield child
-    child.kill()
-    child.wait()
 
 
 def children():
@@ -30,17 +18,6 @@ def children():
     servers = ("processes.start_server", "resource_tracker")
     stay = [child for child in psutil.Process().children() if any(name in str(child.cmdline()) for name in servers)]
     return [child for child in psutil.Process().children(recursive=True) if child not in stay]
-
-
-def test_usage_shows_which_process_is_busy(sleeper):
-    usage, busy = Usage(), psutil.Process().pid
-    usage.read({"busy": [busy], "idle": [sleeper.pid]})
-    deadline = time.process_time() + 0.3
-    while time.process_time() < deadline:
-        pass
-    usage.read({"busy": [busy], "idle": [sleeper.pid]})
-    assert usage.readings["idle"][0] < usage.readings["busy"][0]
-    assert usage.readings[REST][0] >= 0
 
 
 def test_interrupted_run_returns_its_measurements_and_leaves_no_process():
