@@ -18,7 +18,7 @@ from catstream.messages import storage
 from catstream.messages.kinds import DetectorState, Features, Sample
 from catstream.messages.storage import Arrays, Metadata, with_prefix
 
-_KIND = "forest 3"  # kind of file, and the version of its contents
+_KIND = "forest 4"  # kind of file, and the version of its contents
 _MAX_STATES = 256  # messages whose detector states are stored: a restarted detector continues after one of them
 
 
@@ -140,7 +140,7 @@ class Forest:
         metadata = storage.read_metadata(path)
         _check_kind(path, metadata)
         try:
-            return int(metadata["seq"]), float(metadata.get("time", 0.0))
+            return int(metadata["seq"]), float(metadata["time"])
         except (KeyError, TypeError, ValueError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
 
@@ -182,7 +182,7 @@ class Forest:
         """Restore a forest from its `state`; KeyError, TypeError or ValueError if it is something else."""
         self = cls(settings)
         self.seq, self.frame, self.version = (int(metadata[name]) for name in ("seq", "frame", "version"))
-        self.time = float(metadata.get("time", 0.0))  # which an older checkpoint lacks
+        self.time = float(metadata["time"])
         for i, own in enumerate(metadata["objects"]):
             name = str(own["name"])
             self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)

@@ -169,7 +169,7 @@ class Job:
         file = path / _NAME if path.is_dir() else path
         if not file.is_file():
             raise ServiceError(f"{str(path)!r} contains no run: start one with --state {quote(str(path))}")
-        metadata: dict[str, Any] = {"rate": None} | storage.read(file)[1]  # which an older job lacks
+        metadata: dict[str, Any] = storage.read(file)[1]
         try:
             settings = Settings.from_values(metadata.pop("settings"))
             read = {name: msgspec.convert(metadata[name], kind, dec_hook=_typed) for name, kind in _kinds().items()}

@@ -34,7 +34,7 @@ from catstream.messages.kinds import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, 
 from catstream.messages.schema import check_message
 from catstream.messages.storage import Arrays, Metadata, pack, unpack
 
-_KIND = "saved model 4"  # kind of file, and the version of its contents
+_KIND = "saved model 5"  # kind of file, and the version of its contents
 
 #: Settings that say what a feature row and a tree contain: models can be merged, and continued, only if they agree.
 _SAME = ("coreset.size", "training.colours", "training.classifier")

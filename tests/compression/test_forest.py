@@ -212,7 +212,7 @@ def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path)
     take(forest, messages, 37)
     arrays, metadata = forest.state()
     metadata["objects"][0]["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
-    storage.write(path, arrays, metadata | {"kind": "forest 3"})
+    storage.write(path, arrays, metadata | {"kind": "forest 4"})
     with pytest.raises(ProtocolError, match="use an older copy"):
         Forest.load(path, settings)
 
@@ -221,7 +221,7 @@ def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path)
 def test_a_file_of_another_kind_or_version_is_rejected_with_one_line(settings, kind, tmp_path):
     arrays, metadata = Forest(settings).state()
     storage.write(tmp_path / "000000000001.safetensors", arrays, metadata | ({"kind": kind} if kind else {}))
-    with pytest.raises(ServiceError, match=rf"is of kind {kind!r}, this catstream reads 'forest 3'") as error:
+    with pytest.raises(ServiceError, match=rf"is of kind {kind!r}, this catstream reads 'forest 4'") as error:
         CheckpointStore(tmp_path).load(settings)
     assert "\n" not in str(error.value)
 
