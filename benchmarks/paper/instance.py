@@ -34,7 +34,7 @@ from catstream.base.threads import one_thread
 from catstream.base.workers import SPAWN
 from catstream.evaluation.datasets import Sequence
 from catstream.features.score_map import non_maximum_suppression
-from catstream.finding.find import Scan
+from catstream.finding.scan import Scan
 from catstream.jobs.saved_model import SavedModel
 from catstream.tracker import Tracker
 from catstream.video.source import open_source

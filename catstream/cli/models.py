@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -17,11 +16,6 @@ from catstream.cli.options import PATH, NumberRange, with_overwrite, with_skip_d
 from catstream.errors import CatstreamError, VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.saved_model import merge as merged
-
-if TYPE_CHECKING:
-    from catstream.finding.files import File
-    from catstream.finding.find import Search
-    from catstream.finding.results import FileResult, SearchLog
 
 _PRINTED = 12  # intervals that are printed
 
@@ -75,17 +69,14 @@ def find(
 
     Videos are sampled every 0.2 s (--every; 0 searches every frame), and objects
     are searched at 0.4 to 2.5 times the learned size (--sizes). After Ctrl-C, the
-    same command continues where it stopped; complete files are not searched
-    again, unless they have changed or --overwrite is passed. The exit status is 1
-    if a file could not be read.
+    same command continues: files with a line in results.ndjson are not searched
+    again. The exit status is 1 if a file could not be read.
 
     \b
     OUTPUT FILES
-      report.html      timelines, and pictures of the best detections
-      detections.csv   a row for each detection: file, object, frame, time, box, score
-      intervals.csv    a row for each interval: file, object, begin, end
-      results.json     both, by file
-      search.ndjson    log from which an interrupted search continues
+      report.html     a picture of the best detection in each interval
+      detections.csv  a row for each detection: file, object, frame, time, box, score
+      results.ndjson  a line for each searched file: detections, intervals, problems
 
     The score is about 1 on the object. Raise --threshold if there are false
     positives; lower it, or train on more frames, if the object is missed.
@@ -99,64 +90,39 @@ def find(
     with INTERRUPTS.leaving():
         from catstream.finding.files import find_files
         from catstream.finding.find import Search, load_models
-        from catstream.finding.results import SearchLog, write_report, write_tables
+        from catstream.finding.results import FileResult, Results, intervals_of, write_csv, write_report
+        from catstream.reports.report import clock
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes)
     files = find_files(paths)
-    with SearchLog(output / "search.ndjson", search.description, overwrite=overwrite) as log:
+    columns = text("file {task.completed}/{task.total}  {task.fields[frame]}  {task.description}", last=True)
+    interrupted = False
+    with Results(output, search.digest, overwrite=overwrite) as results:
         try:
-            with one_thread(opencv=True):
-                _search(search, files, log)
-            interrupted = False
+            with one_thread(opencv=True), line_of(messages(), columns) as progress:
+                task = progress.add_task("", total=len(files), frame="")
+                for number, file in enumerate(files):
+                    if results.has(file):
+                        continue
+                    result = FileResult.of(file.path, search.digest, every)
+                    try:
+                        for frame, detections in search.file(file, result):
+                            result.add(frame, detections)
+                            place = f"frame {frame.number + 1}/{result.frames or '?'}"
+                            progress.update(task, completed=number, description=file.path.name, frame=place)
+                    except VideoError as error:
+                        result.problems.append(str(error))
+                    with INTERRUPTS.deferred():
+                        results.add(result)
         except KeyboardInterrupt:
             interrupted = True
         with INTERRUPTS.deferred():
-            results = list(log.results.values())
-            write_tables(output, results, search.description)
-            report = write_report(output / "report.html", list(search.models), results)
-    _print(results, report)
-    if interrupted:
-        stopped("the results so far are saved; the same command continues")
-    problems = [problem for result in results for problem in result.problems]
-    for problem in problems:
-        complain(problem)
-    if problems:
-        raise CatstreamError(
-            f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}: all other content was searched"
-        )
+            found = list(results.files.values())
+            write_csv(output / "detections.csv", found)
+            report = write_report(output / "report.html", search.models, found)
 
-
-def _search(search: Search, files: list[File], log: SearchLog) -> None:
-    """Search all files that are not complete, and show the progress."""
-    columns = (
-        text("file {task.fields[number]}/{task.total}"),
-        text("{task.fields[frame]}  {task.fields[detections]} detections  {task.description}", last=True),
-    )
-    with line_of(messages(), *columns) as progress:
-        task = progress.add_task("", total=len(files), number=0, frame="", detections=0)
-        for number, file in enumerate(files, 1):
-            result = log.begin(file)
-            if result.complete:
-                continue
-            try:
-                for step in search.file(file, result):
-                    with INTERRUPTS.deferred():
-                        result.add(step)
-                    frame = f"frame {step.frame.number + 1}/{result.frames or '?'}"
-                    count = len(result.detections)
-                    progress.update(task, description=file.path.name, number=number, frame=frame, detections=count)
-            except VideoError as error:
-                result.problems.append(str(error))
-            with INTERRUPTS.deferred():
-                log.end(result)
-
-
-def _print(results: list[FileResult], report: Path) -> None:
-    from catstream.reports.report import clock
-
-    intervals = [interval for result in results for interval in result.intervals]
-    intervals.sort(key=lambda interval: -interval.best.score)
+    intervals = sorted(intervals_of(found), key=lambda interval: -interval.best.score)
     numbers = ("from", "to", "detections", "score")
     best = table("object", "file", *numbers, right=numbers)
     for interval in intervals[:_PRINTED]:
@@ -167,9 +133,16 @@ def _print(results: list[FileResult], report: Path) -> None:
         screen().print(best)
     if len(intervals) > _PRINTED:
         click.echo(f"and {len(intervals) - _PRINTED} more intervals")
-    if not intervals:
-        click.echo("no detections")
-    click.echo(f"report: {report}")
+    click.echo(f"report: {report}" if intervals else f"no detections; report: {report}")
+    if interrupted:
+        stopped("the results of the searched files are saved; the same command continues")
+    problems = [problem for result in found for problem in result.problems]
+    for problem in problems:
+        complain(problem)
+    if problems:
+        raise CatstreamError(
+            f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}: all other content was searched"
+        )
 
 
 @click.command()

@@ -12,6 +12,7 @@ import numpy as np
 
 from catstream.base.addresses import is_live
 from catstream.base.arrays import Float64
+from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
@@ -145,9 +146,9 @@ class Section:
             logged = {frame.number: frame for frame in self._log if frame.number in frames}
             part, rate = slice(self._head.start, None, self._head.stride), self._head.rate or RATE
             # A run skips damaged frames and scales others, or ends at the first: in any case these are its frames.
-            reading = {"image_rate": rate, "skip_damaged": True, "resize": True}
+            settings = RunSettings(image_rate=rate, skip_damaged=True, resize=True)
             try:
-                with open_source(self._head.source, part=part, **reading) as source:
+                with open_source(self._head.source, part=part, settings=settings) as source:
                     for frame in islice(source, max(frames) + 1):
                         if frame.number in frames:
                             image = draw(frame.image, logged[frame.number].tracks, self._palette)

@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 
+import cv2
 import pytest
 
 import catstream
@@ -25,22 +26,24 @@ def run(said, model_files, tmp_path):
     return command
 
 
-def rows(folder, name):
-    with (folder / name).open(newline="") as file:
+def rows(folder):
+    with (folder / "detections.csv").open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def lines(folder):
+    return [json.loads(line) for line in (folder / "results.ndjson").read_text().splitlines()]
 
 
 def test_the_files_agree_and_the_report_is_self_contained(run, video, tmp_path):
     code, output = run(video)
     assert code == 0, output
     folder = tmp_path / "found"
-    detections, intervals = rows(folder, "detections.csv"), rows(folder, "intervals.csv")
-    (file,) = json.loads((folder / "results.json").read_text())["files"]
-    assert (len(file["detections"]), len(file["intervals"])) == (len(detections), len(intervals))
-    assert sum(int(interval["detections"]) for interval in intervals) == len(detections)
+    detections, (file,) = rows(folder), lines(folder)
+    assert len(file["detections"]) == len(detections) == sum(interval["count"] for interval in file["intervals"])
     assert {detection["object"] for detection in detections} >= {"dahlia"}
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/jpeg") == len(intervals)
+    assert page.count("data:image/jpeg") == len(file["intervals"])
     assert not re.search(r'(?:src|href)="(?!data:)', page)
 
 
@@ -57,18 +60,41 @@ def test_a_command_that_was_interrupted_keeps_its_results_and_continues(run, vid
     code, output = run(*files)
     assert code == 130
     assert "the same command continues" in output
-    early = rows(tmp_path / "found", "detections.csv")
-    assert {row["file"] for row in early} == {str(file) for file in files}
-    assert "searched in part" in (tmp_path / "found" / "report.html").read_text()
+    early = rows(tmp_path / "found")
+    assert {row["file"] for row in early} == {str(files[0])}
+    with (tmp_path / "found" / "results.ndjson").open("a") as stream:
+        stream.write('{"file":"half a li')  # as if the process had been killed in a write
 
     assert run(*files)[0] == 0
-    continued, count = rows(tmp_path / "found", "detections.csv"), len(steps)
+    continued, count = rows(tmp_path / "found"), len(steps)
     assert count == 16 + 11, "only the second file is searched again"
     assert continued[: len(early)] == early
+    assert [file["file"] for file in lines(tmp_path / "found")] == [str(file) for file in files]
     assert run(*files)[0] == 0
-    assert len(steps) == count, "a complete file is not searched again"
+    assert len(steps) == count, "a searched file is not searched again"
     assert run(*files, "--overwrite")[0] == 0
-    assert rows(tmp_path / "found", "detections.csv") == continued
+    assert rows(tmp_path / "found") == continued
+
+
+def test_results_of_another_search_or_no_results_are_refused_and_stay(run, video, tmp_path):
+    assert run(video)[0] == 0
+    file = tmp_path / "found" / "results.ndjson"
+    before = file.read_bytes()
+    code, output = run(video, "--threshold", 0.7)
+    assert (code, "other models or options" in output) == (1, True)
+    assert file.read_bytes() == before
+    file.write_text("[]\n")
+    code, output = run(video)
+    assert (code, "has no results of a search" in output) == (1, True)
+    assert file.read_text() == "[]\n"
+
+
+def test_a_folder_with_new_images_is_searched_again(run, images, tmp_path):
+    (folder := tmp_path / "photos").mkdir()
+    for count in (1, 2):
+        cv2.imwrite(str(folder / f"{count}.png"), images[count])
+        assert run(folder)[0] == 0
+        assert {row["image"] for row in rows(tmp_path / "found")} == {f"{number}.png" for number in range(1, count + 1)}
 
 
 def test_a_damaged_file_is_reported_and_the_others_are_searched(run, video, tmp_path):
@@ -78,7 +104,7 @@ def test_a_damaged_file_is_reported_and_the_others_are_searched(run, video, tmp_
         code, output = run(tmp_path / "a.mp4", tmp_path / "b.mp4")
         assert (code, "1 problem" in output) == (1, True)
         assert "a.mp4' is not a video" in output
-    assert {row["file"] for row in rows(tmp_path / "found", "detections.csv")} == {str(tmp_path / "b.mp4")}
+    assert {row["file"] for row in rows(tmp_path / "found")} == {str(tmp_path / "b.mp4")}
     assert "is not a video" in (tmp_path / "found" / "report.html").read_text()
 
 

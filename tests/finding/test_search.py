@@ -20,8 +20,9 @@ from catstream.errors import ProtocolError, ServiceError, SettingsError, VideoEr
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid
 from catstream.finding.files import Reading, find_files
-from catstream.finding.find import Detection, Scan, Search, Step, load_models
-from catstream.finding.results import FileResult, SearchLog
+from catstream.finding.find import Detection, Search, load_models
+from catstream.finding.results import FileResult
+from catstream.finding.scan import Scan
 from catstream.video.frames import Frame
 from catstream.video.writer import VideoWriter
 
@@ -45,81 +46,14 @@ def appearing(once, images):
     return once("appearing", write) / "appearing.mp4"
 
 
-def finished(log, file, search, steps=None):
-    """Search a file to its end, or so many steps of it."""
-    result = log.begin(file)
-    for number, step in enumerate(() if result.complete else search.file(file)):
-        if number == steps:
-            return result
-        result.add(step)
-    log.end(result)
-    return result
-
-
 def test_one_frame_in_a_time_is_searched_and_the_last_one(search, appearing):
     file = find_files([appearing])[0]
-    steps = list(search.file(file))
-    assert [step.frame.number for step in steps] == [*range(0, 40, 5), 39]
-    seen = [each.frame for step in steps for each in step.detections if each.object == "dahlia"]
+    steps = list(search.file(file, Reading()))
+    assert [frame.number for frame, _ in steps] == [*range(0, 40, 5), 39]
+    seen = [each.frame for _, detections in steps for each in detections if each.object == "dahlia"]
     assert list(dict.fromkeys(seen)) == [15, 20, 25, 30]
     rare = dataclasses.replace(search, every=1.2)
-    assert [step.frame.number for step in rare.file(file)] == [0, 30, 39]
-
-
-def test_a_search_that_was_interrupted_finds_the_same_as_one_that_was_not(search, appearing, video, tmp_path):
-    files = find_files([video, appearing])
-    with SearchLog(tmp_path / "whole", search.description) as log:
-        whole = [finished(log, file, search) for file in files]
-    with SearchLog(tmp_path / "cut", search.description) as log:
-        finished(log, files[0], search)
-        finished(log, files[1], search, 4)
-    with (tmp_path / "cut").open("ab") as stream:
-        stream.write(b'{"file":"half a li')  # a process was killed in a write
-    with SearchLog(tmp_path / "cut", search.description) as log:
-        assert log.begin(files[0]).complete
-        assert not log.begin(files[1]).complete
-        assert [finished(log, file, search) for file in files] == whole
-    with SearchLog(tmp_path / "cut", search.description) as log:
-        assert list(log.results.values()) == whole
-        assert all(interval.picture.startswith(b"\xff\xd8") for each in whole for interval in each.intervals)
-
-
-def test_a_file_that_has_changed_is_searched_anew(search, appearing, video, tmp_path):
-    path = shutil.copy(appearing, tmp_path / "one.mp4")
-    with SearchLog(tmp_path / "log", search.description) as log:
-        finished(log, find_files([path])[0], search)
-        assert log.begin(find_files([path])[0]).complete
-        shutil.copy(video, path)
-        assert not log.begin(find_files([path])[0]).complete
-
-
-def test_the_log_of_another_search_is_not_continued(search, tmp_path):
-    with SearchLog(tmp_path / "log", search.description):
-        pass
-    other = dataclasses.replace(search, threshold=0.7)
-    with pytest.raises(ServiceError, match="differs in threshold"):
-        SearchLog(tmp_path / "log", other.description)
-    with SearchLog(tmp_path / "log", other.description, overwrite=True) as log:
-        assert not log.results
-
-
-def test_the_log_of_a_running_search_is_refused_to_another_one(search, tmp_path):
-    with SearchLog(tmp_path / "log", search.description):
-        for overwrite in (False, True):
-            with pytest.raises(ServiceError, match="log is being written by process"):
-                SearchLog(tmp_path / "log", search.description, overwrite=overwrite)
-    with SearchLog(tmp_path / "log", search.description) as log:
-        assert not log.results
-
-
-@pytest.mark.parametrize(
-    "content", ["[]\n", '{"kind":"catstream find 3"}\n', "no json\n", '{"kind":"catstream find 4"}\n']
-)
-def test_a_file_that_is_no_log_is_an_error_and_stays(search, tmp_path, content):
-    (tmp_path / "log").write_text(content)
-    with pytest.raises(ServiceError, match="is not the log of a search"):
-        SearchLog(tmp_path / "log", search.description)
-    assert (tmp_path / "log").read_text() == content
+    assert [frame.number for frame, _ in rare.file(file, Reading())] == [0, 30, 39]
 
 
 def test_find_yields_the_detections_of_all_paths_in_order(model_files, images, appearing, tmp_path):
@@ -207,9 +141,9 @@ def detection(time, x=0.0, size=40.0, name="anna", score=0.8):
 
 def intervals_of(*steps):
     """The intervals of the detections of these steps."""
-    result = FileResult("walk.mp4", [], gap=1.0)
+    result = FileResult("walk.mp4", "", gap=1.0)
     for number, step in enumerate(steps):
-        result.add(Step(Frame(number, step[0].time, IMAGE), step))
+        result.add(Frame(number, step[0].time, IMAGE), step)
     return result.intervals
 
 
@@ -255,10 +189,11 @@ def frames(file):
     return [(frame.number, name, frame.image.shape) for frame, name in searched], reading.problems
 
 
-def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
-    found = find_files([tree, tree / "clips" / "a.mp4"])
-    kinds = [(str(file.path.relative_to(tree)), file.kind) for file in found]
-    assert kinds == [("clips/a.mp4", "video"), ("clips/deep/b.MP4", "video"), ("photos", "images")]
+def names(tree, *paths):
+    return [str(file.path.relative_to(tree)) for file in find_files(paths or [tree])]
+
+
+EVERYTHING = ["clips/a.mp4", "clips/deep/b.MP4", "photos"]
 
 
 def test_a_folder_that_may_not_be_read_is_a_problem_and_the_others_are_searched(tree, monkeypatch):
@@ -276,39 +211,20 @@ def test_a_folder_that_may_not_be_read_is_a_problem_and_the_others_are_searched(
         frames(denied)
 
 
-def names(tree, *paths):
-    return [str(file.path.relative_to(tree)) for file in find_files(paths or [tree])]
-
-
-def test_a_file_is_searched_once_whatever_links_lead_to_it(tree, caplog):
-    everything = ["clips/a.mp4", "clips/deep/b.MP4", "photos"]
+def test_folders_are_searched_with_their_subfolders_and_each_file_once(tree):
     (tree / "loop").symlink_to(tree)
     (tree / "z.mp4").symlink_to(tree / "clips" / "a.mp4")
-    (tree / "z-hard.mp4").hardlink_to(tree / "clips" / "a.mp4")
     (tree / "z-folder").symlink_to(tree / "photos")
     (tree / "photos" / "z.png").symlink_to(tree / "photos" / "9.png")
-    assert names(tree) == names(tree, tree, tree, tree / "clips", tree / "z.mp4") == everything
-    assert names(tree, tree / "clips", tree) == everything
-    assert "5 duplicates, 1 hidden folder, 1 .txt file" in caplog.text
+    assert names(tree) == names(tree, tree, tree, tree / "clips", tree / "z.mp4") == EVERYTHING
+    assert names(tree, tree / "photos" / "9.png", tree) == ["photos/9.png", *EVERYTHING]
     assert [name for _, name, _ in frames(find_files([tree / "photos"])[0])[0]] == ["1.png", "9.png", "10.png"]
-
-
-def test_an_image_of_another_folder_is_searched_once(tree):
-    (tree / "album").mkdir()
-    for name in ("1.png", "9.png"):
-        (tree / "album" / name).symlink_to(tree / "photos" / name)
-    files = find_files([tree / "photos" / "1.png", tree])
-    assert [[path.name for path in file.files] for file in files if file.kind != "video"] == [
-        ["1.png"],
-        ["9.png"],
-        ["10.png"],
-    ]
 
 
 @pytest.mark.parametrize("name", ["gone.mp4", "gone.png", "gone"])
 def test_a_dead_link_is_a_problem(tree, name):
     (tree / "clips" / name).symlink_to(tree / "nowhere" / name)
-    (file,) = (file for file in find_files([tree]) if name in file.files[0].name)
+    (file,) = (file for file in find_files([tree / "clips"]) if name == file.path.name or file.pages)
     try:
         problems = frames(file)[1]
     except VideoError as error:
@@ -316,45 +232,27 @@ def test_a_dead_link_is_a_problem(tree, name):
     assert name in problems[0]
 
 
-@pytest.mark.parametrize(
-    "name", ["@eaDir", ".thumbnails", "@__thumb", "Thumbnails", "#recycle", "__MACOSX", ".Trash-0"]
-)
-def test_thumbnails_and_hidden_folders_are_skipped_and_said(tree, name, caplog):
-    everything = names(tree)
+@pytest.mark.parametrize("name", ["@eaDir", ".thumbnails", "Thumbnails", "#recycle", "__MACOSX"])
+def test_thumbnails_and_hidden_folders_are_skipped_unless_they_are_named(tree, name):
     shutil.copytree(tree / "clips", tree / "clips" / name / "inner")
-    assert names(tree) == everything
-    assert (f"{name} folder" if name[0] != "." else "2 hidden folders") in caplog.text
-    assert names(tree, tree / "clips" / name)  # unless it is named
+    assert names(tree) == EVERYTHING
+    assert names(tree, tree / "clips" / name)
 
 
 def test_files_of_other_kinds_are_counted_by_suffix(tree, caplog):
     for name in ("c.m2ts", "d.heic", "e.heic", "f"):
         shutil.copy(tree / "clips" / "a.mp4", tree / "clips" / name)
     assert names(tree) == ["clips/a.mp4", "clips/c.m2ts", "clips/deep/b.MP4", "photos"]
-    assert "2 .heic files, 1 hidden folder, 1 file without a suffix, 1 .txt file" in caplog.text
+    assert "2 .heic, 1 file without a suffix, 1 .txt" in caplog.text
 
 
-def test_images_of_a_folder_come_in_natural_order_and_may_differ_in_size(tree):
-    found, problems = frames(find_files([tree / "photos"])[0])
-    assert found == [(0, "1.png", (21, 30, 3)), (1, "9.png", (29, 30, 3)), (2, "10.png", (30, 30, 3))]
-    assert not problems
-
-
-def test_images_that_are_unreadable_or_gone_are_reported_and_the_others_are_read(tree):
-    (tree / "photos" / "9.png").write_bytes(b"no picture")
-    (tree / "photos" / "8.png").symlink_to("gone.png")
-    file = find_files([tree / "photos"])[0]
-    assert file.signature[0] == 3
-    found, (gone, unreadable) = frames(file)
-    assert [name for _, name, _ in found] == ["1.png", "10.png"]
-    assert "8.png" in gone
-    assert "9.png" in unreadable
-
-
-def test_a_single_image_has_a_frame_for_each_page(tree):
+def test_images_are_read_each_in_its_size_and_unreadable_ones_are_reported(tree):
+    (tree / "photos" / "8.png").write_bytes(b"no picture")
     cv2.imwritemulti(str(tree / "a.tif"), [np.zeros((20, 30 + page), np.uint8) for page in range(3)])
-    one, several = find_files([tree / "photos" / "10.png", tree / "a.tif"])
-    assert frames(one)[0] == [(0, "", (30, 30, 3))]
+    folder, several = find_files([tree / "photos", tree / "a.tif"])
+    found, (unreadable,) = frames(folder)
+    assert found == [(0, "1.png", (21, 30, 3)), (2, "9.png", (29, 30, 3)), (3, "10.png", (30, 30, 3))]
+    assert "8.png" in unreadable
     assert frames(several)[0] == [(page, "", (20, 30 + page, 3)) for page in range(3)]
 
 
@@ -384,7 +282,7 @@ def test_a_video_is_searched_by_time_whatever_its_rate_and_its_size_may_change(t
     [
         ("none.mp4", "no file or folder"),
         ("empty", "neither images nor videos: "),
-        ("texts", r"neither images nor videos \(1 \.txt file\)"),
+        ("texts", r"neither images nor videos \(1 \.txt\)"),
         ("0", "live"),
         ("rtsp://a:b@c/d", "rtsp://c/d is a live"),
     ],
