@@ -53,19 +53,6 @@ def test_a_process_that_a_signal_ends_before_the_run_is_started_again(video):
     assert pipeline.totals["stored"] == len(video[1])
 
 
-def test_received_tracks_are_returned_after_a_signal_has_ended_the_detector(video, until):
-    """It does not wait for its owner any longer."""
-    with Pipeline(video[0], video[1][0]) as pipeline, subscribe(pipeline.endpoint, "tracks") as published:
-        tracks, detector = list(islice(pipeline, 1)), pipeline.pids["detector"]
-        while next(published).frame < len(video[1]) - 1:
-            pass  # all of them are then on their way
-        os.kill(detector, signal.SIGTERM)
-        until(lambda: "detector" not in pipeline.pids)
-        tracks.extend(pipeline)
-    assert [track.frame for track in tracks] == list(range(len(tracks)))
-    assert pipeline.totals["sent"] == len(tracks)
-
-
 @pytest.mark.parametrize("stays", [False, True], ids=["private folder", "folder of the user"])
 def test_a_subscriber_that_reads_nothing_from_a_restart_on_receives_the_end(video, folder, stays):
     """Its subscription is sent to the restarted detector only once it reads."""

@@ -11,8 +11,11 @@ import pytest
 
 from catstream.base.settings import Settings
 from catstream.errors import BoxError, ServiceError, VideoError
+from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
+from catstream.video.source import open_source
+from catstream.wire.keys import create
 from tests.pipeline.conftest import share_found
 
 #: A small window keeps the detector near the frame that a test has reached.
@@ -42,6 +45,40 @@ def test_the_object_is_followed_with_ever_newer_models(run, video):
     assert versions == sorted(versions)
     assert versions[0] == 0
     assert versions[-1] > 2
+
+
+@pytest.fixture(scope="module")
+def in_one_process(video):
+    """The boxes of three objects in the first frame, and their tracks in one process, frame by frame."""
+    boxes = {"anna": video[1][0], "ben": (20, 150, 70, 60), "carl": (20, 20, 60, 60)}
+    tracker, tracks = MultiTracker(), []
+    with open_source(video[0]) as source:
+        for frame in source:
+            if frame.number:
+                tracker.update(frame.image, time=frame.time)
+            else:
+                tracker.init(frame.image, boxes, frame.time)
+            tracks.append(tracker.tracks)
+    return boxes, tracks
+
+
+@pytest.mark.parametrize("victims", [{}, {5: "detector", 12: "compressor", 20: "trainer"}], ids=["none", "each"])
+def test_lockstep_with_keys_gives_the_tracks_of_one_process_if_processes_die(
+    video, in_one_process, folder, tcp, victims
+):
+    create(folder / "keys")
+    settings = Settings(run={"lockstep": True, "keys": str(folder / "keys"), "endpoint": tcp})
+    (boxes, expected), tracks = in_one_process, []
+    with Pipeline(video[0], boxes, settings) as pipeline:
+        for each in pipeline.by_frame():
+            tracks.append(each)
+            if victim := victims.get(len(tracks)):
+                os.kill(pipeline.pids[victim], signal.SIGKILL)
+        assert pipeline.restarts == len(victims)
+    if not victims:
+        assert tracks == expected
+    assert [[*each] for each in tracks] == [[*each] for each in expected]
+    assert pipeline.totals["sent"] == pipeline.totals["stored"] == len(expected)
 
 
 def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):

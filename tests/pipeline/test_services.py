@@ -7,7 +7,6 @@ import sys
 import time
 from itertools import islice
 
-import cv2
 import psutil
 import pytest
 
@@ -22,8 +21,7 @@ from catstream.pipeline import Pipeline
 from catstream.processes.shared import RUNNING_SECONDS
 from catstream.processes.start_server import NAMES
 from catstream.processes.supervisor import Child, Supervisor
-from catstream.video.source import open_source
-from catstream.wire.channels import HEALTH, TRACKS
+from catstream.wire.channels import TRACKS
 from catstream.wire.endpoint import Endpoint
 from catstream.wire.newest import Subscriber
 
@@ -32,10 +30,9 @@ from catstream.wire.newest import Subscriber
 def by_hand(service, folder):
     """Starts processes of a run by hand, in an order; what is learned is kept in `folder`."""
 
-    def start(*source, box, order=("compressor", "trainer", "detector"), endpoint=folder, settings=()):
-        pairs = [word for pair in (f"run.endpoint={endpoint}", *settings) for word in ("--set", pair)]
+    def start(*source, box, order=("compressor", "trainer", "detector"), endpoint=folder):
         words = {"compressor": ["--state", folder], "trainer": [], "detector": [*source, "--box", box]}
-        return [service(name, *pairs, *words[name]) for name in order]
+        return [service(name, "--set", f"run.endpoint={endpoint}", *words[name]) for name in order]
 
     return start
 
@@ -47,29 +44,6 @@ def test_processes_started_manually_in_any_order_complete_a_run(video, folder, t
     processes = by_hand("--resume", path, box=boxes[0], order=order, endpoint=tcp)
     assert [process.wait(120) for process in processes] == [0, 0, 0]
     assert CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq == len(boxes)
-
-
-@pytest.fixture
-def broken(video, tmp_path):
-    """A source that breaks at its sixth frame, and the object's box."""
-    path, boxes = video
-    with open_source(path) as source:
-        for frame, _ in zip(source, range(9), strict=False):
-            cv2.imwrite(str(tmp_path / f"{frame.number}.png"), frame.image)
-    (tmp_path / "5.png").write_text("no image")
-    return tmp_path, boxes[0]
-
-
-def test_a_source_that_breaks_ends_processes_that_were_started_by_hand(broken, folder, by_hand, until):
-    source, box = broken
-    with Subscriber(HEALTH, Endpoint.parse(str(folder))) as health:
-        processes = by_hand(source, box=box, order=("compressor", "trainer"))
-        until(lambda: (report := health.receive(0.1)) and report.process == "trainer")
-    processes += by_hand(source, box=box, order=("detector",))  # its six frames need no trainer: none waits for it
-    errors = [process.communicate(timeout=150)[1] for process in processes]
-    assert [process.returncode for process in processes] == [3, 3, 3], errors
-    assert "5.png' (frame 5): replace or remove it" in errors[-1]
-    assert CheckpointStore(folder / CHECKPOINTS).load(Settings()).seq == 5
 
 
 PROGRAM = """

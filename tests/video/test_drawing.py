@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from contextlib import closing
@@ -129,16 +128,6 @@ def test_the_video_of_a_killed_process_is_readable_up_to_the_last_second(tmp_pat
     times = decoded(tmp_path / "out.mp4")
     assert times == pytest.approx([frame / rate for frame in range(len(times))])
     assert times[-1] >= 8 - 1 / rate
-
-
-@pytest.mark.skipif(shutil.which("ffprobe") is None, reason="no other reader: apt-get install ffmpeg")
-def test_another_reader_sees_a_complete_video_with_an_index(tmp_path):
-    with VideoWriter(tmp_path / "out.mp4", 25, (64, 64)) as video:
-        for _ in range(100):
-            video.write(np.zeros((64, 64, 3), np.uint8))
-    words = "-v error -count_frames -show_entries stream=nb_frames,nb_read_frames,duration,start_time -of csv=p=0"
-    told = subprocess.run(["ffprobe", *words.split(), tmp_path / "out.mp4"], capture_output=True, text=True, check=True)
-    assert (told.stdout.strip(), told.stderr) == ("0.000000,4.000000,100,100", "")
 
 
 @pytest.mark.parametrize("frames", [0, 200], ids=["at its end", "while it is written"])
