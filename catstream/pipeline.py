@@ -59,7 +59,7 @@ class Pipeline:
         objects by name: `{"anna": (120, 80, 64, 48), "ben": (300, 90, 60, 150)}`. Without a box or a model, the run
         waits for the box that `catstream.control` gives: a file stays at its first frame, a live source continues.
     settings : Settings or mapping of str
-        All settings; or by name, those that differ from the defaults, or from those of the run that is resumed.
+        All settings; or by name, the settings that differ from the defaults, or from the run that is resumed.
     model : path, or a mapping of names to paths
         File that `catstream save` wrote. The object is searched for, and absent until it is found; learning continues
         from the file.
@@ -77,10 +77,10 @@ class Pipeline:
         Whether the run starts paused: `catstream resume` continues it, for example once all subscribers are there.
     results : Results
         The files that the program writes, stored in the state folder for the program that resumes the run. A run that
-        is resumed continues those of each kind without a new one.
+        is resumed continues its files of each kind without a new one.
     save_model : path, or a mapping of names to paths
         Files for what was learned of the objects, written as by `catstream save` once the processes have ended, however
-        the run ended. One path is for the only object. By default those of `results`.
+        the run ended. One path is for the only object. By default the files of `results`.
 
     Attributes
     ----------
@@ -95,9 +95,9 @@ class Pipeline:
     live : bool
         Whether the source is a camera or a stream.
     source, boxes, part, settings
-        Those of the run, also if it is resumed; the path of a source is absolute.
+        The values of the run, also if it is resumed; the path of a source is absolute.
     results, earlier_results : Results
-        The files that the program writes, with those of the run that is resumed; and those of that run alone.
+        The files that the program writes, including those of the resumed run; and the files of the resumed run alone.
     first_frame : int or None
         With `resume`: number of the next frame that the caller needs, `after` + 1. It may be set before the start.
     saved_models : list of Path
@@ -353,7 +353,7 @@ class Pipeline:
 
     @property
     def _start(self) -> int:
-        """Number of the last frame before the run: that of the caller, or of the checkpoint."""
+        """Number of the last frame before the run, which the caller or the checkpoint has."""
         if self._earlier is None or self._state is None:
             return 0
         # Frames of a live source cannot be read again: the checkpoint may be ahead of the tracks.

@@ -374,8 +374,8 @@ def annotate(
     """Track objects between boxes at keyframes of a video, and check the tracks.
 
     Each stretch between two boxes is tracked from both ends. A frame is checked if the passes agree so well that its
-    box is right with a probability of 97 %, see `catstream.annotation.fusion`. Parameters and errors are those of
-    `Annotation`.
+    box is right with a probability of 97 %, see `catstream.annotation.fusion`. See `Annotation` for the parameters
+    and errors.
     """
     if not boxes:
         raise ObjectError("no object: pass the box of one in at least one frame")

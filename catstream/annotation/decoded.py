@@ -26,7 +26,7 @@ class DecodedFrames:
     size   width and height of a frame in pixels
     times  time of each frame in seconds
     rate   frames per second of the video
-    name   that of the results
+    name   name of the results
     count  file to which a byte is appended for each frame that is read; without it, reading is an OSError
     """
 

@@ -36,7 +36,7 @@ class FirstFrames(Annotation):
     Parameters
     ----------
     folder : folder to which the paths of videos are relative
-    boxes : mapping of the path of each video to its boxes, of which those in frame 0 can be edited
+    boxes : mapping of the path of each video to its boxes; the boxes in frame 0 can be edited
     settings : for the readers of the videos
     progress : function that is called after each video
 

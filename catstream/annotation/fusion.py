@@ -20,10 +20,10 @@ from catstream.base.arrays import Bool, Float64
 _ARRIVAL_WEIGHT = 4.0
 _SAME = 0.5  #: IoU of two boxes that count as the same
 
-#: Weights of the logistic regression: bias, then those of the features in `fuse`. They were fitted on 29 sequences with
+#: Weights of the logistic regression: bias, then the features in `fuse`. They were fitted on 29 sequences with
 #: one to four boxes, each sequence with the same weight.
 _LOGISTIC = np.array([-4.4, 6.3, 3.8])
-_AROUND = 5  #: frames before and after a frame, whose agreement counts, too
+_AROUND = 5  #: frames before and after a frame, whose agreement counts as well
 
 
 def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) -> tuple[Float64, Float64, Float64]:
@@ -61,7 +61,7 @@ def fuse(passes: Sequence[Pass], start: int, stop: int, keyframes: Keyframes) ->
 
 
 def _in_order(one: Pass, count: int) -> tuple[Float64, Float64]:
-    """Boxes and scores of a pass in the order of the video, without those of a keyframe at its end."""
+    """Boxes and scores of a pass in the order of the video, without a keyframe at its end."""
     boxes, scores = one.boxes[:count], one.scores[:count]
     return (boxes, scores) if one.is_forward else (boxes[::-1], scores[::-1])
 

@@ -102,7 +102,7 @@ def run_pass(
     """Track the object of some keyframes from the one at `start` to the frame `stop`.
 
     Without a memory of the other boxes, only that at `start` is used. With it, an object that is absent at `start` is
-    searched for in the frames after it. Returns None if tracking cannot start: without a box, or with one that looks
+    searched for in the frames after it. Returns None if tracking cannot start: without a box, or with a box that looks
     like all around it.
     """
     box, others = keyframes[start], {number: box for number, box in keyframes.items() if number != start}

@@ -25,9 +25,9 @@ class _StoppedError(Exception):
 
 
 class Session:
-    """Changes the boxes of an annotation, while a thread decodes the video and tracks what is missing.
+    """Changes the boxes of an annotation, while a thread decodes the video and runs the missing passes.
 
-    Objects take turns, beginning with that of the newest box, and the passes of the newest box of each run first. The
+    Objects take turns, beginning with the object of the newest box; the passes of the newest box of each run first. The
     methods may be called from any thread. Use it in a `with`; the owner of the annotation closes it afterwards.
 
     Parameters
@@ -107,7 +107,7 @@ class Session:
             return object, frame
 
     def finish(self) -> None:
-        """Write the results of what is tracked so far, and set `finished`. VideoError if they cannot be written."""
+        """Write the results so far, and set `finished`. VideoError if they cannot be written."""
         with self.lock:
             if not self.decoded:
                 raise VideoError("the video is not decoded yet: wait, or press Ctrl-C where the command runs")

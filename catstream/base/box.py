@@ -1,6 +1,6 @@
 """Boxes and windows: axis-aligned rectangles in pixels, `x, y, w, h`.
 
-A `Box` is what is reported: tight around the object, as the benchmarks write it. A `Window` is what is cut from the
+A `Box` is reported: tight around the object, as in the benchmarks. A `Window` is cut from the
 frame, searched and learned from: the box with some of its surroundings, 1.25 times as wide and high. They are two
 types, so that mypy finds where one stands for the other. `Window.around` and `Window.box` convert.
 """

@@ -58,7 +58,7 @@ def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextlib.contextmanager
 def _written_beside(path: Path, data: bytes, mode: int) -> Iterator[Path]:
-    """A new file in the folder of `path` whose content is on disk; what the block does with it is then on disk, too.
+    """A new file in the folder of `path` whose content is on disk; after the block, its new name is on disk as well.
 
     Its name is its own, so that several may write `path` at the same time. It is removed if the block leaves it there.
     """
@@ -175,7 +175,7 @@ def _flock(handle: int, kind: str) -> bool:
 
 
 def open_locked(path: Path, kind: type[CatstreamError] = ServiceError, size: int | None = 0, **options: Any) -> IO[Any]:
-    """Open a file to append to it, and lock it until it is closed; `options` are those of `open`.
+    """Open a file to append to it, and lock it until it is closed; see `open` for the `options`.
 
     size  number of its first bytes that remain, 0 for a new file; None for all
 
@@ -222,7 +222,7 @@ def check_unlocked(path: Path, kind: type[CatstreamError] = ServiceError) -> Non
 
 
 def _holder(path: Path) -> str:
-    """The process that has locked a file, for an error; the kernel lists those of this machine."""
+    """The process that has locked a file, for an error; the kernel lists the locks of this machine."""
     with contextlib.suppress(OSError):
         locks = Path("/proc/locks").read_text()
         if entry := re.search(rf"FLOCK +ADVISORY +WRITE +([1-9]\d*) \S+:{path.stat().st_ino} ", locks):

@@ -42,7 +42,7 @@ def check_name(name: str) -> str:
             f"{name!r:.80} is not a name: expected text of 1 to {_LONGEST} letters, digits, '_', '-' and '.', "
             "the first of them a letter, a digit or '_'"
         )
-    return str(composed)  # of a text of numpy, too
+    return str(composed)  # also of a text of numpy
 
 
 def by_name(values: Mapping[str, _Value]) -> dict[str, _Value]:

@@ -55,7 +55,7 @@ class _Limit:
 
     @staticmethod
     def _controller() -> ThreadpoolController:
-        """The libraries of this process, of which this thread may set the numbers from now on."""
+        """The libraries of this process; this thread may set their numbers of threads from now on."""
         controller = _libraries("blas")
         for library in controller.lib_controllers:
             if library.internal_api == "openblas":  # by itself, one thread of a program keeps the right to set it
@@ -68,7 +68,7 @@ _limit = _Limit()
 
 def _libraries(kind: str) -> ThreadpoolController:
     """The libraries of a kind that are loaded in this process: "blas" or "openmp"."""
-    import scipy.linalg  # noqa: F401  brings a BLAS beside that of numpy: loaded later, it would have all threads
+    import scipy.linalg  # noqa: F401  brings a second BLAS: loaded later, it would have all threads
     from threadpoolctl import get_cached_controller
 
     return get_cached_controller().select(user_api=kind)
@@ -79,7 +79,7 @@ def one_thread(*, opencv: bool = False) -> Iterator[None]:
     """Run linear algebra on one thread inside a `with`, or inside the function that it decorates.
 
     It may be nested and used by several threads at once: the last one to leave restores the number of threads.
-    Meanwhile, linear algebra in other threads of the process runs on one thread, too. It costs about 30 microseconds.
+    Meanwhile, linear algebra in other threads of the process also runs on one thread. It costs about 30 microseconds.
 
     Parameters
     ----------

@@ -80,9 +80,9 @@ class Control(AbstractContextManager["Control"]):
         the name, and everything that was learned of the previous one is dropped; with `keep`, the box corrects the
         position of the same object.
 
-        The box may have been drawn in a picture of a live source: `time` is that of the `Preview`, of the last five
+        The box may have been drawn in a picture of a live source: `time` is the time of the `Preview`, of the last five
         seconds. The object is searched for from there to the next frame. The frames are kept for this while anybody
-        receives previews, at most 256 MiB of them; if that of the box is not kept, it applies to the next frame.
+        receives previews, at most 256 MiB of them; a box of an older picture applies to the next frame.
         """
         return self.execute("set-box", object, box=Box.parse(box), keep=keep, time=time)
 
@@ -180,7 +180,7 @@ class Control(AbstractContextManager["Control"]):
         self.close()
 
     def _newest(self, name: str, version: int) -> SavedModel:
-        """Return what was learned of an object up to a version or a later one."""
+        """Return the saved model of an object, of this version or a later one."""
         clock = RunningClock()
         with Subscriber(SAVED_MODELS, self.endpoint, ModelFile, about=name) as saved:
             while (remaining := self.timeout - clock()) > 0:

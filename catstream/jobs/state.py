@@ -30,9 +30,9 @@ from catstream.errors import CatstreamError, ObjectError, ServiceError
 from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 
-#: Folder of the checkpoints, in that of the state.
+#: Folder of the checkpoints, in the folder of the state.
 CHECKPOINTS = "trees"
-#: Folder of the saved models that objects are searched for by, in that of the state.
+#: Folder of the saved models of searched objects, in the folder of the state.
 SEARCHED = "searched_models"
 
 _SMALL = ("job.safetensors", "desired_state.json")
@@ -136,7 +136,7 @@ def saved(
 ) -> Iterator[None]:
     """Save what was learned of each object to its file afterwards, and report each file that was saved.
 
-    An error of the run comes before those of saving.
+    An error of the run takes precedence over errors of saving.
     """
     errors: list[CatstreamError] = []
     since = generation()

@@ -50,7 +50,7 @@ class Beginnings:
                 detector.similarity = saved.similarity()
 
     def in_frame(self, frame: Frame, *, held: bool) -> list[Beginning]:
-        """The objects that begin in a frame: those of boxes that commands have set, and all that are due.
+        """The objects that begin in a frame: at the boxes of pending commands, and all that are due.
 
         While the run is `held`, a frame is tracked only if there is such a box.
         """

@@ -26,7 +26,7 @@ _ABOUT = {
 }
 _EXAMPLE = """
 The three processes connect at an endpoint: a folder for their sockets, or tcp://127.0.0.1:PORT. All need the same
-settings; an environment variable such as CATSTREAM_RUN_ENDPOINT sets one, too.
+settings; an environment variable such as CATSTREAM_RUN_ENDPOINT also sets one.
 
   mkdir -m 700 run
   python services/compressor.py --set run.endpoint=run --state checkpoints &

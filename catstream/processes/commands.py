@@ -48,7 +48,7 @@ class Commands(AbstractContextManager["Commands"]):
         self._responder.close()
 
     def _first_state(self, job: Job) -> DesiredState:
-        """The desired state at the start: the stored one if the run is resumed, otherwise that of the job."""
+        """The desired state at the start: the stored one if the run is resumed, otherwise from the job."""
         file = self._process.state / DESIRED
         if job.resume and file.exists():
             try:

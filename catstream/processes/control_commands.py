@@ -106,7 +106,7 @@ _VERBS: dict[str, Callable[[_Execution], Outcome]] = {
 def answer(
     command: Command, detectors: Detectors, done: bool, reason: str, name: str | None = None, frame: int | None = None
 ) -> Answer:
-    """The answer to a command for the object `name`, by default that of the command."""
+    """The answer to a command for the object `name`, by default the object of the command."""
     name = command.object if name is None else name
     frame = max(detectors.seq - 1, 0) if frame is None else frame
     detector = detectors.detectors.get(name)

@@ -1,4 +1,4 @@
-"""The decisions of the processes, as pure functions: where a detector continues, and for what it waits; what is stored.
+"""Decisions as pure functions: where a detector continues and when it waits, and what a compressor stores.
 
 Commands set the desired state. It is stored on disk for a detector that is restarted.
 """
@@ -102,11 +102,11 @@ class Start:
 def resume_at(position: Position, after: int | None, desired: DesiredState, *, live: bool) -> Start:
     """Where a detector continues: after the last frame that both the compressor and the owner have.
 
-    Frames of a live source cannot be read again: the stream continues after the last one that was learned from.
+    Frames of a live source cannot be read again: the stream continues after the last frame that was learned from.
 
     The SCM bootstrap of an object is not stored. If no object has a model yet, a file is tracked again from the first
     frame of the first object. If one of several objects has no model yet, it restarts at its last known box; only the
-    SCM bootstrap takes that long. An object of a saved model, of which the compressor has no trees, begins again.
+    SCM bootstrap takes that long. An object of a saved model without trees in the compressor begins again.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def sync_interval(size: int) -> float:
 def stored(position: Position, seq: int, *, saved: bool, urgent: bool) -> Position:
     """The position after an attempt to write a checkpoint of message `seq`.
 
-    If the disk is full, one that is urgent, as the sender waits for it, is acknowledged although it is only in memory:
+    If the disk is full, an urgent checkpoint (the sender is blocked) is acknowledged although it is only in memory:
     training continues.
 
     >>> stored(Position(8), 12, saved=False, urgent=True).in_memory

@@ -165,7 +165,7 @@ class DetectorLoop:
         """
         beginnings = self.beginnings.in_frame(frame, held=self._held)
         if self.commands.hold and not beginnings:
-            # The other objects, while a box is drawn. A live source goes on: where they are by now is not known.
+            # Show the other objects while a box is drawn. In a live source, their positions are out of date.
             self._show(self.detectors.seq, frame, {} if self._live else self._tracks.tracks)
         while self.commands.hold and not (beginnings or self.process.ending.reason or self._live):
             sleep(TURN_SECONDS)
@@ -251,7 +251,7 @@ class DetectorLoop:
         return own | self._source_counters()
 
     def _source_counters(self) -> dict[str, float]:
-        """The counters of the source; frames that were skipped while the run was paused count, too."""
+        """The counters of the source; frames that were skipped while the run was paused are included."""
         counters = self._source.counters if self._source is not None else {}
         if "skipped" in counters:
             counters["skipped"] += self._skipped
@@ -280,7 +280,7 @@ class Models:
         self.early: dict[str, Model] = {}
 
     def receive(self, seconds: float, *, keep: bool) -> None:
-        """Adopt the models that arrive within so many seconds; `keep` those of objects that have not begun yet."""
+        """Adopt the models that arrive within so many seconds; `keep` models of objects that have not begun yet."""
         for model in self.receive_all(seconds):
             if model.object in self._detectors.detectors:
                 self._detectors.adopt(model)

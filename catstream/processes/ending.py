@@ -32,7 +32,7 @@ class Ending:
         self.begin("it was stopped")
 
     def begin(self, reason: str, *, failed: bool = False) -> None:
-        """End for a reason. The first one counts; but a source that fails is an error whatever came before."""
+        """End for a reason. The first one counts; but a source that fails is always an error."""
         if failed or not self.reason:
             self.reason, self.failed = reason, failed
 

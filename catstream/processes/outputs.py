@@ -128,7 +128,7 @@ class Previews(Publisher[Preview]):
         self.turn()
 
     def since(self, time: float) -> list[Frame]:
-        """The stored frames, from that of the picture at a time on; none if that is not stored any more."""
+        """The stored frames from the picture with this time on; empty if it is not stored any more."""
         frames = [frame for frame in self._frames if frame.time >= time]
         return frames if frames and frames[0].time == time else []
 

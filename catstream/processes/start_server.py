@@ -118,7 +118,7 @@ class StartedProcess:
 
 
 class StartServer:
-    """A start server, as its program sees it; ServiceError if the program is not one that Python runs."""
+    """The client of a start server; ServiceError if no Python interpreter runs this program."""
 
     def __init__(self) -> None:
         if getattr(sys, "frozen", False) or not os.access(sys.executable or "", os.X_OK):
@@ -168,7 +168,7 @@ class StartServer:
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """A block that starts processes: an OSError in it, as that of a limit, becomes an error for a person."""
+    """A block that starts processes: an OSError in it, such as a limit, becomes a ServiceError with a remedy."""
     try:
         yield
     except OSError as error:
@@ -229,7 +229,7 @@ def main(descriptor: int, program: int) -> None:
         sys.stderr = os.fdopen(2, "w")
     reset_process()
     name_process("catstream:start")
-    gc.disable()  # nothing of what is imported is garbage
+    gc.disable()  # imported modules are no garbage
     requests = socket.socket(fileno=descriptor)
     has_ended, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(wakes)

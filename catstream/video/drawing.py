@@ -70,7 +70,7 @@ def draw(image: np.ndarray, tracks: Sequence[Track], colours: Colours) -> np.nda
     colour, and its name at its box. The scores are below the frame.
 
     The image is uint8 (h, w, 3), blue green red, the result uint8 (h + k, w, 3) with k rows for the text. There is at
-    least one track; `colours` has those of the frames before.
+    least one track; `colours` has the colours of earlier frames.
     """
     height, width = image.shape[:2]
     unit = max(width / 640, _MIN_UNIT)

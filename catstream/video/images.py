@@ -1,4 +1,4 @@
-"""Image files that are read as frames: those of a folder or a pattern, or the pages of one file."""
+"""Image files as frames: the files of a folder or a pattern, or the pages of one file."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _page_count(path: Path) -> int:
     """Return the number of pages of an image file, 1 for most; 0 if OpenCV cannot read it."""
     try:
         with path.open("rb") as file, _without_warnings():
-            # On Linux not by its name: OpenCV crashes at one that is not UTF-8.
+            # On Linux not by its name: OpenCV crashes if it is not UTF-8.
             return cv2.imcount(f"/proc/self/fd/{file.fileno()}" if sys.platform == "linux" else str(path))
     except (OSError, cv2.error):
         return 0
@@ -131,7 +131,7 @@ def _decoded(path: Path, page: int) -> np.ndarray | None:
 
 @lru_cache(maxsize=1)
 def _batch(path: Path, number: int) -> Sequence[np.ndarray]:
-    """Return some pages of a file: OpenCV passes over those before them, and counts those of a WebP wrongly."""
+    """Return some pages of a file. OpenCV skips the pages before them; it miscounts the pages of a WebP."""
     data = np.memmap(path, np.uint8, "r")  # a stack of pages may be large
     if path.suffix.lower() == ".webp":
         return cv2.imdecodemulti(data, _ANY)[1][_BATCH * number :]

@@ -3,7 +3,7 @@
 A thread reads and decodes continuously and stores only the newest frame. A slow consumer therefore gets fewer frames,
 never old ones; the skipped frames are counted. If no frame arrives within a timeout, or the stream ends or fails, the
 source reconnects with exponential backoff until it succeeds or the consumer closes it. The timeouts apply to frames: a
-camera that still sends audio but no video is lost, too. `catstream.video.reconnect` decides how to connect again.
+camera that sends audio but no video also counts as lost. `catstream.video.reconnect` decides how to connect again.
 
 HTTP has three special cases. The address of a still picture is polled. MJPEG that FFmpeg's demuxer for it rejects,
 because a part has another content type or none, is read by the demuxer that searches for JPEGs only. HLS delivers
@@ -105,7 +105,7 @@ class LiveSource(Source):
         """`skipped`: frames that were replaced by a newer one before they were returned; `reconnects`: successful
         reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected."""
         silent = monotonic() - self._last_frame_time
-        # FFmpeg has no timeout for a device that hangs, so a long silence counts as a loss, too.
+        # FFmpeg has no timeout for a device that hangs, so a long silence also counts as a loss.
         limits = self._settings.open_timeout_seconds, self._settings.read_timeout_seconds, _POLL_SECONDS
         lost = silent if self._problem or silent > sum(limits) else 0.0
         return {"skipped": self.skipped, "reconnects": self.reconnects, "lost_seconds": lost}

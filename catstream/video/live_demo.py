@@ -4,9 +4,9 @@ It has 320 x 240 pixels, and `run.image_rate` frames per second. The seed is a n
 seconds of the video play forwards, backwards, and so on; an image is rendered when it is due for the first time, and
 cached.
 
-Frames that are not read in time are skipped and counted, as those of a camera. Unlike a camera, the video begins when
-its first frame is read, so the box of `first_box` fits whenever the source is opened. A resumed run begins with the
-image of the number of its next frame.
+As with a camera, frames that are not read in time are skipped and counted. Unlike a camera, the video begins when its
+first frame is read, so the box of `first_box` fits whenever the source is opened. A resumed run begins with the image
+of the number of its next frame.
 """
 
 from __future__ import annotations

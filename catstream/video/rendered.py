@@ -89,7 +89,7 @@ _PAGODA = np.array(
 
 
 def render(frames: int, size: tuple[int, int] = SIZE, seed: int = 0) -> Iterator[tuple[np.ndarray, Box | None]]:
-    """Yield the first images of a `Demo` in order, each with the box of the dahlia; the parameters are those of it."""
+    """Yield the first images of a `Demo` in order, each with the box of the dahlia; see `Demo` for the parameters."""
     yield from map(Demo(size, seed).image, range(frames))
 
 
@@ -120,7 +120,7 @@ class Demo:
 
     After `FRAMES` images the sequence runs backwards, then forwards again, so that a video of any length has no jump.
 
-    If their size is not 4:3, the images are stretched. The seed is that of the sensor noise.
+    If their size is not 4:3, the images are stretched. The seed selects the sensor noise.
     """
 
     def __init__(self, size: tuple[int, int] = SIZE, seed: int = 0) -> None:

@@ -8,7 +8,7 @@ The text is one of these:
 
     a video file        any format that FFmpeg reads; every frame is read once, in order
     an image file       its pages
-    a folder            its images in natural order (2.png before 10.png), or those of its `img`, `color` or `rgb`
+    a folder            its images in natural order (2.png before 10.png), or the images of its `img`, `color` or `rgb`
                         folder, or its only video; sequence folders of the public benchmarks open unchanged
     a pattern           images/%05d.png or images/*.png
     a camera            0 or /dev/video0
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 #: All frames of a source.
 ALL_FRAMES = slice(None)
 
-#: Suffixes of the files in a folder that are read as videos. FFmpeg reads a single file whatever its suffix is.
+#: Suffixes of the files in a folder that are read as videos. FFmpeg reads a single file with any suffix.
 _VIDEOS = (
     "264 265 266 3g2 3gp amv apng asf av1 avc avi avs2 avs3 cavs dav dif divx drc dv dvd dvr-ms f4v flc fli flv gif "
     "gxf h261 h263 h264 h265 h266 h26l hevc imx ismv ivf k3g lvf m1v m2p m2t m2ts m2v m4v mj2 mjpeg mjpg mk3d mkv mod "
@@ -96,7 +96,7 @@ class _FileSource(Source):
 
     @property
     def counters(self) -> dict[str, float]:
-        """`damaged`: number of skipped packets, which is that of their frames; `scaled`: number of frames that were
+        """`damaged`: number of skipped packets, one for each frame; `scaled`: number of frames that were
         scaled to the size of the first one; `truncated`: seconds at the end that are missing."""
         names = ("damaged", "scaled", "truncated")
         return {name: count for name in names if (count := getattr(self._reader, name))}
@@ -133,7 +133,7 @@ def open_source(
     idle      is called ten times a second while a live source has no frame; if it returns True, iteration ends. With
               it, opening a live source never fails: iteration waits for the first frame without a timeout, and the size
               is unknown until then
-    settings  the settings of a run, of which `image_rate`, `hwaccel`, `skip_damaged` and `resize` are used
+    settings  the settings of a run; `image_rate`, `hwaccel`, `skip_damaged` and `resize` are used
     single    values by name that replace those in `settings`
 
     VideoError if the source does not exist or cannot be read; from the iterator where it cannot be decoded, after the
@@ -195,7 +195,7 @@ def _open_reader(path: Path, settings: RunSettings) -> tuple[str, _Images | _Vid
 
 
 def _folder_name(folder: Path) -> str:
-    """The name of a folder of images for results; for the folder of images in a sequence, that of the sequence."""
+    """The name of a folder of images for results; of an `img` folder, the name of the sequence around it."""
     folder = folder.resolve()
     return (folder.name in _FOLDERS and folder.parent.name) or folder.name
 
@@ -238,7 +238,7 @@ class _Images:
         """Yield the frames with these numbers, from index `start` on."""
         numbers = range(self.count())[numbers.start : numbers.stop : numbers.step]
         resize = self.settings.resize
-        # The size is that of the first image of the run, even if the run is resumed.
+        # The first image of the run sets the size, even if the run is resumed.
         shape = self._read(numbers[0]).shape if resize and start and numbers else None
         for index, number in enumerate(numbers[start:], start):
             image = self._read(number)
@@ -303,7 +303,7 @@ class _Video:
         self.rate = float((self._has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
 
     def count(self) -> int | None:
-        """Return the number of frames: of the entries of the index that hold pictures, else that of the packets."""
+        """Return the number of frames: index entries that hold pictures, or else packets."""
         video = _Video(self.path, self.settings)
         with video.container:
             index, stated = video.stream.index_entries, video.stream.frames
@@ -342,7 +342,7 @@ class _Video:
         """The time of the end that the header of a Matroska file states in seconds, else 0.
 
         FFmpeg ends without an error where such a file is truncated. It does not for others, or estimates their
-        durations from what is there.
+        durations from the available data.
         """
         if "matroska" not in self.container.format.name:
             return 0.0

@@ -1,4 +1,4 @@
-"""A pipeline in a program: with `with` and without, more than once, in threads, and in an event loop."""
+"""A pipeline in a program: with `with` and without, more than once, and in threads."""
 
 import gc
 import json
