@@ -34,16 +34,7 @@ def supervision_yolo(folder):
     import supervision
 
     files = (str(folder / name) for name in ("images", "labels", "data.yaml"))
-    yield from of_supervision(supervision.DetectionDataset.from_yolo(*files))
-
-
-def supervision_coco(file):
-    import supervision
-
-    yield from of_supervision(supervision.DetectionDataset.from_coco(str(file.parent / "set" / "images"), str(file)))
-
-
-def of_supervision(dataset):
+    dataset = supervision.DetectionDataset.from_yolo(*files)
     for path, _, boxes in dataset:
         for (left, top, right, bottom), kind in zip(boxes.xyxy.tolist(), boxes.class_id, strict=True):
             yield number(path), None, dataset.classes[kind], left, top, right - left, bottom - top
@@ -58,38 +49,16 @@ def pycocotools_coco(file):
         yield number(image["file_name"]), entry["track_id"], kind["name"], *entry["bbox"]
 
 
-def datumaro_coco(file):
-    place = file.parent / "coco" / "annotations" / "instances_walk.json"  # as it requires, with a folder of images
-    for folder in (place.parent, place.parents[1] / "images"):
-        folder.mkdir(parents=True, exist_ok=True)
-    place.write_bytes(file.read_bytes())
-    yield from of_datumaro(place.parents[1], "coco")
-
-
 def datumaro_cvat(file):
-    yield from of_datumaro(file, "cvat")
-
-
-def datumaro_yolo(folder):
-    yield from of_datumaro(folder, "yolo")
-
-
-def of_datumaro(path, kind):
     import datumaro
 
-    dataset = datumaro.Dataset.import_from(str(path), kind)
+    dataset = datumaro.Dataset.import_from(str(file), "cvat")
     names = dataset.categories()[datumaro.AnnotationType.label]
     for item in dataset:
         for box in item.annotations:
-            frame = item.attributes.get("frame", None) if kind == "cvat" else number(item.id)
             if not box.attributes.get("outside"):
-                track = box.attributes.get("track_id")
-                yield (
-                    frame,
-                    track if track is None else track + (kind == "cvat"),
-                    names[box.label].name,
-                    *box.get_bbox(),
-                )
+                track = box.attributes["track_id"] + 1
+                yield item.attributes["frame"], track, names[box.label].name, *box.get_bbox()
 
 
 def trackeval_mot(file):

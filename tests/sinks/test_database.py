@@ -83,14 +83,6 @@ def test_a_run_that_was_killed_before_its_database_had_a_table_continues(tmp_pat
     assert read(path) == [TRACKS[:1]]
 
 
-def test_a_new_run_replaces_a_database_with_all_its_files(tmp_path):
-    for name in ("t.sqlite", "t.sqlite-wal", "t.sqlite-shm"):
-        (tmp_path / name).write_text("of another program")
-    with closing(open_sink(str(tmp_path / "t.sqlite"), Origin())) as sink:
-        sink.write(TrackedFrame(TRACKS[:1]))
-    assert read(tmp_path / "t.sqlite") == [TRACKS[:1]]
-
-
 @pytest.mark.parametrize("disk", [1 << 17], indirect=True)
 def test_a_full_disk_is_an_error_of_one_line_and_the_frames_before_it_remain(disk):
     sink = open_sink(str(disk / "t.sqlite"), Origin())
@@ -102,12 +94,6 @@ def test_a_full_disk_is_an_error_of_one_line_and_the_frames_before_it_remain(dis
     (disk / "ballast").unlink()
     sink.close()
     assert read(disk / "t.sqlite") == [TRACKS[:1]]
-
-
-def test_another_database_is_no_log(tmp_path):
-    (tmp_path / "t.sqlite").write_text("no database, but long enough" * 9)
-    with pytest.raises(VideoError, match=r"cannot read .*: file is not a database"):
-        read(tmp_path / "t.sqlite")
 
 
 def test_frames_wait_in_memory_while_another_program_locks_the_database(tmp_path, caplog, monkeypatch):

@@ -20,6 +20,9 @@ def tracks(history, name="", began=0, first=0):
         yield Track(frame, frame, "present" if box else "absent", box, 0.9, 1, object=name, began=began)
 
 
+LOST_IN_DOOR = ["0 found", "0 entered door", "3 left door", "3 lost"]
+
+
 def told(events):
     return [f"{event.track.time:g} {event.kind} {event.zone}".strip() for event in events]
 
@@ -91,15 +94,6 @@ def test_an_object_of_which_a_subscriber_loses_messages_has_not_ended():
     came = [*frames[0], frames[1][0], frames[4][2], *frames[5], *frames[6]]
     events = Events({})
     assert [event.kind for track in came for event in events.update([track])] == ["found"] * 3
-
-
-def test_status_is_what_the_events_have_told():
-    events = Events(DOOR)
-    seen = [(events.update([track]), events.status(""))[1] for track in tracks(".5..5")]
-    assert [status["present"] for status in seen] == [False, True, True, False, True]
-    assert [status["zones"] for status in seen] == [[], ["door"], ["door"], [], ["door"]]
-    events.close()
-    assert events.status("") is None
 
 
 def test_an_event_has_its_track():
