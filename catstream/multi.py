@@ -57,7 +57,7 @@ class MultiTracker:
     """
 
     def __init__(self, settings: Settings | Mapping[str, object] | None = None) -> None:
-        self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
+        self.settings = Settings().replace(settings)
         motion_em.prepare()  # before the first frame: a later one would wait for it
         self._tracks: dict[str, Track] | None = None
 

@@ -123,7 +123,7 @@ class Annotation:
         jobs: int | None = None,
         progress: Progress = lambda *_: None,
     ) -> None:
-        self.settings = settings if isinstance(settings, Settings) else Settings().replace(settings or {})
+        self.settings = Settings().replace(settings)
         self._jobs, self.progress = jobs or cores(), progress
         if is_live(os.fspath(video)):
             redacted = without_password(os.fspath(video))

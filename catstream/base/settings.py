@@ -311,15 +311,15 @@ class Settings:
             )
         return self.replace({"coreset.size": max(2, round(self.coreset.share * frames)), "coreset.share": 0.0})
 
-    def replace(self, others: Mapping[str, object]) -> Settings:
-        """Return a copy with other values, given as in `from_values`.
+    def replace(self, others: Settings | Mapping[str, object] | None) -> Settings:
+        """Return a copy with other values, given as in `from_values`; with none, or with those of other settings.
 
         Examples
         --------
         >>> Settings(run={"lockstep": True}).replace({"coreset.size": 32}).changed()
         ['run.lockstep=true', 'coreset.size=32']
         """
-        return Settings.from_values(self.values() | flat(others))
+        return others if isinstance(others, Settings) else Settings.from_values(self.values() | flat(others or {}))
 
     def values(self) -> dict[str, Value]:
         """All values, by full name."""

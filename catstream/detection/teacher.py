@@ -51,10 +51,8 @@ _SCALE, _SHIFT, _TURN = 0.03, 0.02, 0.05  # standard deviations of affine copies
 _MIRRORED = 1  # of a frame's copies that are flipped, as an object that turns may look
 _MOVED = 0.9  # share of the first frame's copies on another background, which no model is to learn; 0.5 gains less
 _MIN_OFFSET, _MAX_OFFSET = 0.3, 1.0  # distance of another background, in windows
-_OPAQUE, _TRANSPARENT = (
-    0.8,
-    1.15,
-)  # radii of the object's ellipse between which it fades; 1 touches the sides of its box
+# Radii of the object's ellipse between which a copy fades into another background; 1 touches the sides of its box.
+_OPAQUE, _TRANSPARENT = 0.8, 1.15
 
 
 def first_training(

@@ -124,7 +124,7 @@ class Job:
             boxes={} if boxes is None else boxes_by_name(boxes),
             models={name: file.absolute() for name, file in files_by_name(models).items()},
             part=part,
-            settings=settings if isinstance(settings, Settings) else Settings().replace(settings or {}),
+            settings=Settings().replace(settings),
             results=results or Results(),
             paused=paused,
         )
@@ -143,7 +143,7 @@ class Job:
             self,
             source=self.source if source is None else source,
             part=self.part if part == _ALL else part,
-            settings=settings if isinstance(settings, Settings) else self.settings.replace(settings or {}),
+            settings=self.settings.replace(settings),
             results=self.results if results is None else results.after(self.results),
             paused=paused,
         )
