@@ -13,7 +13,7 @@ from typing import cast
 import click
 
 from catstream.base.addresses import without_passwords
-from catstream.cli.common import INTERRUPTS, CommandGroup, complain, stopped
+from catstream.cli.common import INTERRUPTS, complain, stopped
 from catstream.errors import CatstreamError, ServiceError, require_linux
 
 #: Command -> its module, and its summary. The module is imported when the command is called, because some imports take
@@ -59,10 +59,7 @@ def load_command(name: str) -> click.Command:
     return command
 
 
-class _Commands(CommandGroup):
-    def list_commands(self, _: click.Context) -> list[str]:
-        return list(COMMANDS)
-
+class _Commands(click.Group):
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         if name == "track" and not context.resilient_parsing:
             from catstream.processes.start_server import start_server
@@ -84,7 +81,9 @@ class _Commands(CommandGroup):
             formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
 
-@click.command(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(
+    cls=_Commands, commands=list(map(click.Command, COMMANDS)), context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(package_name="catstream", prog_name="catstream")
 def group() -> None:
     """Track objects in a video stream; each is learned online from a single box, on a CPU.

@@ -5,7 +5,6 @@ What takes long to import is imported in the functions that need it, in all comm
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 import signal
@@ -40,19 +39,6 @@ def messages() -> Console:
 def complain(problem: object) -> None:
     """Print a problem in one line that begins with the name of the program, without passwords of addresses in it."""
     click.echo(f"catstream: {without_passwords(str(problem))}", err=True)
-
-
-class CommandGroup(click.Group):
-    """A group of commands that suggests the nearest one for a name that it does not have."""
-
-    def resolve_command(
-        self, context: click.Context, words: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        names = self.list_commands(context)
-        if words[0] not in names and not words[0].startswith("-"):
-            near = difflib.get_close_matches(words[0], names, n=1)
-            context.fail(f"No such command {words[0]!r}." + (f" Did you mean {near[0]!r}?" if near else ""))
-        return super().resolve_command(context, words)
 
 
 def table(*heads: str, right: Collection[str] = ()) -> Table:

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from catstream.base.names import split_name
 from catstream.cli.attach import with_fleet_address
-from catstream.cli.common import CommandGroup, screen, table
+from catstream.cli.common import screen, table
 from catstream.cli.options import PATH, with_json
 from catstream.cli.view import HostPort, fleet_view, token_of_page, with_view
 from catstream.client.address import Address
@@ -35,7 +35,7 @@ _SHOW_SECONDS = 0.5  # between two pictures of the status
 _STARTED = ("running", "lost", "waiting", "paused", "ended", "failed")
 
 
-@click.group(cls=CommandGroup)
+@click.group()
 def fleet() -> None:
     """Run many streams on one machine or on many, and change them while they run.
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import click
 
-from catstream.cli.common import CommandGroup
 from catstream.cli.options import PATH
 from catstream.wire.channels import Role
 from catstream.wire.keys import ROLES, allow, create
@@ -14,7 +13,7 @@ from catstream.wire.keys import ROLES, allow, create
 _folder = click.argument("folder", metavar="DIR", type=PATH)
 
 
-@click.group(cls=CommandGroup)
+@click.group()
 def keys() -> None:
     """Manage the keys of a pipeline and its clients.
 

@@ -52,7 +52,7 @@ def test_no_file_in_the_current_folder_is_imported(name, walk, traps, tmp_path):
     load = ["--rate", "20", "--duration", "1", "--size", "160x120", "--subscribers", "1"]
     command = {
         "track": [CATSTREAM, "track", images, "--box", box, "--output", out],
-        "evaluate": [CATSTREAM, "evaluate", walk, "--starts", "2", "--jobs", "2", "--output", out],
+        "evaluate": [CATSTREAM, "evaluate", walk, "--jobs", "2", "--json", tmp_path / "x.json"],
         "loadtest": [CATSTREAM, "loadtest", *load],
         "program": [sys.executable, tmp_path / "program.py", images, box, "12"],
         "all others": [sys.executable, "-P", "-c", EVERY_COMMAND, *COMMANDS],
