@@ -60,6 +60,9 @@ def load_command(name: str) -> click.Command:
 
 
 class _Commands(click.Group):
+    def list_commands(self, _: click.Context) -> list[str]:
+        return list(COMMANDS)  # in this order, also in the reference
+
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         if name == "track" and not context.resilient_parsing:
             from catstream.processes.start_server import start_server
