@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-import numpy as np
 
 from catstream.annotation.annotation import Annotation
 from catstream.annotation.keyframes import Keyframe, by_object, cells, format_keyframe, parse_row
@@ -33,8 +32,8 @@ from catstream.sinks.destinations import Head, Origin, TrackedFrame
 from catstream.sinks.track_log import RunFiles, places_of
 from catstream.video.source import open_source
 
-#: Called during the work with the number of finished frames, and of all; None if that is unknown.
-Progress = Callable[[int, int | None], object]
+#: Name of the table of results in the folder of a batch.
+SUMMARIES = "batch.csv"
 
 
 class Video(NamedTuple):
@@ -94,13 +93,6 @@ class Summary:
         )
 
 
-def read_videos(table: Path) -> list[Video]:
-    """Read the videos of a table, at least one; errors as of `read_boxes` and `videos_of`."""
-    if not (boxes := read_boxes(table)):
-        raise VideoError(f"{str(table)!r} has no row: pass a CSV file file,object,x,y,w,h with a row for each box")
-    return videos_of(table, boxes)
-
-
 def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
     """Read the boxes of each video from a table with the columns file, object, x, y, w, h, and optionally frame.
 
@@ -146,12 +138,63 @@ def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Vide
 
 
 def check_results(videos: Iterable[Video], output: Path) -> None:
-    """Raise VideoError if a file of the results of a video exists."""
-    for video in videos:
-        _files(video, output, Head(source=str(video.path)), overwrite=False)
+    """Raise VideoError if a file of the results of a video exists in a folder without batch.csv."""
+    if not (output / SUMMARIES).exists():  # otherwise, all files there are of this batch
+        for video in videos:
+            _files(video, output, Head(source=str(video.path)), overwrite=False)
 
 
-def track_video(video: Video, output: Path, settings: Settings, progress: Progress) -> Summary:
+class Batch:
+    """The videos of a batch, and its table batch.csv in the folder of the results.
+
+    rows  the row of each video; None before it is tracked, also if it failed earlier, or had other boxes
+    """
+
+    def __init__(self, videos: Sequence[Video], output: Path, *, overwrite: bool) -> None:
+        self.videos, self._output, self._table = videos, output, output / SUMMARIES
+        earlier = {} if overwrite else {(row.video, row.boxes): row for row in read_summaries(self._table)}
+        rows = (earlier.get((video.file, video.boxes)) for video in videos)
+        self.rows: list[Summary | None] = [None if row is None or row.error else row for row in rows]
+        self._write()
+
+    @property
+    def missing(self) -> list[int]:
+        """The numbers of the videos that are still to be tracked."""
+        return [number for number, row in enumerate(self.rows) if row is None]
+
+    def track(self, settings: Settings, jobs: int) -> Generator[Video]:
+        """Track the missing videos in `jobs` processes, and yield each one after its row was written.
+
+        If a process is killed, for example because memory is exhausted, the remaining videos are tracked one by one.
+        """
+        tasks = [(number, self.videos[number], self._output, settings) for number in self.missing]
+        try:
+            for number, row in run_tasks(_numbered, tasks, jobs):
+                yield self._add(number, row)
+        except ServiceError as error:
+            for number in self.missing:
+                video = self.videos[number]
+                try:
+                    ((_, row),) = run_tasks(_numbered, [(number, video, self._output, settings)], 1)
+                except ServiceError:
+                    row = Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
+                yield self._add(number, row)
+
+    def _add(self, number: int, row: Summary) -> Video:
+        self.rows[number] = row
+        self._write()
+        return self.videos[number]
+
+    def _write(self) -> None:
+        names = [field.name for field in fields(Summary)]
+        _write_table(self._table, names, (astuple(row) for row in self.rows if row is not None))
+
+
+def _numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
+    return number, track_video(video, output, settings)
+
+
+def track_video(video: Video, output: Path, settings: Settings) -> Summary:
     """Track the objects of a video, and write their tracks to NAME.ndjson and NAME.csv in `output`.
 
     An error is in the summary; the tracks up to it are in the files. Existing files are replaced.
@@ -160,7 +203,7 @@ def track_video(video: Video, output: Path, settings: Settings, progress: Progre
     method = _annotated if any(len(boxes) > 1 for boxes in video.keyframes.values()) else _tracked
     try:
         with one_thread(opencv=True), ExitStack() as stack:
-            head, frames = method(video, settings, progress, stack)
+            head, frames = method(video, settings, stack)
             files = _files(video, output, head, overwrite=True)
             files.make_folder()
             output_files = stack.enter_context(files.opened(""))
@@ -172,40 +215,8 @@ def track_video(video: Video, output: Path, settings: Settings, progress: Progre
     return summary
 
 
-def track_videos(
-    videos: Sequence[Video], output: Path, settings: Settings, jobs: int, counts: Path
-) -> Generator[tuple[Video, Summary]]:
-    """Track videos in `jobs` processes, and yield each with its summary once it has ended.
-
-    If a process is killed, for example because memory is exhausted, the remaining videos are tracked one by one.
-
-    counts : file of the progress, which is made here: int64 (videos, 2), the finished frames, and all or 0
-    """
-    np.zeros((len(videos), 2), np.int64).tofile(counts)
-    tasks = {video.name: (number, video, output, settings, counts) for number, video in enumerate(videos)}
-    try:
-        for name, summary in run_tasks(_work, [*tasks.values()], jobs):
-            yield tasks.pop(name)[1], summary
-    except ServiceError as error:
-        for _, video, *_ in [*tasks.values()]:
-            try:
-                ((_, summary),) = run_tasks(_work, [tasks[video.name]], 1)
-            except ServiceError:
-                summary = Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
-            yield video, summary
-
-
-def _work(number: int, video: Video, output: Path, settings: Settings, counts: Path) -> tuple[str, Summary]:
-    progress = np.memmap(counts, np.int64, "r+").reshape(-1, 2)
-
-    def show(done: int, total: int | None) -> None:
-        progress[number] = done, total or 0
-
-    return video.name, track_video(video, output, settings, show)
-
-
 def read_summaries(path: Path) -> list[Summary]:
-    """Read a file that `write_summaries` wrote; none if it does not exist, VideoError if it is not one."""
+    """Read the rows of batch.csv; none if it does not exist, VideoError if it is another table."""
     if not path.exists():
         return []
     try:
@@ -213,11 +224,6 @@ def read_summaries(path: Path) -> list[Summary]:
             return [msgspec.convert(row, Summary, strict=False) for row in csv.DictReader(file)]
     except (OSError, UnicodeDecodeError, csv.Error, msgspec.ValidationError) as error:
         raise VideoError(f"{path} is not the table of a batch ({error}): pass another --output") from None
-
-
-def write_summaries(path: Path, summaries: Iterable[Summary]) -> None:
-    """Write the rows of batch.csv, atomically."""
-    _write_table(path, [field.name for field in fields(Summary)], map(astuple, summaries))
 
 
 def _write_table(path: Path, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
@@ -236,9 +242,7 @@ def _files(video: Video, output: Path, head: Head, *, overwrite: bool) -> RunFil
     return files
 
 
-def _tracked(
-    video: Video, settings: Settings, progress: Progress, stack: ExitStack
-) -> tuple[Head, Iterator[TrackedFrame]]:
+def _tracked(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, Iterator[TrackedFrame]]:
     """Track the objects of a video, each from its only box on; the same tracks as of `catstream track` in lockstep."""
     begins: dict[int, dict[str, Box]] = {}
     for name, boxes in video.keyframes.items():
@@ -267,7 +271,6 @@ def _tracked(
                 tracker.init(frame.image, begin, frame.time)
             else:
                 tracker.update(frame.image, time=frame.time, begin=begin)
-            progress(frame.number + 1, source.frames)
             yield TrackedFrame([replace(track, source_frame=number) for track in tracker.tracks.values()])
         for frame_number, boxes in begins.items():
             raise BoxError(
@@ -277,15 +280,9 @@ def _tracked(
     return head, frames()
 
 
-def _annotated(
-    video: Video, settings: Settings, progress: Progress, stack: ExitStack
-) -> tuple[Head, Iterator[TrackedFrame]]:
+def _annotated(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, Iterator[TrackedFrame]]:
     """Track the objects of a video between their boxes."""
-
-    def show(_: str, done: int, total: int | None) -> None:
-        progress(done, total)
-
-    annotation = stack.enter_context(Annotation(str(video.path), video.keyframes, settings, jobs=1, progress=show))
+    annotation = stack.enter_context(Annotation(str(video.path), video.keyframes, settings, jobs=1))
     annotation.track()
     frames = annotation.frames
     head = Head(

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
-from rich.console import RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from catstream.base.files import locked_folder
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.base.threads import cores
 from catstream.cli.annotate import wait_for
-from catstream.cli.common import INTERRUPTS, line_of, messages, screen, stopped, table, text
+from catstream.cli.common import INTERRUPTS, line_of, messages, screen, stopped, table
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, with_listen, with_token
 from catstream.errors import BoxError, CatstreamError, VideoError
@@ -81,46 +77,31 @@ def batch(
       catstream export out dataset --format yolo
     """
     with INTERRUPTS.leaving():
-        from catstream.batch import (
-            check_results,
-            read_boxes,
-            read_summaries,
-            read_videos,
-            track_videos,
-            videos_of,
-            write_summaries,
-        )
+        from catstream.batch import Batch, check_results, read_boxes, videos_of
 
-    drawn, path, settings = output / "boxes.csv", output / "batch.csv", Settings.from_values(overrides)
+    drawn, settings = output / "boxes.csv", Settings.from_values(overrides)
     if ask:
         boxes = read_boxes(drawn) if drawn.exists() else {}
         boxes |= {file: [] for file in (_relative(file, output) for file in files) if file not in boxes}
         videos = videos_of(drawn, boxes)
     else:
-        videos = read_videos(*files) if len(files) == 1 else []
+        videos = videos_of(*files, read_boxes(*files)) if len(files) == 1 else []
     if not videos:
-        raise click.UsageError("expected one file BOXES, or videos after --ask")
-    if not (overwrite or path.exists()):  # if it exists, all files there are of this batch
+        raise click.UsageError("expected one file BOXES with a row for each box, or videos after --ask")
+    if not overwrite:
         check_results(videos, output)
     if ask:
         videos = _ask_for_boxes(drawn, boxes, settings, listen, token)
-    complete = {} if overwrite else {row.video: row for row in read_summaries(path) if not row.error}
-    rows = {video.name: complete.get(video.file) for video in videos}
-    missing = [video for video in videos if (row := rows[video.name]) is None or row.boxes != video.boxes]
-    rows |= dict.fromkeys((video.name for video in missing), None)
-    write_summaries(path, filter(None, rows.values()))
-    jobs = min(jobs or cores(), max(len(missing), 1))
-    with tempfile.TemporaryDirectory(prefix="catstream-batch-") as folder:
-        counts = Path(folder) / "counts"
-        tracked = track_videos(missing, output, settings, jobs, counts)
-        try:
-            with closing(tracked), _Lines(missing, counts):
-                for video, summary in tracked:
-                    rows[video.name] = summary
-                    write_summaries(path, filter(None, rows.values()))
-        except KeyboardInterrupt:
-            stopped("the results so far are saved; the same command continues")
-    summaries = [row for row in rows.values() if row is not None]
+
+    batch = Batch(videos, output, overwrite=overwrite)
+    try:
+        with line_of(messages()) as progress, closing(batch.track(settings, jobs or cores())) as tracked:
+            task = progress.add_task("tracking", total=len(batch.missing))
+            for video in tracked:
+                progress.update(task, advance=1, description=video.name)
+    except KeyboardInterrupt:
+        stopped("the results so far are saved; the same command continues")
+    summaries = [row for row in batch.rows if row is not None]
     _print(summaries)
     click.echo(f"results: {output}")
     if failed := sum(bool(row.error) for row in summaries):
@@ -174,24 +155,6 @@ def _ask_for_boxes(
         if empty := [video.file for video in videos if not video.keyframes and video.file not in frames.errors]:
             click.echo(f"not tracked, because no box is drawn: {', '.join(empty)}", err=True)
         return [video for video in videos if video.file not in empty]
-
-
-class _Lines(Progress):
-    """A line for each video that is tracked at the moment, and one for all; nothing if there is no terminal."""
-
-    def __init__(self, videos: Iterable[Video], counts: Path) -> None:
-        self._counts = counts  # first: the constructor renders the lines
-        console = messages()
-        columns = (text("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn())
-        super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
-        for video in videos:
-            self.add_task(video.name, total=None, visible=False)
-
-    def get_renderables(self) -> Iterable[RenderableType]:
-        if self._counts.exists():
-            for task, (done, total) in zip(self.tasks, np.fromfile(self._counts, np.int64).reshape(-1, 2), strict=True):
-                self.update(task.id, completed=done, total=total or None, visible=0 < done != total)
-        return super().get_renderables()
 
 
 def _print(summaries: Iterable[Summary]) -> None:
