@@ -95,13 +95,6 @@ def test_absent_object_has_no_box(demo):
         assert annotation.tracks[""][-1].box == truth[-1]
 
 
-def test_a_part_of_a_video_counts_its_frames_from_zero(demo):
-    video, truth = demo
-    with annotate(video, {0: truth[10]}, part=slice(10, 15), jobs=1) as annotation:
-        assert len(annotation.frames) == 5
-        assert annotation.tracks[""][-1].box.overlap(truth[14]) > 0.5
-
-
 def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
     video, truth = demo
     work, started = module._work, []

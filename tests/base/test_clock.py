@@ -5,10 +5,6 @@ import pytest
 import catstream
 from catstream.base import clock
 from catstream.errors import SilenceError
-from catstream.messages.kinds import Command
-from catstream.wire.channels import CONTROL
-from catstream.wire.commands import Requester
-from catstream.wire.endpoint import Endpoint
 
 
 def test_a_clock_does_not_count_the_time_in_which_the_process_was_stopped(monkeypatch):
@@ -18,26 +14,15 @@ def test_a_clock_does_not_count_the_time_in_which_the_process_was_stopped(monkey
     assert [running() for _ in range(4)] == pytest.approx([0.2, 0.4, 0.4 + clock.STEP_SECONDS, 1.0])
 
 
-@pytest.fixture
-def looks(monkeypatch):
-    """How often a clock was read, in a process that is stopped for an hour between two of the times."""
-    moments = []
+def test_a_subscriber_that_was_stopped_waits_for_the_rest_of_its_timeout(folder, monkeypatch):
+    looks = []
 
     def read():
-        moments.append(0.1 * len(moments) + 3600 * (len(moments) > 20))
-        return moments[-1]
+        """The clock of a process that is stopped for an hour between two of the times."""
+        looks.append(0.1 * len(looks) + 3600 * (len(looks) > 20))
+        return looks[-1]
 
     monkeypatch.setattr(clock, "monotonic", read)
-    return moments
-
-
-def test_a_subscriber_that_was_stopped_waits_for_the_rest_of_its_timeout(folder, looks):
     with catstream.subscribe(str(folder), "tracks", timeout=5) as tracks, pytest.raises(SilenceError):
         next(tracks)
-    assert len(looks) > 40
-
-
-def test_a_command_of_a_process_that_was_stopped_waits_for_the_rest_of_its_timeout(folder, looks):
-    with Requester(CONTROL, Endpoint.parse(str(folder))) as requester:
-        assert requester.ask(Command("1", "pause"), 5) is None
     assert len(looks) > 40

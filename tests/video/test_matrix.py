@@ -63,8 +63,6 @@ CONTAINERS = {
 }
 #: Containers without time stamps: frames have equal distances.
 RAW = {"y4m", "h264", "hevc"}
-#: Those of which FFmpeg reads two files that were joined byte by byte.
-JOINABLE = {"mkv", "webm", "ts", "m2ts", "mpg", "vob", "h264", "hevc"}
 FORMATS = [(container, codec) for container, (codecs, _) in CONTAINERS.items() for codec in codecs.split()]
 
 #: Frame n of an irregular video is shown at so many twenty-fifths of a second.
@@ -148,13 +146,6 @@ def test_all_frames_and_their_times_are_those_that_ffmpeg_says(tmp_path, picture
         numbers, times = read(path)
         compared(times, said(path) if container not in RAW else [number / RATE for number in range(FRAMES)])
         assert numbers == list(wanted or range(numbers[0], numbers[0] + len(times))), path.name
-    if container in JOINABLE:
-        joined = tmp_path / f"joined.{container}"
-        joined.write_bytes(2 * constant.read_bytes())
-        numbers, times = read(joined)
-        assert len(said(joined)) == len(numbers)
-        assert numbers[-FRAMES:] == list(range(FRAMES))
-        assert times == pytest.approx([number / RATE for number in range(len(times))], abs=0.0015)
 
 
 def test_the_table_of_the_how_to_lists_what_is_compared():

@@ -148,22 +148,14 @@ def broken(path, start: int = 0) -> tuple[list[int], str]:
 
 @KINDS
 def test_every_frame_of_a_video_is_returned_once_in_order_with_its_number_and_time(video, name):
-    with open_source(video(name)) as source:
+    path = video(name)
+    with open_source(path) as source:
         assert (source.name, source.size, source.rate, source.live) == ("a", (160, 120), 25.0, False)
         assert source.frames == 100
         found = [(frame.number, frame.time, number_of(frame.image)) for frame in source]
     assert found == [(number, pytest.approx(number / 25, abs=0.002), number) for number in range(100)]
-
-
-@KINDS
-def test_a_later_start_gives_the_same_frames_as_reading_up_to_it(video, name):
-    path = video(name)
-    with open_source(path) as source:
-        wanted = [frame for frame in source if frame.number >= 37]
     with open_source(path, start=37) as source:
-        for frame, other in zip(source, wanted, strict=True):
-            assert (frame.number, frame.time) == (other.number, other.time)
-            np.testing.assert_array_equal(frame.image, other.image)
+        assert [(frame.number, frame.time, number_of(frame.image)) for frame in source] == found[37:]
 
 
 PARTS = [slice(7, 31, 3), slice(90, None), slice(None, 200, 11)]
