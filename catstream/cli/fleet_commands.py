@@ -136,18 +136,16 @@ def _watch(console: Console, fleet: Fleet) -> None:
     status = fleet.status()
     try:
         with Live(console=console, transient=True) as live:
-            while fleet.is_owner or time.monotonic() < deadline:
-                if not fleet.is_owner and all(map(_has_started, status.streams.values())):
-                    break
+            while fleet.is_owner or (
+                time.monotonic() < deadline and not all(map(_has_started, status.streams.values()))
+            ):
                 live.update(Group(*_tables(status)))
                 time.sleep(_SHOW_SECONDS)
-                try:
-                    status = fleet.status()
-                except FleetError:
-                    if fleet.is_running:
-                        raise
-                    click.echo(f"the fleet {fleet.name} was ended from elsewhere")
-                    return
+                status = fleet.status()
+    except FleetError:
+        if fleet.is_running:
+            raise
+        click.echo(f"the fleet {fleet.name} was ended from elsewhere")
     finally:
         console.print(*_tables(status), sep="\n")
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from catstream.base.addresses import is_live, without_password
 from catstream.client.address import Address
 from catstream.client.attach import control
-from catstream.client.control import Control
 from catstream.errors import (
     CatstreamError,
     CommandRejectedError,
@@ -216,26 +215,25 @@ class Stream:
 
     def _change_objects(self, pipeline: Pipeline, facts: Metadata) -> None:
         """Begin the objects that the spec has now and had not when the state was made, and forget the others."""
-        before = set(facts["objects"]) if facts else set(self._spec.boxes)
-        now = self._spec.boxes.keys() | self._spec.models.keys()
-        begin, forget = sorted(self._spec.boxes.keys() - before), sorted(before - now)
-        if begin or forget:  # a peer that connects for nothing counts as rejected
-            with self._control(pipeline) as controlled:
-                for name in begin:
-                    controlled.set_box(self._spec.boxes[name], name)
-                for name in forget:
-                    with suppress(CommandRejectedError):  # it was forgotten already
-                        controlled.forget(name)
-        for name in sorted(self._spec.models.keys() - before):
-            if (model := self._store.model(self._spec.name, name).newest()) is None:
-                raise FleetError(f"{self._spec.name} has no saved model of {name!r} in the store: apply the file again")
-            learned = SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store")
-            with self._control(pipeline) as controlled:
-                controlled.search(learned, name)
-
-    @staticmethod
-    def _control(pipeline: Pipeline) -> Control:
-        return control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys))
+        boxes, models = self._spec.boxes, self._spec.models
+        before = set(facts["objects"]) if facts else set(boxes)
+        begin, search = sorted(boxes.keys() - before), sorted(models.keys() - before)
+        forget = sorted(before - boxes.keys() - models.keys())
+        if not (begin or search or forget):  # a peer that connects for nothing counts as rejected
+            return
+        with control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys)) as controlled:
+            for name in begin:
+                controlled.set_box(boxes[name], name)
+            for name in forget:
+                with suppress(CommandRejectedError):  # it was forgotten already
+                    controlled.forget(name)
+            for name in search:
+                model = self._store.model(self._spec.name, name).newest()
+                if model is None:
+                    raise FleetError(f"the store has no saved model of {name!r}: apply the file of the fleet again")
+                controlled.search(
+                    SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store"), name
+                )
 
     def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
         """Take the tracks of a frame; an empty mapping means that none has arrived for a while."""

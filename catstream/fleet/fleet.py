@@ -30,7 +30,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -94,7 +94,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         self._address = address or os.environ.get("RAY_ADDRESS", "")
         self.name = name or (read.name if read is not None else "")
         if not self.name and not self._address:
-            folders = sorted(_fleets_folder().glob("*"))
+            folders = sorted((state_home() / "fleets").glob("*"))
             self.name = _only([folder.name for folder in folders if _is_up(folder)], "this machine")
         self._owned: ExitStack | None = None  # the node of Ray that `up` has started
         self._controller: Any = None
@@ -135,16 +135,17 @@ class Fleet(AbstractContextManager["Fleet"]):
 
     def add(self, spec: StreamSpec) -> list[str]:
         """Add a stream, or change the one of the same name."""
-        return _about(self._ask("add", spec, _models([spec])), [spec.name])
+        lines: list[str] = self._ask("add", spec, _models([spec]))
+        return [line for line in lines if line.startswith(f"{spec.name}:")]
 
     def remove(self, *names: str, forget: bool = False) -> list[str]:
         """Remove streams. Unless `forget`, their state stays in the store: they continue if they are added again."""
-        lines = self._ask("remove", names)
+        self._ask("remove", names)
         if forget:
             store = Store(self._ask("spec").store)
             for name in names:
                 store.stream(name).clear()  # its actor is superseded, if it still runs
-        return _about(lines, names)
+        return [f"{name}: is removed" for name in names]
 
     def status(self) -> FleetStatus:
         """The state of all streams and nodes."""
@@ -191,7 +192,7 @@ class Fleet(AbstractContextManager["Fleet"]):
     @property
     def _folder(self) -> Path:
         """The folder of the fleet on this machine."""
-        return _fleets_folder() / self.name
+        return state_home() / "fleets" / self.name
 
     def _start_ray(self) -> None:
         """Start a node of Ray on the loopback interface, unless another process has done so."""
@@ -284,7 +285,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         options: dict[str, Any] = {}
         if self._address:
             registry = spec.registry or f"{_gcs_address().rpartition(':')[0]}:{REGISTRY_PORT}"
-            listen, keys = f"tcp://{registry}", spec.keys or str(_fleets_folder() / spec.name / "keys")
+            listen, keys = f"tcp://{registry}", spec.keys or str(state_home() / "fleets" / spec.name / "keys")
             options["resources"] = {f"node:{registry.rpartition(':')[0]}": 0.001}
         else:
             listen, keys = str(self._folder / "registry"), ""  # it stays if Ray starts the controller again
@@ -305,7 +306,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         )
         self._ask("ready")
 
-    def _ask(self, method: str, *arguments: object, **options: object) -> Any:
+    def _ask(self, method: str, *arguments: object) -> Any:
         """Call a method of the controller, and wait for its answer."""
         self._connect()
         import ray
@@ -321,7 +322,7 @@ class Fleet(AbstractContextManager["Fleet"]):
                     f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
                 ) from None
         try:
-            return ray.get(getattr(self._controller, method).remote(*arguments, **options), timeout=ANSWER_SECONDS)
+            return ray.get(getattr(self._controller, method).remote(*arguments), timeout=ANSWER_SECONDS)
         except RayTaskError as error:
             if isinstance(error.cause, CatstreamError):
                 raise error.cause from None
@@ -345,11 +346,6 @@ def _disconnect() -> None:
         ray.shutdown()
 
 
-def _fleets_folder() -> Path:
-    """The folder with one for each fleet of this user."""
-    return state_home() / "fleets"
-
-
 def _is_up(folder: Path) -> bool:
     """Return True if a process has, or starts, the node of Ray of a fleet on this machine."""
     with suppress(OSError), (folder / "lock").open() as file:
@@ -362,11 +358,6 @@ def _only(fleets: Sequence[str], where: str) -> str:
         help_ = f"say which (--name), there are {', '.join(fleets)}" if fleets else "start one with catstream fleet up"
         raise FleetError(f"{len(fleets)} fleets run on {where}: {help_}")
     return fleets[0]
-
-
-def _about(lines: Iterable[str], names: Collection[str]) -> list[str]:
-    """The lines of a change about some streams."""
-    return [line for line in lines if line.partition(":")[0] in names]
 
 
 def _models(streams: Iterable[StreamSpec]) -> dict[tuple[str, str], bytes]:

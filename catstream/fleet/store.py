@@ -74,7 +74,6 @@ class Store:
     def __init__(self, url: str) -> None:
         self._url, self._folder = _parse(url)
         require_extra("fleet")
-        self._checked = False
 
     def __repr__(self) -> str:
         return f"Store({self._url!r})"
@@ -93,17 +92,34 @@ class Store:
         return StateStore(self, f"models/{stream}/{_NO_NAME if name == UNNAMED else check_name(name)}")
 
     def check(self) -> None:
-        """Create the folder of the store, and raise StoreError if it cannot be used. A bucket has to exist."""
+        """Create the folders of the store; StoreError if it cannot be used.
+
+        A bucket has to exist, on a server that creates exclusively.
+        """
         if self._folder is not None:
             with self._errors("", "created"):
-                self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self._check()
+                for folder in (self._folder, *map(self._folder.joinpath, _FOLDERS)):
+                    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            return
+        try:
+            for _ in range(2):
+                self.create(_PROBE, b"")
+        except FileExistsError:
+            return
+        raise StoreError(
+            f"the store {self._url} is on a server that ignores If-None-Match, so that two processes could write the "
+            "state of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
+        )
 
     def create(self, name: str, data: bytes) -> None:
         """Create an object; FileExistsError if there is one of this name."""
-        if not self._checked:
-            self._check()
-        self._put(name, data)
+        from obstore.exceptions import AlreadyExistsError
+
+        with self._errors(name, "written"):
+            try:
+                self._store.put(name, data, mode="create")
+            except AlreadyExistsError:  # also: another process creates it at this moment
+                raise FileExistsError(name) from None
 
     def read(self, name: str) -> bytes:
         """Return the content of an object; FileNotFoundError if there is none."""
@@ -140,35 +156,6 @@ class Store:
             retry_config={"max_retries": 0},
             disable_bulk_delete=True,  # one object each time, and not all servers have it
         )
-
-    def _put(self, name: str, data: bytes) -> None:
-        from obstore.exceptions import AlreadyExistsError
-
-        with self._errors(name, "written"):
-            try:
-                self._store.put(name, data, mode="create")
-            except AlreadyExistsError:  # also: another process creates it at this moment
-                raise FileExistsError(name) from None
-
-    def _check(self) -> None:
-        """Raise StoreError if the store is not there, or does not create objects exclusively."""
-        with self._errors(_PROBE, "written"):
-            if self._folder is not None and self._store:
-                for name in _FOLDERS:
-                    (self._folder / name).mkdir(mode=0o700, exist_ok=True)
-                self._checked = True
-        for _ in range(2):
-            if self._checked:
-                return
-            try:
-                self._put(_PROBE, b"")
-            except FileExistsError:
-                self._checked = True
-        if not self._checked:
-            raise StoreError(
-                f"the store {self._url} is on a server that ignores If-None-Match, so that two processes could write "
-                "the state of one stream: use a server that supports it, such as AWS S3 or a current MinIO"
-            )
 
     @contextlib.contextmanager
     def _errors(self, name: str, what: str) -> Iterator[None]:

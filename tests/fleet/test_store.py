@@ -138,7 +138,7 @@ def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
 
 
 def test_only_its_owner_may_enter_the_folders_of_a_store(tmp_path):
-    Store(str(tmp_path)).fleet.put({"fleet": b"rtsp://user:password@camera"}, {})
+    Store(str(tmp_path)).check()
     assert [stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()] == [0o700] * 3
 
 
@@ -240,7 +240,7 @@ def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
     store = Store("s3://fleet/overwrites")
     monkeypatch.setattr(S3Store, "put", lambda *given, **_: obstore.put(*given))
     with pytest.raises(StoreError, match="ignores If-None-Match"):
-        store.stream("cam-7").claim()
+        store.check()
 
 
 @pytest.mark.parametrize(
