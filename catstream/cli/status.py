@@ -115,7 +115,7 @@ def status(address: Address, as_json: bool, wait: float) -> None:
 
 def _collect(address: Address, seconds: float) -> Status:
     """Collect reports until there are two of the detector, for its rate, and one of each other process."""
-    clock, found = RunningClock(), Status(str(address), processes={})
+    clock, found = RunningClock(), Status(str(address))
     with subscribe(address, "health") as health:
         while not found.ok or found.frames_per_second is None:
             if (remaining := seconds - clock()) <= 0:

@@ -3,13 +3,12 @@
 A dahlia moves over a picture of a lake while the camera pans. It rotates and
 changes its size, the brightness changes, a dahlia of another colour crosses
 it, a pagoda occludes it, and it leaves the image and returns at another place.
-The same arguments give the same pixels. `Sprite` and `Lake` serve other rendered
-videos, too.
+The same arguments give the same pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +18,6 @@ import numpy as np
 from numpy import random  # now: numpy would import it at its first use, and lose a Ctrl-C meanwhile
 
 from catstream.base.box import Box
-from catstream.base.names import UNNAMED
 from catstream.video.writer import VideoWriter
 
 #: Number of different frames, and frames per second.
@@ -28,9 +26,7 @@ FRAMES, RATE = 600, 30.0
 #: Full size (width, height) of the rendered images in pixels.
 SIZE = (640, 480)
 
-#: If a smaller share of a sprite is visible, its object counts as absent.
-VISIBLE = 0.1
-
+_VISIBLE = 0.1  # if a smaller share of the dahlia is visible, it counts as absent
 _DAHLIA = (308, 221)  # centre of the dahlia in its photograph, in pixels
 _NOISE = 4.0  # standard deviation of the sensor noise, in grey levels
 _NOISES = 4096  # different images of noise, one after the other
@@ -124,10 +120,12 @@ class Demo:
     """
 
     def __init__(self, size: tuple[int, int] = SIZE, seed: int = 0) -> None:
-        self.size = size
-        self.lake = Lake(_ZOOM, random.default_rng(seed))
-        shape = self.lake.picture.shape[:2]
-        pagoda = cv2.fillPoly(np.zeros(shape, np.float32), [(_PAGODA * _ZOOM).astype(np.int32)], 1.0)
+        self.size, lake, rng = size, load_photograph("china"), random.default_rng(seed)
+        self.lake = cv2.resize(lake, None, fx=_ZOOM, fy=_ZOOM, interpolation=cv2.INTER_CUBIC).clip(0, 255)
+        self.noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
+        self.corners = rng.integers(SIZE[::-1], size=(_NOISES, 2))  # of the part of the noise in each image
+        outline = (_PAGODA * _ZOOM).astype(np.int32)
+        pagoda = cv2.fillPoly(np.zeros(self.lake.shape[:2], np.float32), [outline], 1.0)
         self.pagoda = cv2.GaussianBlur(pagoda, (0, 0), 1.2)
         self.dahlia = cut_out_dahlia(load_photograph("flower"))
         self.decoy = replace(self.dahlia, colours=self.dahlia.colours[..., [2, 0, 1]] * np.float32(0.9))
@@ -142,14 +140,21 @@ class Demo:
         left, top, light = self.camera[frame]
         sway = 3 * np.sin(frame / np.array([7.3, 5.1]))  # camera shake
         view = np.array([[1, 0, -left - sway[0]], [0, 1, -top - sway[1]]])  # lake -> picture
-        image, front = self.lake.crop(view), cv2.warpAffine(self.pagoda, view, SIZE)
+        image = cv2.warpAffine(self.lake, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
+        front = cv2.warpAffine(self.pagoda, view, SIZE)
 
         self.decoy.paint(image, self.decoy.transform(self.away[frame], view), 1 - front)
         transform = self.dahlia.transform(self.flight[frame], view)
         visible = self.dahlia.paint(image, transform, 1 - front if frame <= _BEHIND else np.ones_like(front))
-        box = self.dahlia.box(transform) if visible >= VISIBLE else None
-        image, boxes = resized(self.lake.with_noise(image * np.float32(light), number), {UNNAMED: box}, self.size)
-        return image, boxes[UNNAMED]
+        y, x = self.corners[number % _NOISES]
+        noisy = image * np.float32(light) + self.noise[y : y + SIZE[1], x : x + SIZE[0]]
+        picture = noisy.clip(0, 255).astype(np.uint8)
+        box = self.dahlia.box(transform) if visible >= _VISIBLE else None
+        if self.size == SIZE:
+            return picture, box
+        wide, high = self.size[0] / SIZE[0], self.size[1] / SIZE[1]
+        box = box and Box(box.x * wide, box.y * high, box.w * wide, box.h * high)
+        return cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA), box
 
 
 def _interpolate(keys: np.ndarray) -> np.ndarray:
@@ -220,36 +225,6 @@ class Sprite:
         """Return the top left and bottom right corners of the object in the picture."""
         points = self.outline @ turn[:, :2].T + turn[:, 2]
         return points.min(axis=0), points.max(axis=0)
-
-
-class Lake:
-    """The picture of the lake, enlarged, over which sprites move, and the sensor noise of the camera."""
-
-    def __init__(self, zoom: float, rng: random.Generator) -> None:
-        photograph = load_photograph("china")
-        self.picture = cv2.resize(photograph, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC).clip(0, 255)
-        self._noise = rng.normal(scale=_NOISE, size=(2 * SIZE[1], 2 * SIZE[0], 3)).astype(np.float32)
-        self._corners = rng.integers(SIZE[::-1], size=(_NOISES, 2))
-
-    def crop(self, view: np.ndarray) -> np.ndarray:
-        """Return the part in the field of view, float32 (h, w, 3), 0 to 255; `view` maps it to the image."""
-        return cv2.warpAffine(self.picture, view, SIZE, borderMode=cv2.BORDER_REFLECT_101)
-
-    def with_noise(self, image: np.ndarray, number: int) -> np.ndarray:
-        """Return an image with the noise of a number, uint8."""
-        y, x = self._corners[number % _NOISES]
-        return (image + self._noise[y : y + SIZE[1], x : x + SIZE[0]]).clip(0, 255).astype(np.uint8)
-
-
-def resized(
-    image: np.ndarray, boxes: Mapping[str, Box | None], size: tuple[int, int]
-) -> tuple[np.ndarray, dict[str, Box | None]]:
-    """Return an image of full size and its boxes in another size; if it is not 4:3, they are stretched."""
-    if size == SIZE:
-        return image, dict(boxes)
-    x, y = size[0] / SIZE[0], size[1] / SIZE[1]
-    scaled = {name: box and Box(box.x * x, box.y * y, box.w * x, box.h * y) for name, box in boxes.items()}
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), scaled
 
 
 def cut_out_dahlia(photograph: np.ndarray) -> Sprite:
