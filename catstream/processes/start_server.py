@@ -45,6 +45,7 @@ NAMES = ("detector", "compressor", "trainer")
 _LOOK_SECONDS = 0.01  # from one look at a process that starts or ends to the next
 _EXIT_SECONDS = 1.0  # limit for a server that has closed its sockets to end
 _LONGEST = 1 << 16  # bytes of a request
+_MOST_DESCRIPTORS = 1 << 16  # of a server: not the limit, which may be a thousand million that are closed one by one
 #: The limits to which glibc raises its own: of freed memory that it keeps, and of arrays that it does not map alone.
 #: With lower ones, the kernel clears new pages for each sample and checkpoint: a twentieth of a compressor's time. Each
 #: process releases its memory once a second. All threads share one arena: what one has freed, another can use.
@@ -275,8 +276,8 @@ def _run(request: dict[str, str], parent: int, log: int, memory: int) -> None:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.dup2(log, sys.stderr.fileno())
-        os.closerange(3, memory)
-        os.closerange(memory + 1, os.sysconf("SC_OPEN_MAX"))
+        os.closerange(3, memory)  # the descriptors of the server, which are few
+        os.closerange(memory + 1, _MOST_DESCRIPTORS)
         with suppress(OSError):  # it was removed
             os.chdir(request["folder"])
         gc.enable()
