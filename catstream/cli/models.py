@@ -96,21 +96,21 @@ def find(
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
     search = Search(load_models(models), reading, threshold, every, sizes)
     files = find_files(paths)
-    columns = text("file {task.completed}/{task.total}  {task.fields[frame]}  {task.description}", last=True)
+    columns = text("file {task.completed}/{task.total}  {task.fields[place]}  {task.description}", last=True)
     interrupted = False
     with Results(output, search.digest, overwrite=overwrite) as results:
         try:
             with one_thread(opencv=True), line_of(messages(), columns) as progress:
-                task = progress.add_task("", total=len(files), frame="")
+                task = progress.add_task("", total=len(files), place="")
                 for number, file in enumerate(files):
                     if results.has(file):
                         continue
-                    result = FileResult.of(file.path, search.digest, every)
+                    result = FileResult.of(file, search.digest, every)
                     try:
-                        for frame, detections in search.file(file, result):
+                        for frame, detections in search.file(file, result.problems):
                             result.add(frame, detections)
-                            place = f"frame {frame.number + 1}/{result.frames or '?'}"
-                            progress.update(task, completed=number, description=file.path.name, frame=place)
+                            place = f"{clock(frame.time)}, {counted(len(result.intervals), 'interval')}"
+                            progress.update(task, completed=number, description=file.path.name, place=place)
                     except VideoError as error:
                         result.problems.append(str(error))
                     with INTERRUPTS.deferred():

@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from catstream.base.addresses import is_live, without_password
@@ -31,18 +31,6 @@ _GENERATED = {
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True, kw_only=True)
-class Reading:
-    """The length and the problems of a file, which become known while it is read.
-
-    frames    number of its frames, None if unknown
-    problems  reasons for what could not be read: each image, or at the end of a video the frames that were skipped
-    """
-
-    frames: int | None = None
-    problems: list[str] = field(default_factory=list)
-
-
 @dataclass(frozen=True, slots=True)
 class File:
     """A video, a folder of images, or a single image.
@@ -54,19 +42,19 @@ class File:
     path: Path
     pages: tuple[tuple[Path, int], ...] = ()
 
-    def frames(self, every: float, settings: RunSettings, reading: Reading) -> Generator[NamedFrame]:
+    def frames(self, every: float, settings: RunSettings, problems: list[str]) -> Generator[NamedFrame]:
         """Yield the frames to search: all images; of a video the first one in each `every` seconds, and the last one.
 
-        A video that is damaged raises VideoError after the frames before the damage.
+        A video that is damaged raises VideoError after the frames before the damage. What else could not be read, an
+        image or frames of a video that were skipped, is added to `problems`.
         """
         if self.path.is_symlink() and not self.path.exists():
             raise VideoError(f"{str(self.path)!r} is a dead link: {str(self.path.readlink())!r} does not exist")
-        return self._of_images(settings, reading) if self.pages else self._of_video(every, settings, reading)
+        return self._of_images(settings, problems) if self.pages else self._of_video(every, settings, problems)
 
-    def _of_video(self, every: float, settings: RunSettings, reading: Reading) -> Generator[NamedFrame]:
+    def _of_video(self, every: float, settings: RunSettings, problems: list[str]) -> Generator[NamedFrame]:
         # Not in equal numbers of frames: the rate of a file may be nominal, and its frames need not be regular.
         with open_source(self.path, settings=settings, resize=True) as source:
-            reading.frames = source.frames
             before, last = -1.0, None
             with closing(read_ahead(source)) as frames:
                 for frame in frames:
@@ -80,16 +68,16 @@ class File:
             if scaled := source.counters.get("scaled"):
                 _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
             if skipped := source.counters.get("damaged"):
-                reading.problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
+                problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
             if missing := source.counters.get("truncated"):
-                reading.problems.append(f"{str(self.path)!r} is truncated: it lacks {missing:.0f} s at the end")
+                problems.append(f"{str(self.path)!r} is truncated: it lacks {missing:.0f} s at the end")
 
-    def _of_images(self, settings: RunSettings, reading: Reading) -> Generator[NamedFrame]:
-        reading.frames, read_image = len(self.pages), ImageReader([*self.pages])
+    def _of_images(self, settings: RunSettings, problems: list[str]) -> Generator[NamedFrame]:
+        read_image = ImageReader([*self.pages])
         for number, (path, _) in enumerate(self.pages):
             image = read_image(number)
             if image is None:
-                reading.problems.append(f"cannot read the image {str(path)!r}: it is left out")
+                problems.append(f"cannot read the image {str(path)!r}: it is left out")
             else:
                 yield Frame(number, number / settings.image_rate, image), "" if path == self.path else path.name
 

@@ -18,7 +18,7 @@ from catstream.base.box import Box
 from catstream.base.settings import RunSettings
 from catstream.base.threads import cores
 from catstream.errors import SettingsError, VideoError
-from catstream.finding.files import File, NamedFrame, Reading, find_files
+from catstream.finding.files import File, NamedFrame, find_files
 from catstream.finding.scan import SIZES, THRESHOLD, Match, Scan
 from catstream.jobs.saved_model import SavedModel
 from catstream.video.frames import Frame
@@ -33,22 +33,13 @@ EVERY = 0.2
 class Detection:
     """An object that was detected in a frame.
 
-    Attributes
-    ----------
-    object : str
-        Name of the object.
-    file : str
-        The video, the image, or the folder of images.
-    frame : int
-        Number of the frame, or of the image in its folder; the first one is 0.
-    time : float
-        Seconds since the start of the video.
-    box : Box
-        Box of the object in pixels of the frame.
-    score : float
-        About 1 on the object, near 0 elsewhere; at least the threshold of the search.
-    image : str
-        Name of the file in a folder of images, otherwise empty.
+    object  name of the object
+    file    path of the video, the image, or the folder of images
+    frame   number of the frame, or of the image in its folder; the first one is 0
+    time    seconds since the start of the video
+    box     box of the object in pixels of the frame
+    score   about 1 on the object, near 0 elsewhere; at least the threshold of the search
+    image   name of the file in a folder of images, otherwise empty
     """
 
     object: str
@@ -95,9 +86,9 @@ class Search:
             digest.update(np.array([saved.model.bias, *saved.box[2:]]).tobytes())
         return digest.hexdigest()[:16]
 
-    def file(self, file: File, reading: Reading) -> Iterator[tuple[Frame, list[Detection]]]:
+    def file(self, file: File, problems: list[str]) -> Iterator[tuple[Frame, list[Detection]]]:
         """Search a file, and yield each frame with its detections. At damage, VideoError follows the frames before."""
-        frames = file.frames(self.every, self.settings, reading)
+        frames = file.frames(self.every, self.settings, problems)
         with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
             for (frame, image), results in scanned:
                 place = str(file.path), frame.number, frame.time
@@ -173,18 +164,18 @@ def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[s
 
 
 def _detections(search: Search, files: list[File]) -> Iterator[Detection]:
-    problems: list[VideoError] = []
+    errors: list[VideoError] = []
     for file in files:
-        reading = Reading()
+        problems: list[str] = []
         try:
-            for _, detections in search.file(file, reading):
+            for _, detections in search.file(file, problems):
                 yield from detections
         except VideoError as error:
-            problems.append(error)
+            errors.append(error)
         if file.pages:  # in a video, the caller asked to skip damaged frames
-            problems += map(VideoError, reading.problems)
-    if problems:
-        raise problems[0]
+            errors += map(VideoError, problems)
+    if errors:
+        raise errors[0]
 
 
 def _several(values: _One | Iterable[_One]) -> Iterable[_One]:

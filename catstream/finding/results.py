@@ -16,7 +16,7 @@ import numpy as np
 from catstream.base.box import Box
 from catstream.base.files import open_locked, write_atomically, writing
 from catstream.errors import ServiceError
-from catstream.finding.files import File, Reading
+from catstream.finding.files import File
 from catstream.finding.find import Detection
 from catstream.reports.report import COLOURS, write_page
 from catstream.video.drawing import outline
@@ -43,25 +43,29 @@ class Interval:
 
 
 @dataclass(slots=True)
-class FileResult(Reading):
+class FileResult:
     """The result for one file.
 
     file        path of the video, the image or the folder
     search      digest of the models and options: see `Search.digest`
+    pages       number of its images, 0 for a video
     gap         longest time between two detections of an interval, in seconds
+    problems    reasons for what could not be read
     detections  in the order of the frames
     intervals   of all objects, in the order of their first detection
     """
 
     file: str
     search: str
+    pages: int
     gap: float
+    problems: list[str] = field(default_factory=list)
     detections: list[Detection] = field(default_factory=list)
     intervals: list[Interval] = field(default_factory=list)
 
     @classmethod
-    def of(cls, file: Path, search: str, every: float) -> FileResult:
-        return cls(str(file), search, max(_GAP_SECONDS, _GAP_STEPS * every))
+    def of(cls, file: File, search: str, every: float) -> FileResult:
+        return cls(str(file.path), search, len(file.pages), max(_GAP_SECONDS, _GAP_STEPS * every))
 
     def add(self, frame: Frame, detections: Iterable[Detection]) -> None:
         """Add the detections in a frame.
@@ -126,7 +130,7 @@ class Results(AbstractContextManager["Results"]):
     def has(self, file: File) -> bool:
         """Return True if a file was searched, and a folder of images has as many as it had then."""
         result = self.files.get(str(file.path))
-        return result is not None and (not file.pages or result.frames == len(file.pages))
+        return result is not None and result.pages == len(file.pages)
 
     def add(self, result: FileResult) -> None:
         """Store the result of a file that was searched to its end, or to its damage."""

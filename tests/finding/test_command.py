@@ -126,9 +126,3 @@ def test_a_name_that_is_not_utf_8_stays_in_the_tables_and_the_report(run, video,
     assert code == 0, output
     for name in ("detections.csv", "report.html"):
         assert b"caf\xe9.mp4" in (tmp_path / "found" / name).read_bytes()
-
-
-@pytest.mark.parametrize("sizes", ["1", "a,b"])
-def test_sizes_that_are_not_two_numbers_are_an_error(run, video, sizes):
-    code, output = run(video, "--sizes", sizes)
-    assert (code, "0.5,2" in output) == (2, True)
