@@ -125,31 +125,34 @@ class PipelineFeed:
                 subscription.close()
 
     def _receive(self, endpoint: Endpoint, subscriptions: dict[str, Subscription[Any]]) -> None:
-        """Receive all channels until the pipeline ends or is silent, those that have ended are removed."""
-        last_report, last_read, deadline = monotonic(), 0.0, inf
-        has_reported = False
-        while subscriptions and monotonic() < deadline and not self._stopped.is_set():
-            is_watched = self.viewers or monotonic() - self.pictured < PICTURE_SECONDS
-            if is_watched and deadline == inf and "previews" not in subscriptions:
+        """Receive all channels until the pipeline ends or is silent; a channel that has ended is removed."""
+        last_report, has_reported, next_read = monotonic(), False, 0.0
+        over = inf  # after the first end, when to stop waiting for the last messages of the others
+        while subscriptions and (now := monotonic()) < over and not self._stopped.is_set():
+            # Step 1: receive pictures only while they are looked at.
+            is_watched = self.viewers or now - self.pictured < PICTURE_SECONDS
+            if is_watched and over == inf and "previews" not in subscriptions:
                 subscriptions["previews"] = Subscription(endpoint, "previews", timeout=0.0)
             elif not is_watched and "previews" in subscriptions:
                 subscriptions.pop("previews").close()
-            due = monotonic() - last_read >= READ_SECONDS
-            last_read = monotonic() if due else last_read
-            for channel, messages in list(subscriptions.items()):
-                if not (due or channel == "tracks") or (message := _next(messages)) is None:
+            # Step 2: wait for a track; look at the other channels less often than tracks may arrive.
+            is_due = now >= next_read
+            next_read = now + READ_SECONDS if is_due else next_read
+            for channel in list(subscriptions) if is_due else [name for name in subscriptions if name == "tracks"]:
+                if (message := _next(subscriptions[channel])) is None:
                     continue
                 now = monotonic()
-                if deadline == inf or not isinstance(message, End):  # the next pipeline may have begun at this place
-                    self._call(self.dashboard.take, message, now, messages.run)
+                if over == inf or not isinstance(message, End):  # the next pipeline may have begun at this endpoint
+                    self._call(self.dashboard.take, message, now, subscriptions[channel].run)
                 if channel == "health":
                     last_report, has_reported = now, True
                 if isinstance(message, End):
                     # The last health report, with the final size of the trees, and the last picture may follow.
-                    deadline = min(deadline, now + DRAIN_SECONDS)
+                    over = min(over, now + DRAIN_SECONDS)
                     self._has_end.set()
                     subscriptions.pop(channel).close()
-            if deadline == inf and monotonic() - last_report > SILENCE_SECONDS:
+            # Step 3: without health reports, the pipeline is silent.
+            if over == inf and monotonic() - last_report > SILENCE_SECONDS:
                 if has_reported:
                     raise SilenceError(f"no health report arrived from {endpoint} within {SILENCE_SECONDS:g} s")
                 raise SilenceError(
