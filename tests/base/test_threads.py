@@ -128,8 +128,8 @@ def test_a_model_has_the_same_bits_in_any_order_of_imports_and_on_any_number_of_
             text=True,
             preexec_fn=lambda some=some: os.sched_setaffinity(0, some),
         )
-        for imports, some in ((FIRST, cores[:1]), (FIRST, cores[:2]), (LAST, cores[:2]))
+        for imports, some in ((FIRST, cores[:1]), (LAST, cores[:2]))
     ]
     lines = [process.communicate()[0] for process in started]
-    assert [process.returncode for process in started] == [0] * 3
+    assert [process.returncode for process in started] == [0] * 2
     assert len(set(lines)) == 1, lines
