@@ -115,7 +115,7 @@ def boxes(records: Records) -> str:
     ]
     return _block(
         f"""**Little on average: over four boxes that differ by at most 2 %, the AUC is {rows[0][3]:.3f} in place of
-        {rows[0][1]:.3f}.** On new sequences it is lower than on those of the choice of the defaults: expect
+        {rows[0][1]:.3f}.** On new sequences, expect
         {rows[2][3]:.2f} to {rows[2][1]:.2f}.""",
         ("sequences", "AUC, true box", "success", "AUC, mean of four boxes", "success"),
         rows,
