@@ -15,13 +15,12 @@ import json
 import os
 import sys
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import groupby, pairwise
-from math import isfinite, isnan, nan
+from math import isfinite, isnan
 from pathlib import Path
 from typing import IO, Any, get_args
 
@@ -213,43 +212,38 @@ class Log:
         if self.path.suffix == ".sqlite":
             yield from read_database(self.path)
             return
-        rows: Iterator[tuple[Track, float]] = ((track, seconds) for track, seconds, _ in self._rows())
-        if any(one.frame > other.frame for (one, _), (other, _) in pairwise(rows)):
-            rows = iter(sorted(((track, seconds) for track, seconds, _ in self._rows()), key=lambda row: row[0].frame))
+        tracks: Iterable[Track] = (track for track, _ in self._rows())
+        if any(one.frame > other.frame for one, other in pairwise(tracks)):
+            tracks = sorted((track for track, _ in self._rows()), key=lambda track: track.frame)
         else:
-            rows = ((track, seconds) for track, seconds, _ in self._rows())
-        for number, group in groupby(rows, lambda row: row[0].frame):
-            tracks, seconds = zip(*group, strict=True)
-            names = [track.object for track in tracks]
+            tracks = (track for track, _ in self._rows())
+        for number, group in groupby(tracks, lambda track: track.frame):
+            frame = TrackedFrame([*group])
+            names = [track.object for track in frame.tracks]
             if twice := {name for name in names if names.count(name) > 1}:
                 raise VideoError(f"{self.path} has two rows of {listed(sorted(twice))} in frame {number}: remove one")
-            yield TrackedFrame([*tracks], seconds[-1])
+            yield frame
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         return self.frames()
 
-    def whole_frames(self) -> Iterator[tuple[TrackedFrame, int]]:
-        """Yield each frame, and the byte at which it ends; except for a last one that may be incomplete."""
-        if self.path.suffix == ".sqlite":  # a frame is one transaction
-            yield from ((frame, 0) for frame in read_database(self.path))
-            return
-        last: tuple[TrackedFrame, int] | None = None
-        before = _FIRST
-        for _, group in groupby((row for row in self._rows() if row[2]), lambda row: row[0].frame):
-            if last is not None:
-                yield last
-                before = _objects(last[0])
-            rows = [*group]
-            last = TrackedFrame([track for track, _, _ in rows]), rows[-1][2]
-        if last is not None and before <= _objects(last[0]):
-            yield last
-
     def last_whole_frame(self) -> tuple[TrackedFrame | None, int]:
-        """Return the last one of them, None if there is none, and the byte at which it ends."""
-        return next(iter(deque(self.whole_frames(), maxlen=1)), (None, 0))
+        """Return the last frame that is complete, None if there is none, and the byte at which it ends."""
+        last: tuple[TrackedFrame | None, int] = (None, 0)
+        if self.path.suffix == ".sqlite":  # a frame is one transaction
+            for frame in read_database(self.path):
+                last = frame, 0
+            return last
+        before = last
+        for _, group in groupby((row for row in self._rows() if row[1]), lambda row: row[0].frame):
+            rows = [*group]
+            before, last = last, (TrackedFrame([track for track, _ in rows]), rows[-1][1])
+        # The last frame is complete if it has all objects of the frame before it.
+        required = _FIRST if before[0] is None else _objects(before[0])
+        return last if last[0] is None or required <= _objects(last[0]) else before
 
-    def _rows(self) -> Iterator[tuple[Track, float, int]]:
-        """Yield each track, the processing time of its frame, and the byte at which its line ends; 0 without an end."""
+    def _rows(self) -> Iterator[tuple[Track, int]]:
+        """Yield each track, and the byte at which its line ends; 0 without an end."""
         self.damaged = 0
         if not self.path.exists():
             return
@@ -263,14 +257,14 @@ class Log:
                     self._report(problem)
                     problem = ""
                 try:
-                    track, seconds = parse(line.decode("utf-8-sig"))
+                    track = parse(line.decode("utf-8-sig"))
                 except (KeyError, TypeError, ValueError, ProtocolError) as error:
                     if Head.from_json(line) is not None:  # the first line, or that of a log which was joined to another
                         continue
                     problem = f"{self.path}, line {number} is no track ({error})"
                     is_cut = not line.endswith(b"\n") or not line.strip()
                 else:
-                    yield track, seconds, end if line.endswith(b"\n") else 0
+                    yield track, end if line.endswith(b"\n") else 0
         if problem and not is_cut:
             self._report(problem)
 
@@ -280,10 +274,10 @@ class Log:
             raise VideoError(f"{problem}: pass --skip-damaged to continue after it")
         self.damaged += 1
 
-    def _parser(self) -> Callable[[str], tuple[Track, float]]:
+    def _parser(self) -> Callable[[str], Track]:
         """Return the function that parses a line; VideoError if the names of the columns of a CSV file are wrong."""
         if self.path.suffix != ".csv":
-            return _parse_json
+            return lambda line: decode_json(line.encode(), Track)
         with self.path.open(encoding="utf-8-sig", errors="replace") as file:
             first = file.readline().strip()
         separator = max(",;\t", key=first.count)
@@ -291,7 +285,7 @@ class Log:
         if first and (missing := [column for column in _COLUMNS if column not in (*columns, *_OPTIONAL)]):
             raise VideoError(f"{self.path} lacks the column {listed(missing)}: its first line has to name the columns")
 
-        def parse(line: str) -> tuple[Track, float]:
+        def parse(line: str) -> Track:
             values = next(csv.reader([line.strip("\r\n")], delimiter=separator), [])
             if len(values) < len(columns):
                 raise ValueError(f"{len(values)} values for {len(columns)} columns")
@@ -300,19 +294,14 @@ class Log:
         return parse
 
 
-def _parse_json(line: str) -> tuple[Track, float]:
-    """The track of a line; raise ProtocolError if it is none. Fields that a track lacks are ignored."""
-    return decode_json(line.encode(), Track), nan
+def _parse_row(row: Mapping[str, str]) -> Track:
+    """The track of a row of a CSV file; raise ValueError or KeyError if it is none.
 
-
-def _parse_row(row: Mapping[str, str]) -> tuple[Track, float]:
-    """The same of a row of a CSV file; raise ValueError or KeyError if it is none.
-
-    The track has no `pts`, `began` and `doubtful`, which are not in the file.
+    It has no `pts`, `began` and `doubtful`, which are not in the file.
     """
     box = Box(*(_number(row[side]) for side in "xywh")) if row["x"] else None
     frame = _integer(row["frame"])
-    track = Track(
+    return Track(
         *(frame, _number(row["seconds"]), _STATES[row["state"]], box, _number(row["score"])),
         model_version=_integer(row["model_version"]),
         object=check_name(row["object"]),
@@ -320,7 +309,6 @@ def _parse_row(row: Mapping[str, str]) -> tuple[Track, float]:
         checked=_CHECKS[row.get("checked") or ""],
         probability=_number(row["probability"]) if row.get("probability") else None,
     )
-    return track, _number(row["processing"]) if row.get("processing") else nan
 
 
 def _number(text: str) -> float:

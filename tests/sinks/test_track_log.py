@@ -9,7 +9,6 @@ import tempfile
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from itertools import product
-from math import isnan
 from pathlib import Path
 
 import pytest
@@ -69,7 +68,6 @@ def test_an_open_file_is_read_back_up_to_a_line_that_a_power_cut_tore(tmp_path, 
             path.write_bytes(whole + torn)
             found = list(Log(path).frames())
             assert [frame.tracks for frame in found] == [[track] for track in kept]
-        assert isnan(found[1].seconds) if suffix == ".ndjson" else found[1].seconds == 0.25
     assert list(Log(tmp_path / f"none{suffix}").frames()) == []
 
 
