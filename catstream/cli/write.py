@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial, wraps
+from functools import wraps
 from inspect import cleandoc
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import click
@@ -22,10 +21,10 @@ from catstream.cli.options import Command, with_overwrite
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SettingsError, SilenceError
-from catstream.sinks import destinations
 from catstream.sinks.destinations import SINKS, Head, Origin, TrackedFrame
 from catstream.sinks.events import check_zones
 from catstream.sinks.options import OPTIONS, parse
+from catstream.sinks.track_log import RunFiles
 
 _REPORTS = 12  # of all processes, in which one of the detector says what it tracks: those of four seconds
 
@@ -118,10 +117,8 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
         options = parse(values, places, _flag)
     except SettingsError as error:
         raise click.UsageError(str(error)) from None
-    for place in places:
-        destinations.check_sink(place, options)
-        if destinations.is_file(place):
-            destinations.check_result(Path(place), overwrite=overwrite)
+    files = RunFiles(Origin(options=options), None, [*dict.fromkeys(places)])
+    files.check(overwrite=overwrite, earlier=[])
     written, reason, run = 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     address = address.with_endpoint()
@@ -130,10 +127,9 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
             wait_for_pipeline(address, wait)
             origin = Origin(_head(address), address, options, attached=True)
             check_zones(options.zone, origin.head.size)
-            opened = (destinations.open_sink(place, origin) for place in dict.fromkeys(places))
-            sinks = [stack.enter_context(closing(sink)) for sink in opened]
+            outputs = stack.enter_context(replace(files, origin=origin).opened(address.endpoint))
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
-            for track in with_silence_warnings(tracks, partial(destinations.idle, sinks)):
+            for track in with_silence_warnings(tracks, outputs.idle):
                 run = run or tracks.run
                 if tracks.run != run and not address.stream:  # a stream of a fleet may move
                     reason = ": the run had no end, and another one started"
@@ -142,8 +138,7 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
                 if track.frame < max(newest.values(), default=-1) or track.frame == newest.get(track.object):
                     continue
                 with INTERRUPTS.deferred():  # a track is written everywhere or nowhere
-                    for sink in sinks:
-                        sink.write(TrackedFrame([track]))
+                    outputs.write(TrackedFrame([track]))
                     written, newest[track.object] = written + 1, track.frame
                 status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:

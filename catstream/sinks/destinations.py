@@ -8,7 +8,7 @@ are made from a log afterwards.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
@@ -247,10 +247,3 @@ def redacted(place: str) -> str:
 def open_sink(place: str, origin: Origin) -> Sink:
     """Open the sink of a destination; raises VideoError if that is not possible."""
     return cast(Sink, sink_of(place).load()(place, origin))
-
-
-def idle(sinks: Iterable[Sink]) -> None:
-    """Tell sinks that no frame has arrived for a while."""
-    for sink in sinks:
-        if hasattr(sink, "idle"):
-            sink.idle()

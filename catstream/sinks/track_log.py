@@ -39,7 +39,6 @@ from catstream.sinks.destinations import (
     TrackedFrame,
     check_result,
     check_sink,
-    idle,
     is_file,
     open_sink,
 )
@@ -446,7 +445,9 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
 
     def idle(self) -> None:
         """Tell the destinations that no frame has arrived for a while."""
-        idle(self._sinks)
+        for sink in self._sinks:
+            if hasattr(sink, "idle"):
+                sink.idle()
 
     def __exit__(self, *details: Any) -> None:
         self._stack.__exit__(*details)
