@@ -76,7 +76,7 @@ def find(
     OUTPUT FILES
       report.html     a picture of the best detection in each interval
       detections.csv  a row for each detection: file, object, frame, time, box, score
-      results.ndjson  a line for each searched file: detections, intervals, problems
+      results.ndjson  a line for each searched file: intervals, problems
 
     The score is about 1 on the object. Raise --threshold if there are false
     positives; lower it, or train on more frames, if the object is missed.
@@ -90,7 +90,7 @@ def find(
     with INTERRUPTS.leaving():
         from catstream.finding.files import find_files
         from catstream.finding.find import Search, load_models
-        from catstream.finding.results import FileResult, Results, intervals_of, write_csv, write_report
+        from catstream.finding.results import FileResult, SearchResults, write_csv, write_report
         from catstream.reports.report import clock
 
     reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
@@ -98,7 +98,7 @@ def find(
     files = find_files(paths)
     columns = text("file {task.completed}/{task.total}  {task.fields[place]}  {task.description}", last=True)
     interrupted = False
-    with Results(output, search.digest, overwrite=overwrite) as results:
+    with SearchResults(output, search.digest, overwrite=overwrite) as results:
         try:
             with one_thread(opencv=True), line_of(messages(), columns) as progress:
                 task = progress.add_task("", total=len(files), place="")
@@ -119,16 +119,16 @@ def find(
             interrupted = True
         with INTERRUPTS.deferred():
             found = list(results.files.values())
-            write_csv(output / "detections.csv", found)
-            report = write_report(output / "report.html", search.models, found)
+            intervals = [interval for result in found for interval in result.intervals]
+            write_csv(output / "detections.csv", intervals)
+            intervals.sort(key=lambda interval: -interval.best.score)
+            report = write_report(output / "report.html", search.models, found, intervals)
 
-    intervals = sorted(intervals_of(found), key=lambda interval: -interval.best.score)
     numbers = ("from", "to", "detections", "score")
     best = table("object", "file", *numbers, right=numbers)
     for interval in intervals[:_PRINTED]:
-        first, last = interval.first, interval.last
-        times = clock(first.time), clock(last.time)
-        best.add_row(first.object, first.file, *times, str(interval.count), f"{interval.best.score:.2f}")
+        figures = (*map(clock, interval.times), str(len(interval.detections)), f"{interval.best.score:.2f}")
+        best.add_row(interval.best.object, interval.best.file, *figures)
     if intervals:
         screen().print(best)
     if len(intervals) > _PRINTED:

@@ -30,29 +30,28 @@ _PICTURES = 200  # of each object, at most
 
 @dataclass(slots=True)
 class Interval:
-    """Consecutive detections of one object in a file: the first, the last and the best one, their number, and a JPEG.
+    """Consecutive detections of one object in a file, the best of them, and a JPEG of it with its surroundings."""
 
-    picture  the best detection with its surroundings
-    """
-
-    first: Detection
-    last: Detection
+    detections: list[Detection]
     best: Detection
-    count: int = 1
     picture: bytes = b""
+
+    @property
+    def times(self) -> tuple[float, float]:
+        """Times of the first and the last detection in seconds."""
+        return self.detections[0].time, self.detections[-1].time
 
 
 @dataclass(slots=True)
 class FileResult:
     """The result for one file.
 
-    file        path of the video, the image or the folder
-    search      digest of the models and options: see `Search.digest`
-    pages       number of its images, 0 for a video
-    gap         longest time between two detections of an interval, in seconds
-    problems    reasons for what could not be read
-    detections  in the order of the frames
-    intervals   of all objects, in the order of their first detection
+    file       path of the video, the image or the folder
+    search     digest of the models and options: see `Search.digest`
+    pages      number of its images, 0 for a video
+    gap        longest time between two detections of an interval, in seconds
+    problems   reasons for what could not be read
+    intervals  of all objects, in the order of their first detection
     """
 
     file: str
@@ -60,7 +59,6 @@ class FileResult:
     pages: int
     gap: float
     problems: list[str] = field(default_factory=list)
-    detections: list[Detection] = field(default_factory=list)
     intervals: list[Interval] = field(default_factory=list)
 
     @classmethod
@@ -74,15 +72,13 @@ class FileResult:
         model is of one object, so its intervals never overlap.
         """
         for detection in detections:
-            self.detections.append(detection)
-            own = (interval for interval in reversed(self.intervals) if interval.first.object == detection.object)
+            own = (interval for interval in reversed(self.intervals) if interval.best.object == detection.object)
             interval = next(own, None)
-            if interval is None or detection.time - interval.last.time > self.gap:
-                interval = Interval(detection, detection, detection)
+            if interval is None or detection.time - interval.times[1] > self.gap:
+                interval = Interval([], detection)
                 self.intervals.append(interval)
-            else:
-                interval.last, interval.count = detection, interval.count + 1
-                interval.best = max(interval.best, detection, key=lambda at: at.score)
+            interval.detections.append(detection)
+            interval.best = max(interval.best, detection, key=lambda at: at.score)
             if interval.best is detection:
                 interval.picture = _picture(frame.image, detection.box)
 
@@ -98,7 +94,7 @@ def _picture(image: np.ndarray, box: Box) -> bytes:
     return jpeg(picture, _PICTURE)
 
 
-class Results(AbstractContextManager["Results"]):
+class SearchResults(AbstractContextManager["SearchResults"]):
     """The results in a folder: results.ndjson has a line for each file that was searched. Use it in a `with`.
 
     files  the results by the path of the file
@@ -140,27 +136,22 @@ class Results(AbstractContextManager["Results"]):
             self._stream.flush()
 
 
-def intervals_of(results: Iterable[FileResult]) -> list[Interval]:
-    """Return the intervals in all files."""
-    return [interval for result in results for interval in result.intervals]
-
-
-def write_csv(path: Path, results: Iterable[FileResult]) -> None:
+def write_csv(path: Path, intervals: Iterable[Interval]) -> None:
     """Write a row for each detection."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("file", "object", "frame", "seconds", "x", "y", "w", "h", "score", "image"))
-    for at in (detection for result in results for detection in result.detections):
+    for at in (detection for interval in intervals for detection in interval.detections):
         box = (round(value, 2) for value in at.box)
         writer.writerow((at.file, at.object, at.frame, round(at.time, 3), *box, round(at.score, 4), at.image))
     with writing(path):
         write_atomically(path, text.getvalue().encode(errors="surrogateescape"))  # the name of a file need not be UTF-8
 
 
-def write_report(path: Path, objects: Iterable[str], results: Sequence[FileResult]) -> Path:
-    """Write the page of a search: the best detections of each object first."""
+def write_report(path: Path, objects: Iterable[str], results: Sequence[FileResult], intervals: list[Interval]) -> Path:
+    """Write the page of a search: the intervals of each object in the given order."""
     found: dict[str, list[Interval]] = {name: [] for name in objects}
-    for interval in sorted(intervals_of(results), key=lambda interval: -interval.best.score):
+    for interval in intervals:
         found[interval.best.object].append(interval)
     problems = [problem for result in results for problem in result.problems]
     return write_page(path, "finding.html", files=len(results), found=found, most=_PICTURES, problems=problems)

@@ -142,13 +142,14 @@ def test_every_detection_is_in_one_interval_of_its_object(facts):
     ]
     for one in made:
         result.add(Frame(one.frame, one.time, np.zeros((60, 80, 3), np.uint8)), [one])
-    assert sum(interval.count for interval in result.intervals) == len(made)
+    assert sum(len(interval.detections) for interval in result.intervals) == len(made)
     for name in ("anna", "ben"):
-        own = [interval for interval in result.intervals if interval.first.object == name]
-        assert all(one.last.time + 1.0 < other.first.time for one, other in pairwise(own))
+        own = [interval for interval in result.intervals if interval.best.object == name]
+        assert all(one.times[1] + 1.0 < other.times[0] for one, other in pairwise(own))
         for each in own:
-            within = [one for one in made if one.object == name and each.first.time <= one.time <= each.last.time]
-            assert (each.count, each.best.score) == (len(within), max(one.score for one in within))
+            within = [one for one in made if one.object == name and each.times[0] <= one.time <= each.times[1]]
+            assert each.detections == within
+            assert each.best.score == max(one.score for one in within)
 
 
 @pytest.fixture
