@@ -18,7 +18,7 @@ from catstream.sinks.destinations import Head, Origin, TrackedFrame, open_sink
 from catstream.sinks.track_log import Log, RunFiles
 
 TRACKS = [
-    Track(0, 0.0, "bootstrapping", Box(1 / 3, 20.0, 30.5, 40.0), 1.0, 0),
+    Track(0, 0.0, "bootstrapping", Box(1 / 3, 20.0, 30.5, 40.0), 1.0, 0, checked="keyframe", probability=1.0),
     Track(1, 0.04, "absent", None, 0.125, 3, 17.5, "anna", 1),
     Track(3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.43, 4, 18.5, "anna", 1, doubtful=True),
 ]

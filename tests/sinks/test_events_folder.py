@@ -13,7 +13,7 @@ from catstream.client.address import Address
 from catstream.errors import VideoError
 from catstream.messages.kinds import Preview, Track
 from catstream.pipeline import Pipeline
-from catstream.sinks import events_folder, remote
+from catstream.sinks import events_folder
 from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, check_sink, open_sink
 from catstream.wire.channels import PREVIEWS
 from catstream.wire.newest import Publisher
@@ -73,15 +73,6 @@ def test_the_oldest_pictures_are_removed_and_other_files_stay(tmp_path, endpoint
     assert (tmp_path / "holiday.jpg").exists()
     assert kinds(tmp_path)[-2:] == ["returned-anna", "lost-anna"]
     assert sum(file.stat().st_size for file in tmp_path.glob("2*.jpg")) <= 4 * len(image)
-
-
-def test_if_frames_stop_an_event_has_the_last_picture(tmp_path, endpoint, until, image, monkeypatch):
-    monkeypatch.setattr(remote, "_PICTURE_SECONDS", 0.1)
-    with writing(tmp_path, endpoint, until) as (sink, previews):
-        previews.send(Preview(0, 0.0, 640, 480, {}, image))
-        until(lambda: kinds(tmp_path) == ["found-anna"], partial(sink.write, frame(0)))
-        sink.write(frame(30, None))
-        until(lambda: kinds(tmp_path) == ["found-anna", "lost-anna"], sink.idle)
 
 
 def test_a_folder_that_cannot_be_made_is_an_error_before_the_run(tmp_path):

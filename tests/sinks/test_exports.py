@@ -2,9 +2,7 @@
 
 import csv
 import json
-import sqlite3
 from ast import literal_eval
-from contextlib import closing
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -52,17 +50,6 @@ def made(path, name=None, log=LOG, **about):
 def test_mot_counts_from_one_and_has_no_line_for_an_absent_object(tmp_path):
     box = "11.00,21.00,30.50,40.00,0.7500,-1,-1,-1"
     assert made(tmp_path / "t.txt").read_text().splitlines() == [f"1,1,{box}", f"1,2,{box}", f"4,3,{box}", f"4,2,{box}"]
-
-
-def test_a_database_has_a_row_for_each_track(tmp_path):
-    with closing(sqlite3.connect(made(tmp_path / "t.sqlite"))) as database:
-        columns = "frame, seconds, state, x, w, score, model_version, pts, object"
-        assert database.execute(f"SELECT {columns} FROM tracks").fetchall()[1:3] == [
-            (0, 0.0, "present", 10.0, 30.5, 0.75, 4, None, ""),
-            (2, 0.08, "absent", None, None, 0.75, 4, 17.5, ""),
-        ]
-        with pytest.raises(sqlite3.IntegrityError):
-            database.execute("INSERT INTO tracks SELECT * FROM tracks")
 
 
 def test_coco_has_tracks_and_cuts_boxes_at_the_edges_of_the_frame(tmp_path):

@@ -1,7 +1,7 @@
 """What the libraries that people use read in the exports of real runs, beside the CSV file of the same run.
 
 They are installed in `build/readers`, an environment of their own, by the first test: 2 GB, most of it PyTorch for
-Ultralytics. CVAT's importer is a part of its server and no package; `cvat` below follows its rules.
+Ultralytics.
 """
 
 import csv
@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -90,32 +89,6 @@ def boxes_in_csv(folder):
             yield int(row["source_frame"]), number, row["object"], left, top, right - left, bottom - top
 
 
-def cvat(file, frames):
-    """The boxes that CVAT shows after the import of a file into a task of the whole video.
-
-    Its importer refuses frames that the video does not have, and labels that the task does not have. A box holds until
-    the next one of its track, or to the end of the video; between two boxes it moves evenly.
-    """
-    root = ElementTree.parse(file).getroot()
-    labels = {label.text for label in root.iterfind("meta/task/labels/label/name")}
-    for track in root.iterfind("track"):
-        assert track.get("label") in labels
-        keys = {int(box.get("frame")): box for box in track}
-        assert set(keys) <= set(range(frames)), "Unknown frame"
-        sides = {
-            at: np.array([float(box.get(side)) for side in ("xtl", "ytl", "xbr", "ybr")]) for at, box in keys.items()
-        }
-        for frame in range(min(keys), frames):
-            before, after = (
-                max(at for at in keys if at <= frame),
-                min((at for at in keys if at > frame), default=frames),
-            )
-            if keys[before].get("outside") == "0":
-                part = (frame - before) / (after - before) if after in keys else 0
-                left, top, right, bottom = sides[before] + part * (sides.get(after, sides[before]) - sides[before])
-                yield frame, int(track.get("id")) + 1, track.get("label"), left, top, right - left, bottom - top
-
-
 def assert_same(read, expected):
     """Compare boxes; None stands for what a format or a library does not have."""
     read, expected = sorted(read, key=_order), sorted(expected, key=_order)
@@ -147,12 +120,3 @@ def read(run, libraries, tmp_path):
 @pytest.mark.parametrize("reader", READERS)
 def test_a_library_reads_the_boxes_of_the_csv_file(run, read, reader):
     assert_same(read(reader, READERS[reader]), boxes_in_csv(run))
-
-
-def test_cvat_shows_the_boxes_of_the_csv_file_and_none_after_the_last(run):
-    with open_source(run / "walk.mp4" if (run / "walk.mp4").exists() else run / "walk") as source:
-        frames = source.frames
-    expected = [*boxes_in_csv(run)]
-    head = json.loads((run / "walk.ndjson").read_text().partition("\n")[0])
-    tracked = range(head["start"], frames, head["stride"])
-    assert_same([row for row in cvat(run / "walk.xml", frames) if row[0] in tracked], expected)

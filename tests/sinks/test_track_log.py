@@ -26,8 +26,8 @@ from catstream.video.source import open_source
 
 BOX = Box(10.0, 20.0, 30.5, 40.0)
 TRACKS = [
-    Track(0, 0.0, "bootstrapping", BOX, 1.0, 0),
-    Track(1, 0.04, "absent", None, 0.125, 3),
+    Track(0, 0.0, "bootstrapping", BOX, 1.0, 0, checked="keyframe", probability=1.0),
+    Track(1, 0.04, "absent", None, 0.125, 3, checked="checked", probability=0.975),
     Track(3, 0.12, "present", Box(-2.0, 21.0, 30.0, 40.0), 0.75, 4, 17.5),
 ]
 
@@ -52,7 +52,7 @@ def test_each_track_is_in_the_files_at_once(tmp_path):
         rows = list(csv.DictReader(filled(tmp_path / "t.csv", stack).read_text().splitlines()))
     assert objects == [each.to_dict() for each in TRACKS]
     assert list(rows[0].values()) == ["0", "0.000000", "bootstrapping", "10.0000", "20.0000", "30.5000", "40.0000",
-                                      "1.000000", "0", "", "0", "", "", "0.000000"]  # fmt: skip
+                                      "1.000000", "0", "", "0", "keyframe", "1.000000", "0.000000"]  # fmt: skip
     assert [row["state"] for row in rows] == [each.state for each in TRACKS]
     assert [row["processing"] for row in rows] == ["0.000000", "0.250000", "0.750000"]
     assert (rows[1]["x"], rows[1]["h"]) == ("", "")
@@ -345,20 +345,3 @@ def test_logs_that_were_joined_have_a_head_each_and_the_frames_of_both(tmp_path)
     log.write_text("".join(f"{part}\n" for part in parts))
     assert [frame.number for frame in Log(log).frames()] == [0, 1]
     assert Log(log).head() == Head(size=(4, 3))
-
-
-@pytest.mark.parametrize("suffix", [".ndjson", ".csv", ".sqlite"])
-def test_checks_and_probabilities_of_an_annotation_are_read_from_every_log(tmp_path, suffix):
-    checks = [
-        replace(TRACKS[0], checked="keyframe", probability=1.0),
-        replace(TRACKS[1], checked="checked", probability=0.975),
-    ]
-    with closing(open_sink(str(tmp_path / f"t{suffix}"), Origin())) as sink:
-        for each in (*checks, TRACKS[2]):
-            sink.write(TrackedFrame([each]))
-    tracks = [track for frame in Log(tmp_path / f"t{suffix}") for track in frame.tracks]
-    assert [(track.checked, track.probability) for track in tracks] == [
-        ("keyframe", 1.0),
-        ("checked", 0.975),
-        ("", None),
-    ]
