@@ -243,13 +243,13 @@ def down(running: Fleet) -> None:
 
 
 def _tables(status: FleetStatus) -> list[RenderableType]:
-    """The streams, what is wrong with them, a line for each, and the nodes."""
+    """The streams, a line for each problem, and the nodes."""
     troubles = [Text(f"{stream.name}: {stream.trouble}") for stream in status.streams.values() if stream.trouble]
     return [_streams(status), *([Text(), *troubles] if troubles else []), _nodes(status)]
 
 
 def _streams(status: FleetStatus) -> Table:
-    """A row for each stream, those with trouble first."""
+    """A row for each stream, streams with trouble first."""
     numbers = ("frame", "skipped", "model", "present")
     rows = table("stream", "node", "state", *numbers, right=numbers)
     for stream in sorted(status.streams.values(), key=lambda stream: (not stream.trouble, stream.name)):

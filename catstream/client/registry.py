@@ -40,10 +40,10 @@ class Registry(AbstractContextManager["Registry"]):
         fleet = fleet.removeprefix("fleet://").removeprefix("tcp://").rstrip("/")
         self._name, self._endpoint = _remote(fleet, own) if ":" in fleet else _local(fleet, own)
         self._requester = Requester[Question, Listing](REGISTRY, self._endpoint)
-        self._question = ""  # id of the last one that was sent by `request`
+        self._question = ""  # id of the last question of `request`
 
     def streams(self, only: str = "") -> FleetStatus:
-        """The state of all streams and nodes, or that of one stream."""
+        """The state of all streams and nodes, or of one stream."""
         answer = self._requester.ask(Question(uuid4().hex, only), self.timeout)
         if answer is None:
             raise SilenceError(
@@ -130,5 +130,5 @@ def _status(answer: Listing) -> FleetStatus:
 
 
 def described(status: StreamStatus) -> str:
-    """The state of a stream, and what is wrong with it, in words."""
+    """The state of a stream and its trouble, in words."""
     return ", ".join(filter(None, (status.state, status.trouble)))

@@ -202,7 +202,7 @@ class Stream:
         return files
 
     def _sockets(self, stack: ExitStack) -> dict[str, object]:
-        """The settings of the sockets: those of a private folder, or ports of this node with keys made here."""
+        """The settings of the sockets: in a private folder, or on ports of this node with keys made here."""
         if not self._address:
             return {"run.endpoint": "", "run.keys": ""}
         with self._lock:

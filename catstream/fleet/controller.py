@@ -1,7 +1,7 @@
-"""The controller of a fleet: an actor of Ray that compares the streams that should run with the actors that do.
+"""The controller of a fleet: an actor of Ray that compares the desired streams with the running actors.
 
-What should run is in the store, and the streams are actors with names, so a controller that Ray starts again finds
-both, and touches no stream that runs. Ray places a stream, and starts it again elsewhere if its process or its node
+The desired streams are in the store, and actors have names, so a controller that Ray starts again finds both, and
+touches no stream that runs. Ray places a stream, and starts it again elsewhere if its process or its node
 dies. One thread looks at the actors twice a second, and answers the registry in between; calls from
 `catstream.fleet.fleet` come in threads of Ray. Only these use the store, so a store that hangs delays nothing but the
 change that waits for it. What is answered as done is stored.
@@ -138,7 +138,7 @@ class Controller:
         return self._spec
 
     def close(self) -> list[str]:
-        """Stop all streams after their state was stored; returns those that still run."""
+        """Stop all streams after their state was stored; returns the names of the streams that still run."""
         self._phase = "down"
         return sorted(name for name, actor in self._actors.items() if actor.handle is not None)
 
@@ -206,7 +206,7 @@ class Controller:
                 logged = repr(error)
 
     def _turn(self) -> None:
-        """Look at the cluster and the actors, and do what makes them those that should run."""
+        """Compare the actors with the desired streams, and start, stop, restart or kill them."""
         import ray
 
         cluster, existing = nodes(), actors(self._name)  # without the lock: they ask the head
@@ -287,7 +287,7 @@ class Controller:
                 ray.kill(actor.handle)
                 actor.since = now
         elif is_superseded or spec is None or spec.order != actor.order:
-            if is_superseded or not actor.node:  # nothing to store, or nobody to ask
+            if is_superseded or not actor.node:  # it may not store its state, or is not placed
                 ray.kill(actor.handle)
             else:
                 actor.call = actor.handle.stop.remote()

@@ -71,7 +71,7 @@ class Fleet(AbstractContextManager["Fleet"]):
     spec : path or FleetSpec
         The file fleet.toml, or what was read from it. Needed for `up` only.
     name : str
-        Name of the fleet; by default that of the spec, or the only one that runs.
+        Name of the fleet; by default the name in the spec, or the only fleet that runs.
     address : str
         HOST:PORT of the head of a cluster of Ray, of which this machine is a node; by default RAY_ADDRESS. If both are
         empty, the fleet runs on this machine alone.
@@ -105,7 +105,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         return self._owned is not None
 
     def up(self) -> list[str]:
-        """Make the spec the desired state; returns what is done, a line for each stream.
+        """Make the spec the desired state; returns a line for each stream, which describes its change.
 
         What runs and is unchanged is not touched. If the store cannot be used, nothing is started or changed.
         """
@@ -153,7 +153,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         return answer
 
     def down(self) -> list[str]:
-        """Stop all streams after their state was stored, and the controller; on this machine alone, Ray too.
+        """Stop all streams after their state was stored, and the controller; of a local fleet, also Ray.
 
         Returns a line for each stream whose last state could not be stored.
         """
@@ -201,7 +201,7 @@ class Fleet(AbstractContextManager["Fleet"]):
             file = stack.enter_context((self._folder / "lock").open("w"))
             if not lock(file.fileno()):
                 return
-            (self._folder / "address").unlink(missing_ok=True)  # of one that was killed
+            (self._folder / "address").unlink(missing_ok=True)  # of a killed process
             if not (self._folder / "token").exists():
                 write_atomically(self._folder / "token", secrets.token_hex(32).encode(), mode=0o600)
             files = stack.enter_context(private_folder())

@@ -132,7 +132,7 @@ class StreamSpec:
             values["write"], values["options"] = destinations(outputs, folder, name, source)
         return cls(name, **values)
 
-    @cached_property  # the controller asks for that of each stream twice a second
+    @cached_property  # the controller reads it twice a second
     def digest(self) -> str:
         """Text that changes exactly with the source, objects, settings or destinations: what the stream does.
 
@@ -286,7 +286,7 @@ def check_fleet_name(name: object, kind: str) -> None:
 
 @contextmanager
 def _errors_in(where: str) -> Iterator[None]:
-    """Turn the errors of catstream into one that says where."""
+    """Add the place to the errors of catstream."""
     try:
         yield
     except CatstreamError as error:

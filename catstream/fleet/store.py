@@ -6,7 +6,7 @@
 
 Below each of these folders, only the newest holder decides what comes next:
 
-    <token>/claim     the claim of a holder; the token is one higher than that of every earlier claim
+    <token>/claim     the claim of a holder; its token is higher than every earlier token
     <token>/<n>       its states, every few seconds: n = 1, 2, 3 ...
 
     claim   create the claim of the highest token + 1; this fails if another process has it already: try the next one
@@ -18,8 +18,8 @@ A holder that was paused or disconnected may continue to write under its own tok
 written a state, older ones are not read. Before that, they continue the state that the newer holder began from. If the
 answer to a claim or a write is lost, the caller uses the next token or number; a half-written state is passed over.
 
-A holder removes all states but the newest two, and the older claims without a state. Of a stream that was removed, a
-state that says so stays, and hides what a holder writes that comes back later (docs/decisions.md, 78).
+A holder removes all states but the newest two, and the older claims without a state. A removed stream keeps one state,
+which hides late writes of an earlier holder (docs/decisions.md, 78).
 
 A state contains the source of its stream, which may contain a password: only its owner may enter the folders, and a
 bucket has to be private. obstore takes the credentials of S3 from the environment or the machine's role, and the
@@ -239,7 +239,7 @@ class Snapshot:
 
     token   of the holder that wrote it
     files   contents by name
-    facts   JSON: frame, time and whatever else the writer added
+    facts   JSON: frame, time and other facts of the writer
     """
 
     token: int
@@ -324,7 +324,7 @@ class StateStore:
 class Claim:
     """The right to write the states of a stream, until another process claims it.
 
-    token    higher than that of every earlier claim
+    token    higher than every earlier token
     state    the state to continue from; None if there is none
     """
 
@@ -334,14 +334,14 @@ class Claim:
         self._fenced: FencedError | None = None
 
     def write(self, files: Mapping[str, bytes], facts: Mapping[str, Any]) -> None:
-        """Write a state, and remove those that are no longer needed.
+        """Write a state, and remove older ones.
 
         Raises FencedError if another process has claimed the stream, and again in every later call; StoreError if the
         store fails: the caller continues, and writes a newer state later.
         """
         if self._fenced is not None:
             raise self._fenced
-        self._number += 1  # whatever becomes of this state, its number is not used again
+        self._number += 1  # its number is not used again, also if this fails
         with contextlib.suppress(FileExistsError):  # the answer was lost, and the request sent again
             self._states.create(self.token, self._number, files, facts)
         listing = self.check()

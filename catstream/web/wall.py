@@ -58,7 +58,7 @@ class Wall:
         self._status = FleetStatus("", 0.0)
         self._answered = 0.0  # moment of the last answer
         self._problem = ""  # why the fleet does not answer
-        self._sites: dict[str, Site] = {}  # of the streams that somebody looks at
+        self._sites: dict[str, Site] = {}  # of the streams whose page was requested
         self._used: dict[str, float] = {}  # moment of the last request to each of them
         self._closing = asyncio.Event()
         routes = [
@@ -160,7 +160,7 @@ class Wall:
         return PlainTextResponse("ok\n")
 
     async def _readyz(self, request: Request) -> Response:
-        """Of the fleet or of a stream. That of the fleet needs no token, so it names no address."""
+        """Answer for the fleet, without a token and therefore without an address; or for a stream."""
         problem = "the fleet does not answer" if self._problem else ""
         if not problem and (stream := request.path_params.get("stream")):
             status = self._find(stream)

@@ -1,5 +1,5 @@
-// The page of a fleet: a wall of the streams, each with a picture and a link to its page, and a table of the nodes; those
-// in trouble first. Once a second, it requests the state of the fleet, and the pictures that are in view.
+// The page of a fleet: a wall of the streams, each with a picture and a link to its page, and a table of the nodes. Trouble
+// comes first. Once a second, it requests the state of the fleet, and the pictures that are in view.
 
 import { $, add, duration, Items, many, write } from "./dom.js";
 
@@ -64,7 +64,7 @@ function level({ state, trouble }) {
   return ["failed", "dead"].includes(state) ? 2 : trouble ? 1 : 0;
 }
 
-/** Pairs of name and value, those with trouble first, then by name. */
+/** Pairs of name and value, trouble first, then by name. */
 function inOrder(values) {
   return values.map((one) => [one.name, one]).sort(([name, one], [other, two]) => level(two) - level(one) || byNumber(name, other));
 }
@@ -80,7 +80,7 @@ function fillPill({ pill, word }, state, words = WORDS[state] ?? state) {
   write(word, words);
 }
 
-/** A tile of the wall: the picture, the name, the state, the objects, what is wrong, and figures. */
+/** A tile of the wall: the picture, the name, the state, the objects, the trouble, and figures. */
 function makeStream(name) {
   const element = document.createElement("li");
   add(element, "a", { href: `streams/${encodeURIComponent(name)}/`, textContent: name });
