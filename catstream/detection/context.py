@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from catstream.base.box import Window
 from catstream.base.settings import Settings
-from catstream.detection.similarity import Similarity
 from catstream.features.pyramid import Pyramid, Region
 from catstream.features.score_map import ScoreMap
 from catstream.messages.kinds import Model
@@ -16,18 +15,16 @@ from catstream.messages.kinds import Model
 class FrameContext:
     """A frame in which one object is searched.
 
-    pyramid     the frame
-    model       of the object
-    settings    of the run
-    seq         number of the frame's message, which selects the periodic tasks of a frame
-    similarity  to the object of a saved model; None without a saved model
+    pyramid   the frame
+    model     of the object
+    settings  of the run
+    seq       number of the frame's message, which selects the periodic tasks of a frame
     """
 
     pyramid: Pyramid
     model: Model
     settings: Settings
     seq: int = 0
-    similarity: Similarity | None = None
 
     def scores_around(self, window: Window, side: int) -> ScoreMap:
         """Scores of all windows in `side` x `side` cells around a window: see `ScoreMap.around`."""

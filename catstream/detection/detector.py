@@ -1,7 +1,6 @@
 """The detector of one object: frames in, tracks and training rows out (paper, "Classification").
 
-It holds the state and the model between frames. The steps from one frame to the next are the pure functions
-`search_step`, `update_state` and `training_rows`: the same state, frame, model and settings give the same result.
+It holds the state and the model between frames: the same state, frame, model and settings give the same result.
 """
 
 from __future__ import annotations
@@ -107,29 +106,51 @@ class Detector:
         self.newest_version = max(self.newest_version, model.version)
 
     def search(self, frame: Pyramid, seq: int) -> Detection:
-        """Search the object in the next frame. The state then has the predicted window."""
+        """Search the object in the next frame. The state then has the predicted window.
+
+        Costs the same for every frame: a few small patches around the object, and the whole frame while the belief is
+        low (or always, if `search.mode` is "full"), or until the first detection of a saved model's object.
+        """
         if self._scm is not None:
             score, box = self._scm.follow(frame.image)
             return Detection(score, Window.around(box).with_centre_in(*frame.size))
-        self.state, detection = search_step(self._context(frame, seq), self._current_state())
-        return detection
+        context = self._context(frame, seq)
+        self.state = belief.predict_window(self._current_state())
+        if self.state.is_sought and self.similarity is not None:
+            self.state, detection = search.seek(context, self.state, self.similarity)
+            return detection
+        return search.find(context, self.state)
 
     def update(self, detection: Detection, frame: Pyramid, seq: int, time: float) -> Result:
         """Update the state by the detection of `search`, or another one in the same frame, and cut training rows."""
         state = self._current_state()
-        if self._scm is None:
-            state = update_state(state, detection, frame.size, self.settings)
-        else:  # never absent: the first leaf is of the first n frames, whatever the score of this tracker is
+        # Step 1: update the belief, and move the window as it allows.
+        if self._scm is not None:  # never absent: the first leaf is of the first n frames, whatever its score is
             state = replace(state, level="confident", window=detection.window)
+        else:
+            state = belief.update_level(state, detection.score, detection.redetected, self.settings.belief)
+            policy = self._policy(state)
+            if policy.report:
+                window = extent.smooth(state.window, detection.window, resize=policy.resize).with_centre_in(*frame.size)
+                confident = window if policy.resize else state.confident_window
+                state = belief.update_motion(replace(state, window=window, confident_window=confident))
         self.state = state
+        # Step 2: cut the training rows, if the belief in the detection allows it and they show something new.
         if self._is_explained(detection, seq) or self._is_still(detection, seq):
             return self._result(seq, time, detection.score, {})
-        training = training_rows(self._context(frame, seq), state, detection)
+        context, training = self._context(frame, seq), {}
+        if state.is_sought and self.similarity is not None:
+            training = teacher.training_of_background(context, detection.window, self.similarity)
+        elif self._policy(state).teach:
+            training = teacher.training_of(context, state.window, detection.around)
         self._last_training = (seq, detection.around.cells) if training and detection.around is not None else None
         return self._result(seq, time, detection.score, training)
 
     def _context(self, frame: Pyramid, seq: int) -> FrameContext:
-        return FrameContext(frame, self.model, self.settings, seq, self.similarity)
+        return FrameContext(frame, self.model, self.settings, seq)
+
+    def _policy(self, state: DetectorState) -> belief.Policy:
+        return belief.policies(self.settings.search.full_interval)[state.level]
 
     def _is_explained(self, detection: Detection, seq: int) -> bool:
         """Return True if the score is high enough to skip training on this frame (docs/paper.md)."""
@@ -196,7 +217,7 @@ class Detector:
     def _result(self, seq: int, time: float, score: float, training: Training) -> Result:
         """The track and the features of a frame; no box is reported if the level of belief forbids it."""
         state, version = self._current_state(), self.model.version
-        reported = _policy(state, self.settings).report
+        reported = self._policy(state).report
         box = state.window.box() if reported else None
         label: State = "absent" if not reported else "present" if version else "bootstrapping"
         began = state.first_frame
@@ -205,41 +226,3 @@ class Detector:
             seq - 1, time, label, box, float(score), version, object=self.name, began=began, doubtful=doubtful
         )
         return track, ObjectFeatures(box, training, state, begins=began == seq - 1)
-
-
-def search_step(context: FrameContext, state: DetectorState) -> tuple[DetectorState, Detection]:
-    """Search the object in the next frame; returns the state with the predicted window, and the detection.
-
-    Costs the same for every frame: a few small patches around the object, and the whole frame while the belief is low
-    (or always, if `search.mode` is "full"), or until the first detection of a saved model's object.
-    """
-    state = belief.predict_window(state)
-    if state.is_sought and context.similarity is not None:
-        return search.seek(context, state, context.similarity)
-    return state, search.find(context, state)
-
-
-def update_state(
-    state: DetectorState, detection: Detection, size: tuple[int, int], settings: Settings
-) -> DetectorState:
-    """Update the belief by a detection in a frame of (width, height) pixels, and move the window as it allows."""
-    state = belief.update_level(state, detection.score, detection.redetected, settings.belief)
-    policy = _policy(state, settings)
-    if not policy.report:
-        return state
-    window = extent.smooth(state.window, detection.window, resize=policy.resize).with_centre_in(*size)
-    confident = window if policy.resize else state.confident_window
-    return belief.update_motion(replace(state, window=window, confident_window=confident))
-
-
-def training_rows(context: FrameContext, state: DetectorState, detection: Detection) -> Training:
-    """Cut the training rows of a frame, if the belief in its detection allows it."""
-    if state.is_sought and context.similarity is not None:
-        return teacher.training_of_background(context, detection.window, context.similarity)
-    if not _policy(state, context.settings).teach:
-        return {}
-    return teacher.training_of(context, state.window, detection.around)
-
-
-def _policy(state: DetectorState, settings: Settings) -> belief.Policy:
-    return belief.policies(settings.search.full_interval)[state.level]

@@ -6,7 +6,7 @@ A window is 8 x 8 cells. A search at another size resizes the frame, not the mod
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -185,22 +185,20 @@ def _turns(width: float, height: float, regions: tuple[Region, ...]) -> list[lis
 
 def _best_of(context: FrameContext, parts: list[_Part], window: Window) -> Detection:
     """Return the best window of several parts of a frame, each searched at the size of a window times a factor."""
-    return Detection(*_best_map(_score_parts(context, parts, window)).best())
+    best, _ = _score_parts(context, parts, window)
+    return Detection(*best.best())
 
 
-def _score_parts(context: FrameContext, parts: Iterable[_Part], window: Window) -> list[tuple[float, ScoreMap]]:
-    """Return the factor and the scores of several parts, each searched at the size of a window times its factor."""
-    return [(factor, context.scores_within(region, window.scaled(factor))) for factor, region in parts]
+def _score_parts(context: FrameContext, parts: list[_Part], window: Window) -> tuple[ScoreMap, list[ScoreMap]]:
+    """Score several parts, each at the size of a window times its factor.
 
-
-def _best_map(maps: Sequence[tuple[float, ScoreMap]]) -> ScoreMap:
-    """Return the map with the highest score less the cost of its factor of size."""
-
-    def value(part: tuple[float, ScoreMap]) -> float:
-        factor, scores = part
-        return float(scores.scores.max()) - extent.cost(math.log(factor))
-
-    return max(maps, key=value)[1]
+    Returns the map with the highest score less the cost of its factor of size; and all maps.
+    """
+    maps = [context.scores_within(region, window.scaled(factor)) for factor, region in parts]
+    values = [
+        float(one.scores.max()) - extent.cost(math.log(factor)) for one, (factor, _) in zip(maps, parts, strict=True)
+    ]
+    return maps[values.index(max(values))], maps
 
 
 def _search_all_sizes(
@@ -214,11 +212,10 @@ def _search_all_sizes(
     """
     frame = context.pyramid
     parts = [(factor, frame.region_around(window.scaled(factor))) for factor in factors]
-    maps = _score_parts(context, parts, window)
-    scores = _best_map(maps)
+    scores, maps = _score_parts(context, parts, window)
     best = Detection(*scores.best())
     best_similarity = similarity(scores.cells.row(*scores.argmax()))
-    others = [part.non_overlapping(best.window) for _, part in maps]
+    others = [part.non_overlapping(best.window) for part in maps]
     rival_map = max(others, key=lambda part: float(part.scores.max()))
     rival_score = max(float(rival_map.scores.max()), 0.0)
     lead = best.score - rival_score
@@ -236,41 +233,33 @@ def _search_near(context: FrameContext, window: Window, first: Window | None) ->
 def fit_extent(context: FrameContext, detection: Detection, first: Window | None) -> Detection:
     """Move a detection by at most a cell, to the size and then the aspect ratio with the highest value.
 
-    The value is the score, plus the value of the extent head, less the cost of the change, and
-    less the cost of the error that the size head or the aspect head predicts. The prior favours the size and the aspect
-    ratio of the `first` window.
+    The value is the score, plus the value of the extent head, less the cost of the change, and less the cost of the
+    error that the size head or the aspect head predicts. The prior favours the extent of the `first` window.
     """
     first = first or detection.window
-    resized = _fit_size(context, detection, first)
-    return resized if EXTENT not in context.model.heads else _fit_aspect(context, resized, first)
-
-
-def _fit_size(context: FrameContext, detection: Detection, first: Window) -> Detection:
+    prior = extent.prior(context.settings.extent)
     growth = math.log(detection.window.area / first.area) / 2
 
-    def evaluate(step: int) -> tuple[float, Detection]:
+    def value_of_size(step: int) -> tuple[float, Detection]:
         scores = context.scores_around(detection.window.scaled(extent.size(step)), _FINE_SIDE)
         best = Detection(*scores.best())
         fit = _extent_value(context, scores.cells.row(1, 1), SIZE)
-        cost = extent.cost(step * extent.SIZE_CHANGE, growth, extent.prior(context.settings.extent))
-        return best.score + fit - cost, best
+        return best.score + fit - extent.cost(step * extent.SIZE_CHANGE, growth, prior), best
 
-    best, _, offset = _climb(evaluate, context.settings.extent.size_count // 2)
-    return replace(detection, score=best.score, window=best.window.scaled(extent.size(offset)))
-
-
-def _fit_aspect(context: FrameContext, detection: Detection, first: Window) -> Detection:
-    window = detection.window
+    best, _, offset = _climb(value_of_size, context.settings.extent.size_count // 2)
+    window = best.window.scaled(extent.size(offset))
+    resized = replace(detection, score=best.score, window=window)
+    if EXTENT not in context.model.heads:
+        return resized
     widening = math.log(window.w / window.h * first.h / first.w)
 
-    def evaluate(step: int) -> tuple[float, Detection]:
+    def value_of_aspect(step: int) -> tuple[float, Detection]:
         scores = context.scores_around(window.scaled(*extent.stretch(step)), WINDOW)
         fit = _extent_value(context, scores.cells.row(0, 0), ASPECT)
-        cost = extent.cost(step * extent.ASPECT_CHANGE, widening, extent.prior(context.settings.extent))
-        return float(scores.scores[0, 0]) + fit - cost, detection
+        return float(scores.scores[0, 0]) + fit - extent.cost(step * extent.ASPECT_CHANGE, widening, prior), resized
 
-    _, step, offset = _climb(evaluate, extent.ASPECT_STEPS)
-    return replace(detection, window=window.scaled(*extent.stretch(step + offset)))
+    _, step, offset = _climb(value_of_aspect, extent.ASPECT_STEPS)
+    return replace(resized, window=window.scaled(*extent.stretch(step + offset)))
 
 
 def _extent_value(context: FrameContext, row: np.ndarray, name: str) -> float:

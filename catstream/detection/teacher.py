@@ -69,7 +69,7 @@ def first_training(
     if options.bootstrap == "scm":
         rows = _appearance(frame, window, around, rng, options, hardest=0)
     else:
-        copies = affine_copies(frame, window, count, rng, moved=_moved_share(options))
+        copies = affine_copies(frame, window, count, rng, moved=_MOVED if options.augment else 0.0)
         rows = _rows(copies, 1, _OBJECT_WEIGHT, options)
         rows += _surroundings(around, window, count, 0, rng, options)
     training = _first_extents(frame, window, rng, settings)
@@ -80,13 +80,22 @@ def first_training(
 def training_of(context: FrameContext, window: Window, around: ScoreMap | None) -> Training:
     """The rows of a frame in which the object was detected, cut around its window.
 
-    Windows of wrong extents are cut in every second frame; hard negatives are searched in a part of the frame at a
-    time.
+    Windows of wrong extents are cut in every second frame. Hard negatives are searched in a part of the frame at a
+    time. The parts have equal shares of the rows, so that the number of rows over many frames does not depend on that
+    of the parts.
     """
     training = training_at(context, window, around, extents=context.seq % _EXTENT_INTERVAL == 0)
-    mined = _mine(context, window)
-    if mined is not None:
-        training[APPEARANCE] += mined
+    options = context.settings.training
+    parts = context.pyramid.region_around(window).split(window, _MAX_CELLS)
+    number = due_part(context.seq, _MINING_INTERVAL, len(parts))
+    if number is None:
+        return training
+    # A round of all parts has hard_negatives / _MINING_INTERVAL rows for every frame that it takes.
+    rows = options.hard_negatives * max(len(parts), _MINING_INTERVAL)
+    shares = len(parts) * _MINING_INTERVAL
+    if count := (number + 1) * rows // shares - number * rows // shares:
+        hardest = _hardest(context.scores_within(parts[number], window), window, count)
+        training[APPEARANCE] += _rows(hardest, 0, 1, options)
     return training
 
 
@@ -124,27 +133,6 @@ def hard_negatives(context: FrameContext, window: Window) -> TrainingRows:
     """The windows of the whole frame with the highest scores, except those that overlap the object's window."""
     options = context.settings.training
     return _rows(_hardest(context.scores_of_frame(window), window, options.hard_negatives), 0, 1, options)
-
-
-def _mine(context: FrameContext, window: Window) -> TrainingRows | None:
-    """The hard negatives of the part of the frame that is due, None if no part is.
-
-    The parts have equal shares of the rows, so that the number of rows over many frames does not depend on that of the
-    parts.
-    """
-    options = context.settings.training
-    parts = context.pyramid.region_around(window).split(window, _MAX_CELLS)
-    number = due_part(context.seq, _MINING_INTERVAL, len(parts))
-    if number is None:
-        return None
-    # A round of all parts has hard_negatives / _MINING_INTERVAL rows for every frame that it takes.
-    rows = options.hard_negatives * max(len(parts), _MINING_INTERVAL)
-    shares = len(parts) * _MINING_INTERVAL
-    count = (number + 1) * rows // shares - number * rows // shares
-    if not count:
-        return None
-    scores = context.scores_within(parts[number], window)
-    return _rows(_hardest(scores, window, count), 0, 1, options)
 
 
 def _hardest(scores: ScoreMap, window: Window, count: int, threshold: float = -math.inf) -> np.ndarray:
@@ -203,11 +191,6 @@ def affine_copies(
     return window_rows(patches)
 
 
-def _moved_share(options: TrainingSettings) -> float:
-    """The share of the first frame's copies that are put on another background."""
-    return _MOVED if options.augment else 0.0
-
-
 def _is_moved(number: int, share: float) -> bool:
     """Return True if copy `number` gets another background, as a `share` of all copies does; never the first one."""
     return number > 0 and number * share % 1 < share
@@ -239,21 +222,13 @@ def _patch(
     patch = frame.cut(x, y, *pixel, _PATCH, turn)
     if offset is None:
         return patch
-    share = _ellipse(window.w / box.w, window.h / box.h)
+    # The share of the object in each pixel: 1 inside its ellipse, falling to 0 around it.
+    position = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
+    radius = np.hypot((position * (window.h / box.h))[:, None], position * (window.w / box.w))
+    share = ((_TRANSPARENT - radius) / (_TRANSPARENT - _OPAQUE)).clip(0, 1).astype(np.float32)
     background = frame.cut(x + offset[0], y + offset[1], *pixel, _PATCH, turn)
     channels = zip(patch, background, strict=True)
     return np.stack([cv2.blendLinear(*pair, share, 1 - share) for pair in channels])
-
-
-def _ellipse(across: float, down: float) -> np.ndarray:
-    """Alpha mask of the object in a patch, float32: 1 inside its ellipse, falling to 0 around it.
-
-    The window is `across` times as wide and `down` times as high as the object.
-    """
-    position = (np.arange(_PATCH) - (_PATCH - 1) / 2) / (WINDOW * CELL / 2)
-    radius = np.hypot((position * down)[:, None], position * across)
-    share: np.ndarray = ((_TRANSPARENT - radius) / (_TRANSPARENT - _OPAQUE)).clip(0, 1).astype(np.float32)
-    return share
 
 
 def _appearance(
@@ -309,12 +284,13 @@ def _first_extents(frame: Pyramid, window: Window, rng: np.random.Generator, set
     The windows are cut from shifted and rotated copies of the object, most of which are on another background.
     """
     kinds = extent.trials(window, settings.extent)
+    moved = _MOVED if settings.training.augment else 0.0
     trials, patches = [], []
     for kind in kinds:
         for number in range(math.ceil(settings.coreset.size / (1 + len(kind)))):
             right, down, turn = rng.normal(size=3) if number else np.zeros(3)
             copy = _shifted(window, right, down)
-            offset = _random_offset(window, rng) if _is_moved(number, _moved_share(settings.training)) else None
+            offset = _random_offset(window, rng) if _is_moved(number, moved) else None
             for trial in (extent.Trial(window), *kind):
                 trials.append(trial)
                 patches.append(_patch(frame, trial.window.centred(*copy.centre), _TURN * turn, copy.box(), offset))
