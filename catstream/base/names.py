@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import chain
@@ -11,6 +10,7 @@ from typing import TypeVar
 from unicodedata import category, normalize
 
 from catstream.base.box import Box
+from catstream.base.text import listed
 from catstream.errors import BoxError, ObjectError
 
 #: The name of an object that has none.
@@ -51,11 +51,12 @@ def by_name(values: Mapping[str, _Value]) -> dict[str, _Value]:
     >>> by_name({"Zoe\u0308": 1})
     {'Zoë': 1}
     """
-    names = Counter(map(check_name, values))
-    if len(names) < len(values):
-        (name, _), *_ = names.most_common(1)
-        raise ObjectError(f"two objects are named {name!r}, once with combining marks: rename one of them")
-    return dict(zip(map(check_name, values), values.values(), strict=True))
+    checked = {check_name(name): value for name, value in values.items()}
+    if len(checked) < len(values):
+        raise ObjectError(
+            f"two objects have one name, once with combining marks ({listed(values)}): rename one of them"
+        )
+    return checked
 
 
 def split_name(text: str) -> tuple[str, str]:

@@ -206,20 +206,15 @@ class Settings:
     training: TrainingSettings
     extent: ExtentSettings
 
-    def __init__(self, **groups: _Group | Mapping[str, object]) -> None:
+    def __init__(self, **groups: Any) -> None:
         for name in groups.keys() - _groups().keys():
             _check_name(name)
         for name, kind in _groups().items():
             group = groups.get(name, {})
-            if isinstance(group, Mapping):
+            if not isinstance(group, kind):
                 for short in group:
                     _check_name(f"{name}.{short}")
                 group = kind(**group)
-            elif not isinstance(group, kind):
-                raise SettingsError(
-                    f"the group of settings {name} cannot be {reprlib.repr(group)}: pass a {kind.__name__} or a "
-                    f"mapping of names to values, Settings({name}={{...}})"
-                )
             object.__setattr__(self, name, group)
 
     @classmethod
@@ -253,7 +248,7 @@ class Settings:
         overrides : mapping of str, or iterable of str
             Names and values, or texts `group.name=value` as `--set` takes them.
         environment : mapping of str, or None
-            Variables, `CATSTREAM_GROUP_NAME=value`; None for `os.environ`. Others with this prefix are ignored.
+            Variables, `CATSTREAM_GROUP_NAME=value`; None for `os.environ`. Those that resemble no setting are ignored.
 
         Raises
         ------
@@ -269,7 +264,8 @@ class Settings:
             values.update(flat(read_toml(Path(file), SettingsError)))
         for variable, text in (os.environ if environment is None else environment).items():
             name = variable.removeprefix("CATSTREAM_").lower().replace("_", ".", 1)
-            if variable.startswith("CATSTREAM_") and not _is_foreign(name):
+            # A variable that resembles no setting is for something else: Kubernetes sets CATSTREAM_SERVICE_HOST.
+            if variable.startswith("CATSTREAM_") and (name in describe() or _nearest(name)):
                 _check_name(name, f" for the environment variable {variable}")
                 if not text:
                     raise SettingsError(f"the environment variable {variable} is empty: set a value, or unset it")
@@ -445,19 +441,6 @@ def _check_name(name: str, origin: str = "") -> None:
         raise SettingsError(
             f"there is no setting {name!r}{origin}{suggestion} `catstream settings` lists all {len(describe())}"
         )
-
-
-_SERVICE = re.compile(r"(^|[._])(service[._](host|port)|port(_[0-9]+_(tcp|udp).*)?$|port\.[0-9]+_(tcp|udp))")
-
-
-def _is_foreign(name: str) -> bool:
-    """Return True if a variable with our prefix is no setting: its name is similar to none, or that of an orchestrator.
-
-    Kubernetes sets CATSTREAM_SERVICE_HOST and others for a service named catstream.
-    """
-    if _SERVICE.search(name):
-        return True
-    return name.partition(".")[0] not in _groups() and not _nearest(name)
 
 
 def _nearest(name: str) -> list[str]:

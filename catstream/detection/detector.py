@@ -20,9 +20,9 @@ from catstream.detection.context import FrameContext
 from catstream.detection.search import Detection
 from catstream.detection.similarity import Similarity
 from catstream.detection.teacher import Training
-from catstream.errors import BoxError, ProtocolError
+from catstream.errors import BoxError
 from catstream.features.cells import Cells
-from catstream.features.layout import ROW_LENGTH, WINDOW
+from catstream.features.layout import WINDOW
 from catstream.features.pyramid import Pyramid
 from catstream.messages.kinds import DetectorState, Model, ObjectFeatures, State, Track
 
@@ -92,14 +92,8 @@ class Detector:
 
         A previous object is forgotten. `box` is of about the expected size, in pixels, and `frame` is the number of the
         first frame to search. The object is detected at a window that is similar to it and scores higher than the rest
-        of the frame, in several successive frames; of two similar objects, neither is. ProtocolError if the model is of
-        other features.
+        of the frame, in several successive frames; of two similar objects, neither is.
         """
-        if len(model.weights) != ROW_LENGTH:
-            raise ProtocolError(
-                f"the model has {len(model.weights)} weights, the features of a window are {ROW_LENGTH}: "
-                "train it again with this version of catstream"
-            )
         window = Window.around(box)
         self.state = DetectorState(frame, "lost", window, window, None)
         self.model, self.similarity, self._scm = replace(model, began=frame), similarity, None

@@ -88,7 +88,7 @@ class Detectors:
     def seek(self, name: str, model: Model, box: Box, similarity: Similarity) -> None:
         """Search for the object of a saved model from the next frame on; another one of this name is forgotten.
 
-        Nothing changes after a ProtocolError of `Detector.seek` or an ObjectError of `add`.
+        Nothing changes after an ObjectError of `add`.
         """
         detector = self.detectors.get(name) or self._new_detector(name)
         detector.seek(model, box, similarity, self.seq)

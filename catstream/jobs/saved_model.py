@@ -139,16 +139,12 @@ class SavedModel:
         ProtocolError
             If it is damaged, another file, or one of other features.
         """
-        if not Path(path).exists():
-            raise MissingFileError(f"there is no saved model {str(path)!r}: `catstream save` writes one")
-        if not Path(path).is_file():
-            raise ServiceError(f"{str(path)!r} is not a file: pass a saved model (`catstream save`)")
         try:
             data = Path(path).read_bytes()
+        except FileNotFoundError:
+            raise MissingFileError(f"there is no saved model {str(path)!r}: `catstream save` writes one") from None
         except OSError as error:
-            raise ServiceError(
-                f"cannot read {str(path)!r} ({error.strerror}): check its permissions, or pass another file"
-            ) from None
+            raise ServiceError(f"cannot read {str(path)!r} ({error.strerror}): pass a saved model") from None
         return cls.from_bytes(data, str(path))
 
     @classmethod

@@ -89,7 +89,6 @@ def test_an_empty_variable_of_a_setting_is_an_error(variable):
         ("lockstep", "there is no setting 'lockstep', did you mean 'run.lockstep'"),
         ("keys", "there is no setting 'keys', did you mean 'run.keys'"),
         ("qqq", r"there is no setting 'qqq': `catstream settings` lists all \d+$"),
-        ("coreset", "the group of settings coreset cannot be 1: pass a CoresetSettings"),
     ],
 )
 def test_a_setting_without_its_group_or_with_an_unknown_group_or_name_is_rejected(name, why):

@@ -11,11 +11,11 @@ from catstream.base.settings import Settings
 from catstream.detection.detector import Detector
 from catstream.detection.objects import Detectors
 from catstream.detection.similarity import MIN_SIMILARITY, Similarity
-from catstream.errors import BoxError, ProtocolError
+from catstream.errors import BoxError
 from catstream.features.layout import ROW_LENGTH
 from catstream.features.pyramid import Pyramid
 from catstream.messages.heads import APPEARANCE, GROUPS
-from catstream.messages.kinds import Model, Motion
+from catstream.messages.kinds import Motion
 
 START = Box(60, 50, 48, 40)
 
@@ -266,11 +266,6 @@ def test_a_resumed_search_continues_bit_for_bit(scene, learned, similarity):
     other.go_on(2, features[1].detector, learned)
     other.similarity = similarity
     assert tuple(other.step(scene((90, 60)))[0] for _ in range(3)) == tracks[2:]
-
-
-def test_a_model_of_other_features_is_rejected(similarity):
-    with pytest.raises(ProtocolError, match="train it again"):
-        Follower().seek(Model(1, 0, np.zeros(5, np.float32), 0.0), START, similarity)
 
 
 def test_a_box_of_a_past_frame_is_tracked_up_to_now_and_only_its_rows_are_learned(scene):
