@@ -26,7 +26,7 @@ IMPORTERS = {
     "safetensors": "messages/storage.py",
     "obstore": "fleet/store.py",
     "ray": "fleet",
-    "av": "video",
+    "av": "loadtest/mjpeg.py video",
     "zmq": "client/subscription.py wire",
     "paho": "sinks/mqtt_sink.py",
     "msgpack": "wire/codec.py",

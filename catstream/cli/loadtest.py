@@ -44,6 +44,9 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option(
     "--size", default="640x480", show_default=True, callback=_size, metavar="WxH", help="Size of a frame in pixels."
 )
+@click.option(
+    "--source", type=click.Choice(["mjpeg", "h264"]), default="mjpeg", show_default=True, help="Over HTTP or RTSP."
+)
 @click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
 @click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
 @with_json_file
@@ -58,12 +61,11 @@ def loadtest(
 ) -> None:
     """Measure latency and dropped frames of pipelines under load.
 
-    The load test sends a rendered video as a network camera
-    does, H.264 over RTSP, on the loopback interface; a pipeline of its own
-    tracks each stream. The camera does not wait: frame i is due at
-    start + i / RATE, and latency counts from then. The latency of a skipped
-    frame ends with the track of a newer one. Slow subscribers read two tracks
-    per second.
+    The load test sends a rendered video with ground truth as a network camera
+    does, on the loopback interface; a pipeline of its own tracks each stream.
+    The camera does not wait: frame i is due at start + i / RATE, and latency
+    counts from then. The latency of a skipped frame ends with the track of a
+    newer one. Slow subscribers read two tracks per second.
 
     \b
     LIMITS, of the worst stream
@@ -71,6 +73,7 @@ def loadtest(
       model-p50 ... model-max   seconds from a frame to the model trained on it, at most
       skipped                   share of frames that were not tracked, at most
       missed                    share of frames whose tracks fast subscribers missed, at most
+      success                   share of frames with an IoU above 0.5, at least
 
     With --find-streams, the load test searches for the number of cameras that
     this machine can serve: it starts with STREAMS, each step takes DURATION, and

@@ -1,4 +1,4 @@
-"""The camera of a load test: a process that sends a known video over RTSP at the times of a schedule.
+"""The camera of a load test: a process that sends a known video over HTTP or RTSP at the times of a schedule.
 
 Each frame is sent when it is due, even if the receiver has not read the frames before it; a slow receiver gets frames
 late, but none is dropped. The time stamp of a frame in the stream is its due time by `time.monotonic`, so the receiver
@@ -14,12 +14,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from multiprocessing.connection import Connection
-from socketserver import ThreadingTCPServer
+from socketserver import StreamRequestHandler, ThreadingTCPServer
 from time import monotonic
 from typing import Any, Self
 
 from catstream.base.workers import SPAWN, die_with, sigint_blocked
 from catstream.errors import ServiceError
+from catstream.loadtest.mjpeg import MjpegConnection
 from catstream.loadtest.rtsp import RtspConnection
 
 _STILL_RATE = 25.0  # frames per second of the still image before a schedule is played
@@ -105,26 +106,38 @@ def _broadcast(pipe: Connection, parent: int, *video: Any) -> None:
             pipe.send(broadcast.late if schedule is None else broadcast.play(schedule))
 
 
+#: Scheme of the URLs, and handler of a connection, by the name of the source.
+_PROTOCOLS: dict[str, tuple[str, type[StreamRequestHandler]]] = {
+    "mjpeg": ("http", MjpegConnection),
+    "h264": ("rtsp", RtspConnection),
+}
+
+
 class Broadcast(ThreadingTCPServer):
     """Serves streams of the same video on the loopback interface; a context manager.
 
-    `units` are access units of H.264, which are sent over and over. `still` is sent before them: a keyframe takes
-    several times as long to decode as the frames after it that show no change.
+    `units` are JPEG files for the source mjpeg, and access units for h264, which are sent over and over. `still` is
+    sent before them: a keyframe takes several times as long to decode as the frames after it that show no change.
 
     The schedules of n streams are shifted by 1/n of a frame each, so that frames are not due at the same time.
 
+    size : (width, height) of an image
     urls : URL of each stream
     late : largest delay in seconds of a sent frame that was not caused by a slow receiver
     """
 
     daemon_threads = True
 
-    def __init__(self, units: Sequence[bytes], streams: int = 1, still: Sequence[bytes] = ()) -> None:
-        super().__init__(("127.0.0.1", 0), RtspConnection)
+    def __init__(
+        self, source: str, size: tuple[int, int], units: Sequence[bytes], still: Sequence[bytes] = (), streams: int = 1
+    ) -> None:
+        protocol, connection = _PROTOCOLS[source]
+        super().__init__(("127.0.0.1", 0), connection)
+        self.size = size
         self._units, self._still, self._closed = units, still or units[:1], threading.Event()
         self._schedules = [Schedule(math.inf, _STILL_RATE)] * streams
         self.late = 0.0
-        self.urls = [f"rtsp://127.0.0.1:{self.server_address[1]}/{number}" for number in range(streams)]
+        self.urls = [f"{protocol}://127.0.0.1:{self.server_address[1]}/{number}" for number in range(streams)]
 
     def play(self, schedule: Schedule) -> list[Schedule]:
         """Start to send the images by a schedule; return the schedule of each stream."""

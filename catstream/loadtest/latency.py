@@ -20,6 +20,7 @@ from catstream.base.arrays import Float64
 from catstream.client.address import Address
 from catstream.client.attach import subscribe
 from catstream.errors import SilenceError
+from catstream.evaluation.scores import overlaps
 from catstream.loadtest.camera import Schedule
 from catstream.loadtest.rtsp import due_time
 from catstream.messages.kinds import Model, Track
@@ -31,6 +32,7 @@ PERCENTILES = {"p50": 50.0, "p95": 95.0, "p99": 99.0, "p99.9": 99.9, "max": 100.
 REST = "everything else"
 
 _POLL_SECONDS = 0.1
+_SUCCESS = 0.5  # a frame with a larger IoU is a success
 
 
 @dataclass(slots=True)
@@ -105,6 +107,8 @@ class Measures:
     track            seconds from the due time of each frame to the track of this frame or a newer one; at most to the
                      end of the run
     model            seconds to the model trained on this frame or a newer one
+    success          share of the frames with a visible object for which the IoU of box and ground truth is above 0.5; a
+                     skipped frame has the box of the last tracked frame
     totals           totals of the pipeline at its end; empty if the stream has not ended
     """
 
@@ -112,6 +116,7 @@ class Measures:
     tracked: np.ndarray
     track: Float64
     model: Float64
+    success: float
     totals: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -127,26 +132,36 @@ class Measures:
     def figures(self) -> dict[str, float]:
         """The figures that can have a limit, by name."""
         model = {f"model-{name}": seconds for name, seconds in percentiles(self.model).items()}
-        return {**percentiles(self.track), **model, "skipped": self.skipped}
+        return {**percentiles(self.track), **model, "skipped": self.skipped, "success": self.success}
 
 
 def measure(
-    observations: Observations, schedule: Schedule, frames: int, end: float, totals: dict[str, int]
+    observations: Observations, schedule: Schedule, frames: int, truth: Float64, end: float, totals: dict[str, int]
 ) -> Measures:
     """Compute the measures of one stream.
 
     frames : number of due frames: all of the schedule of the camera, or those before an interruption
+    truth : boxes of the object in the images, which are sent over and over, float64 (images, 4), NaN if it is absent
     end : time at which the observation ended
     totals : totals of the pipeline at its end
     """
     due = np.array([schedule.due(number) for number in range(frames)])
     tracks = [(moment, schedule.number(track.pts or 0.0)) for moment, track in observations.tracks]
+    tracked = np.isin(np.arange(frames), [number for _, number in tracks])
+    boxes = np.full((frames + 1, 4), np.nan)  # one more, without a box, for the frames before the first tracked one
+    for (_, number), (_, track) in zip(tracks, observations.tracks, strict=True):
+        if 0 <= number < frames:
+            boxes[number] = track.box or np.nan
+    last = np.maximum.accumulate(np.where(tracked, np.arange(frames), -1))
+    true = truth[np.arange(frames) % len(truth)]
+    is_success = overlaps(boxes[last], true)[np.isfinite(true).all(axis=1)] > _SUCCESS
     models = [(moment, schedule.number(newest)) for moment, newest in observations.models]
     return Measures(
         due=due,
-        tracked=np.isin(np.arange(frames), [number for _, number in tracks]),
+        tracked=tracked,
         track=latencies_to_answer(due, tracks, end),
         model=latencies_to_answer(due, models, end),
+        success=float(is_success.mean()),
         totals=totals,
     )
 

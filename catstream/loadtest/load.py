@@ -9,6 +9,9 @@ from contextlib import ExitStack, suppress
 from time import monotonic, sleep
 from typing import Any, NamedTuple, Self, cast
 
+import numpy as np
+
+from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
 from catstream.base.settings import Settings
@@ -20,10 +23,12 @@ from catstream.loadtest.result import Plan, Report
 from catstream.messages.kinds import End
 from catstream.pipeline import Pipeline
 from catstream.video import rendered
+from catstream.video.frames import jpeg
 from catstream.video.writer import Encoder
 from catstream.wire.channels import TRACKS
 from catstream.wire.newest import GapCounter, Subscriber
 
+_QUALITY = 90  # of JPEG, as network cameras use it
 _STILL_FRAMES = 24  # of which the first is a keyframe
 _STOP_SECONDS = 30.0  # timeout for a pipeline to start, to answer `stop`, and to end after it
 _PER_PROCESS = 20  # subscribers in one process, because most machines cannot run a process for each
@@ -35,30 +40,41 @@ _DRAIN_SECONDS = 20.0  # timeout for fast subscribers to receive the last messag
 class Video(NamedTuple):
     """The video that is sent over and over.
 
-    units  access units of H.264; the first one is a keyframe
-    still  access units of the first image, which are sent before
+    units  JPEG files or access units of H.264, of which the first one is a keyframe
+    still  those of the first image over and over, which are sent before
     boxes  boxes of all objects in the first image, by name; the first object is the one whose tracks are measured
+    truth  boxes of the first object in all images, float64 (images, 4), NaN if it is absent
     """
 
     units: list[bytes]
     still: list[bytes]
     boxes: dict[str, Box]
+    truth: Float64
 
 
 def render(plan: Plan, report: Report) -> Video:
     """Render the demo video, forwards, then backwards, and encode it."""
     count, demo = min(plan.frames, 2 * rendered.FRAMES - 2), rendered.Demo(plan.size)
+    truth: dict[int, Box | None] = {}
+
+    def images(numbers: Iterable[int]) -> Iterator[np.ndarray]:
+        for number in numbers:
+            report("rendering", number / count, f"{number} of {count} frames")
+            image, truth[number] = demo.image(number)
+            yield image
 
     def encoded(numbers: Iterable[int]) -> Iterator[bytes]:
+        if plan.source == "mjpeg":
+            yield from (jpeg(image, quality=_QUALITY) for image in images(numbers))
+            return
         encoder = Encoder(plan.size, rate=25)
-        for number in numbers:
-            image, _ = demo.image(number)
-            report("rendering", number / count, f"{number} of {count} frames")
+        for image in images(numbers):
             yield from map(bytes, encoder.packets(image))
         yield from map(bytes, encoder.flush())
 
-    boxes = _boxes(plan, cast(Box, demo.image(0)[1]))  # its object is visible
-    return Video([*encoded(range(count))], [*encoded([0] * _STILL_FRAMES)], boxes)
+    still, units = [*encoded([0] * _STILL_FRAMES)], [*encoded(range(count))]
+    boxes = _boxes(plan, cast(Box, truth[0]))  # its object is visible
+    return Video(units, still, boxes, np.array([truth[number] or (np.nan,) * 4 for number in range(count)]))
 
 
 def _boxes(plan: Plan, dahlia: Box) -> dict[str, Box]:

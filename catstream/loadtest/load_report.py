@@ -45,6 +45,7 @@ def tables(result: Result) -> Iterator[Table]:
             **_cost(*result.cost(number)),
             **_latencies(stream.track, stream.model),
             "not stored": str(stream.totals["sent"] - stream.totals["stored"]) if stream.totals else "-",
+            "success": f"{stream.success:.3f}",
         }
         for number, stream in enumerate(result.streams)
     ]
@@ -55,7 +56,8 @@ def tables(result: Result) -> Iterator[Table]:
         streams,
         "Cores: processor seconds per second of all processes of the stream; MB: their memory, in which a page that n "
         "processes share counts as 1/n of a page (PSS). Latencies in milliseconds. Not stored: features "
-        "messages that were not in the coreset trees at the end.",
+        "messages that were not in the coreset trees at the end. Success: share of frames with an IoU with the ground "
+        "truth above 0.5; a skipped frame has the box of the last tracked frame.",
     )
     if result.usage:
         processes = [
@@ -115,6 +117,7 @@ def to_json(load_test: LoadTest) -> dict[str, object]:
                 "track": percentiles(stream.track),
                 "model": percentiles(stream.model),
                 **{name: stream.totals.get(name) for name in ("sent", "stored", "restarts")},
+                "success": stream.success,
             }
             for number, stream in enumerate(result.streams)
         ],

@@ -27,7 +27,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
     """Run a camera and pipelines on its streams, and measure; after Ctrl-C, return the measurements so far."""
     usage, interrupted, next_reading = Usage(), False, 0.0
     with ExitStack() as stack:
-        camera = stack.enter_context(Camera(video.units, plan.streams, video.still))
+        camera = stack.enter_context(Camera(plan.source, plan.size, video.units, video.still, plan.streams))
         streams = [Stream(number, url, video.boxes, plan.settings) for number, url in enumerate(camera.urls)]
         observations, groups = _started(plan, streams, next(iter(video.boxes)), stack, report)
 
@@ -61,7 +61,7 @@ def run(plan: Plan, video: Video, report: Report) -> Result:
         plan=plan,
         seconds=min(due) / plan.rate,
         streams=[
-            measure(observation, schedule, number, end, stream.totals)
+            measure(observation, schedule, number, video.truth, end, stream.totals)
             for observation, schedule, number, stream in zip(observations, schedules, due, streams, strict=True)
         ],
         usage=usage.readings,

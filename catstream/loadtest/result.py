@@ -22,8 +22,9 @@ KINDS = {
     **{f"model-{name}": "from a frame to the model trained on it" for name in PERCENTILES},
     "skipped": "share of frames that were not tracked",
     "missed": "share of frames whose tracks fast subscribers missed",
+    "success": "share of frames with an IoU above 0.5",
 }
-_SHARES = ("skipped", "missed")  # the other figures are times
+_SHARES = ("skipped", "missed", "success")  # the other figures are times
 
 #: Is called about ten times a second with the current activity, the share of it that is done, and current figures.
 Report = Callable[[str, float, str], None]
@@ -40,6 +41,7 @@ class Plan:
     rate              frames per second of each stream, whether or not the pipeline keeps up
     duration          seconds
     size              (width, height) of a frame in pixels
+    source            "mjpeg" (over HTTP) or "h264" (over RTSP)
     settings          settings of all pipelines
     """
 
@@ -50,6 +52,7 @@ class Plan:
     rate: float = 25.0
     duration: float = 10.0
     size: tuple[int, int] = rendered.SIZE
+    source: str = "mjpeg"
     settings: Settings = field(default_factory=Settings)
 
     def __post_init__(self) -> None:
@@ -62,7 +65,7 @@ class Plan:
             raise SettingsError(
                 f"no frame is due in {self.duration:g} s at {self.rate:g} frames/s: raise --rate or --duration"
             )
-        if any(side % 2 for side in self.size):
+        if self.source == "h264" and any(side % 2 for side in self.size):
             raise SettingsError(
                 f"H.264 needs an even width and height, got {self.size[0]}x{self.size[1]}: pass another --size"
             )
@@ -76,8 +79,8 @@ class Plan:
 
     def __str__(self) -> str:
         objects = f", {self.objects} objects" if self.objects > 1 else ""
-        size = f"{self.size[0]}x{self.size[1]} pixels"
-        return f"{counted(self.streams, 'stream')} of {size}{objects}, {self.rate:g} frames/s due in each"
+        video = f"{self.size[0]}x{self.size[1]} pixels ({self.source})"
+        return f"{counted(self.streams, 'stream')} of {video}{objects}, {self.rate:g} frames/s due in each"
 
     @property
     def frames(self) -> int:
@@ -114,7 +117,7 @@ class Result:
     def worst(self) -> dict[str, float]:
         """The value of each of the `KINDS`."""
         streams = [stream.figures for stream in self.streams]
-        worst = {name: max(stream[name] for stream in streams) for name in streams[0]}
+        worst = {name: (min if name == "success" else max)(stream[name] for stream in streams) for name in streams[0]}
         return worst | {"missed": sum(self.missed) / max(1, sum(self.missed) + sum(self.received))}
 
     @property
@@ -149,7 +152,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """A maximum of one of the `KINDS`.
+    """A limit on one of the `KINDS`: a minimum of the success, a maximum of the others.
 
     >>> Limit.parse("p99=0.1")
     Limit(name='p99', value=0.1)
@@ -176,7 +179,8 @@ class Limit:
         return f"{self.name}={self.value:g}"
 
     def is_met(self, result: Result) -> bool:
-        return result.worst[self.name] <= self.value
+        value = result.worst[self.name]
+        return value >= self.value if self.name == "success" else value <= self.value
 
     def describe(self, result: Result) -> str:
         """The figure and its limit, times in milliseconds, as in the tables."""
@@ -184,7 +188,8 @@ class Limit:
             f"{number:.4g}" if self.name in _SHARES else f"{1000 * number:.4g} ms"
             for number in (result.worst[self.name], self.value)
         )
-        return f"{self.name} is {value}, limit at most {limit} ({KINDS[self.name]})"
+        sense = "least" if self.name == "success" else "most"
+        return f"{self.name} is {value}, limit at {sense} {limit} ({KINDS[self.name]})"
 
 
 def violations(limits: Iterable[Limit], result: Result) -> list[str]:

@@ -23,6 +23,7 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert stream["sent"] == stream["stored"] >= 60 * (1 - stream["skipped"])
     assert 0 < stream["track"]["p50"] <= stream["track"]["max"]
     assert 0 < stream["model"]["p50"] <= stream["model"]["max"]
+    assert stream["success"] > 0.5
     assert figures["subscribers"]["received"] != [0]
     assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
     assert figures["processes"]["detector 0"]["cores"] > 0

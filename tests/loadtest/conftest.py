@@ -36,12 +36,12 @@ def track(schedule) -> Callable[..., tuple[float, Track]]:
 def result() -> Callable[..., Result]:
     """A result of streams with these latencies to the track."""
 
-    def made(*streams: list[float], tracked: float = 1.0, **others) -> Result:
+    def made(*streams: list[float], tracked: float = 1.0, success: float = 0.9, **others) -> Result:
         measures = []
         for seconds in map(np.array, streams):
             frames = np.arange(len(seconds))
             seen = {"due": 100 + frames / 10, "tracked": frames < tracked * len(seconds)}
-            measures.append(Measures(**seen, track=seconds, model=seconds))
+            measures.append(Measures(**seen, track=seconds, model=seconds, success=success))
         facts = {"usage": {}, "received": [], "missed": [], "camera_late": 0.001}
         return Result(Plan(streams=len(streams)), 10.0, measures, **{**facts, **others})
 

@@ -25,7 +25,7 @@ def test_interrupted_run_returns_its_measurements_and_leaves_no_process():
         if share > 0.05 and "tracks" in figures:
             raise KeyboardInterrupt
 
-    plan = Plan(rate=20.0, duration=20.0, size=(320, 240))
+    plan = Plan(rate=20.0, duration=20.0, size=(320, 240), source="h264")
     load_test = run_load_test(plan, [Limit("p99", 60.0)], report=tell)
     assert load_test.interrupted
     assert load_test.violations == []
@@ -96,7 +96,10 @@ def test_streams_that_do_not_start_are_a_step_of_a_search_but_not_the_first_one(
 def test_limit_applies_to_the_worst_stream(result):
     run = result([0.01] * 100, [0.01] * 90 + [0.2] * 10)
     assert violations([Limit("p99", 0.1)], run) == ["p99 is 200 ms, limit at most 100 ms (from a frame to its track)"]
-    assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2)], run) == []
+    assert violations([Limit("p99", 0.2), Limit("p50", 0.01), Limit("max", 0.2), Limit("success", 0.9)], run) == []
+    assert violations([Limit("success", 0.95)], run) == [
+        "success is 0.9, limit at least 0.95 (share of frames with an IoU above 0.5)"
+    ]
 
 
 def test_failed_stream_is_a_violation_beside_missed_frames(result):
@@ -115,7 +118,7 @@ def test_malformed_limit_is_an_error(text):
     ("facts", "said"),
     [
         ({"rate": 0.5, "duration": 0.9}, "no frame is due"),
-        ({"size": (321, 240)}, "an even width"),
+        ({"size": (321, 240), "source": "h264"}, "an even width"),
         ({"settings": Settings(run={"endpoint": "run"})}, "omit run.endpoint"),
         ({"slow_subscribers": 1}, "more slow subscribers"),
     ],
