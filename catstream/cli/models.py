@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from catstream.base.files import check_file
-from catstream.base.settings import RunSettings
 from catstream.base.text import counted
 from catstream.base.threads import one_thread
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages, screen, stopped, table, text
-from catstream.cli.options import PATH, NumberRange, with_overwrite, with_skip_damaged
+from catstream.cli.options import PATH, NumberRange, with_overwrite
 from catstream.errors import CatstreamError, VideoError
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.saved_model import merge as merged
 
+if TYPE_CHECKING:
+    from catstream.finding.results import Interval
+
 _PRINTED = 12  # intervals that are printed
-
-
-def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, float]:
-    try:
-        low, high = map(float, text.split(","))
-    except ValueError:
-        raise click.BadParameter(f"expected two numbers such as 0.5,2, got {text!r}") from None
-    return low, high
 
 
 @click.command()
@@ -41,36 +36,16 @@ def _sizes(_: click.Context, __: click.Parameter, text: str) -> tuple[float, flo
 @click.option(
     "--every", type=NumberRange(0, 3600), default=0.2, show_default=True, help="Seconds of a video between two frames."
 )
-@click.option(
-    "--sizes",
-    default="0.4,2.5",
-    show_default=True,
-    callback=_sizes,
-    metavar="LOW,HIGH",
-    help="Range of sizes, relative to the trained size.",
-)
-@click.option("--fps", type=float, default=25.0, show_default=True, help="Frames per second of a folder of images.")
-@with_skip_damaged
 def find(
-    paths: tuple[Path, ...],
-    models: tuple[Path, ...],
-    output: Path,
-    overwrite: bool,
-    threshold: float,
-    every: float,
-    sizes: tuple[float, float],
-    fps: float,
-    skip_damaged: bool,
+    paths: tuple[Path, ...], models: tuple[Path, ...], output: Path, overwrite: bool, threshold: float, every: float
 ) -> None:
     """Find the objects of saved models in videos, folders and images.
 
-    PATH is a video, an image, or a folder, which is searched recursively. The
-    images of a folder are treated as one sequence.
-
-    Videos are sampled every 0.2 s (--every; 0 searches every frame), and objects
-    are searched at 0.4 to 2.5 times the learned size (--sizes). After Ctrl-C, the
-    same command continues: files with a line in results.ndjson are not searched
-    again. The exit status is 1 if a file could not be read.
+    PATH is a video, an image, or a folder, which is searched recursively. Videos
+    are sampled every 0.2 s (--every; 0 searches every frame). The images of a
+    folder are treated as one sequence. A file that was searched is not searched
+    again, so after Ctrl-C the same command continues. The exit status is 1 if a
+    file is damaged or could not be read.
 
     \b
     OUTPUT FILES
@@ -84,8 +59,7 @@ def find(
     \b
     EXAMPLES
       catstream track walk.mp4 --box 120,80,64,48 --save-model anna.safetensors
-      catstream find --model anna.safetensors --model ben.safetensors videos/ photos/ --output detections
-      catstream find --model anna.safetensors --every 1 --sizes 0.7,1.5 archive/
+      catstream find --model anna.safetensors --model ben.safetensors videos/ photos/
     """
     with INTERRUPTS.leaving():
         from catstream.finding.files import find_files
@@ -93,8 +67,7 @@ def find(
         from catstream.finding.results import FileResult, SearchResults, write_csv, write_report
         from catstream.reports.report import clock
 
-    reading = RunSettings(image_rate=fps, skip_damaged=skip_damaged)
-    search = Search(load_models(models), reading, threshold, every, sizes)
+    search = Search(load_models(models), threshold, every)
     files = find_files(paths)
     columns = text("file {task.completed}/{task.total}  {task.fields[place]}  {task.description}", last=True)
     interrupted = False
@@ -124,15 +97,7 @@ def find(
             intervals.sort(key=lambda interval: -interval.best.score)
             report = write_report(output / "report.html", search.models, found, intervals)
 
-    numbers = ("from", "to", "detections", "score")
-    best = table("object", "file", *numbers, right=numbers)
-    for interval in intervals[:_PRINTED]:
-        figures = (*map(clock, interval.times), str(len(interval.detections)), f"{interval.best.score:.2f}")
-        best.add_row(interval.best.object, interval.best.file, *figures)
-    if intervals:
-        screen().print(best)
-    if len(intervals) > _PRINTED:
-        click.echo(f"and {len(intervals) - _PRINTED} more intervals")
+    _print(intervals)
     click.echo(f"report: {report}" if intervals else f"no detections; report: {report}")
     if interrupted:
         stopped("the results of the searched files are saved; the same command continues")
@@ -143,6 +108,20 @@ def find(
         raise CatstreamError(
             f"{counted(len(problems), 'problem')} in {counted(len(files), 'file')}: all other content was searched"
         )
+
+
+def _print(intervals: list[Interval]) -> None:
+    from catstream.reports.report import clock
+
+    numbers = ("from", "to", "detections", "score")
+    best = table("object", "file", *numbers, right=numbers)
+    for interval in intervals[:_PRINTED]:
+        figures = (*map(clock, interval.times), str(len(interval.detections)), f"{interval.best.score:.2f}")
+        best.add_row(interval.best.object, interval.best.file, *figures)
+    if intervals:
+        screen().print(best)
+    if len(intervals) > _PRINTED:
+        click.echo(f"and {len(intervals) - _PRINTED} more intervals")
 
 
 @click.command()

@@ -21,12 +21,8 @@ from catstream.video.source import VIDEOS, open_source
 #: A frame that is searched, and the name of its file in a folder of images.
 NamedFrame = tuple[Frame, str]
 
+_READING = RunSettings(skip_damaged=True)
 _TIME_STEP = 0.001  # of most containers, in seconds: time stamps are rounded to it
-#: Folders of thumbnails, recycle bins and metadata, in lower case; hidden folders are skipped as well.
-_GENERATED = {
-    *("@eadir", "@__thumb", "thumbnails", "thumbs", "__macosx"),
-    *("#recycle", "@recycle", "$recycle.bin", "system volume information"),
-}
 
 _log = logging.getLogger(__name__)
 
@@ -42,29 +38,23 @@ class File:
     path: Path
     pages: tuple[tuple[Path, int], ...] = ()
 
-    def frames(self, every: float, settings: RunSettings, problems: list[str]) -> Generator[NamedFrame]:
-        """Yield the frames to search: all images; of a video the first one in each `every` seconds, and the last one.
+    def frames(self, every: float, problems: list[str]) -> Generator[NamedFrame]:
+        """Yield the frames to search: all images; of a video the first one in each `every` seconds.
 
-        A video that is damaged raises VideoError after the frames before the damage. What else could not be read, an
-        image or frames of a video that were skipped, is added to `problems`.
+        Damaged images and damaged parts of a video are skipped, and added to `problems`. A video that cannot be opened
+        raises VideoError.
         """
-        if self.path.is_symlink() and not self.path.exists():
-            raise VideoError(f"{str(self.path)!r} is a dead link: {str(self.path.readlink())!r} does not exist")
-        return self._of_images(settings, problems) if self.pages else self._of_video(every, settings, problems)
+        return self._of_images(problems) if self.pages else self._of_video(every, problems)
 
-    def _of_video(self, every: float, settings: RunSettings, problems: list[str]) -> Generator[NamedFrame]:
-        # Not in equal numbers of frames: the rate of a file may be nominal, and its frames need not be regular.
-        with open_source(self.path, settings=settings, resize=True) as source:
-            before, last = -1.0, None
+    def _of_video(self, every: float, problems: list[str]) -> Generator[NamedFrame]:
+        with open_source(self.path, settings=_READING, resize=True) as source:
+            interval = -1.0
             with closing(read_ahead(source)) as frames:
                 for frame in frames:
-                    interval = (frame.time + _TIME_STEP) // every if every else frame.number
-                    last = frame if interval == before else None
-                    if last is None:
+                    # By time, not by number: the rate of a file may be nominal, and its frames need not be regular.
+                    before, interval = interval, (frame.time + _TIME_STEP) // every if every else frame.number
+                    if interval != before:
                         yield frame, ""
-                    before = interval
-            if last is not None:
-                yield last, ""
             if scaled := source.counters.get("scaled"):
                 _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
             if skipped := source.counters.get("damaged"):
@@ -72,21 +62,21 @@ class File:
             if missing := source.counters.get("truncated"):
                 problems.append(f"{str(self.path)!r} is truncated: it lacks {missing:.0f} s at the end")
 
-    def _of_images(self, settings: RunSettings, problems: list[str]) -> Generator[NamedFrame]:
+    def _of_images(self, problems: list[str]) -> Generator[NamedFrame]:
         read_image = ImageReader([*self.pages])
         for number, (path, _) in enumerate(self.pages):
             image = read_image(number)
             if image is None:
                 problems.append(f"cannot read the image {str(path)!r}: it is left out")
             else:
-                yield Frame(number, number / settings.image_rate, image), "" if path == self.path else path.name
+                yield Frame(number, number / _READING.image_rate, image), "" if path == self.path else path.name
 
 
 def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
-    """Return the files to search, in order; folders are searched with all their subfolders.
+    """Return the files to search, in order; folders are searched with their subfolders, except hidden ones.
 
     Each file and folder is searched once, even if links lead to it. The images of one folder are one file, in natural
-    order (2.png before 10.png). A dead link is a file that cannot be read. Files of other kinds are counted in the log.
+    order (2.png before 10.png). Files of other kinds are counted in the log.
     """
     visited: set[Path] = set()
     skipped: Counter[str] = Counter()
@@ -97,31 +87,27 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
         return not known
 
     def below(folder: Path) -> Iterator[File]:
-        entries = [entry for entry in folder.iterdir() if entry.name[0] != "." and entry.name.lower() not in _GENERATED]
-        entries.sort(key=natural_order)
-        images = [entry for entry in entries if entry.suffix.lower() in IMAGES and not entry.is_dir()]
-        if new := [*filter(is_new, images)]:
-            yield File(folder, tuple(first_pages(new)))
+        try:
+            entries = sorted((entry for entry in folder.iterdir() if entry.name[0] != "."), key=natural_order)
+        except PermissionError:
+            yield File(folder)  # an error when it is read
+            return
+        if images := [entry for entry in entries if _is_image(entry) and is_new(entry)]:
+            yield File(folder, tuple(first_pages(images)))
         for entry in entries:
-            if entry.is_dir():
-                try:
-                    yield from below(entry) if is_new(entry) else ()
-                except PermissionError:
-                    yield File(entry)  # an error when it is read
-            elif entry.suffix.lower() in VIDEOS or (not entry.suffix and not entry.exists()):
-                yield from [File(entry)] if is_new(entry) else ()
-            elif entry.suffix.lower() not in IMAGES:
+            if entry.is_dir() or entry.suffix.lower() in VIDEOS:
+                if is_new(entry):
+                    yield from below(entry) if entry.is_dir() else [File(entry)]
+            elif not _is_image(entry):
                 skipped[entry.suffix.lower() or "file without a suffix"] += 1
 
     files: list[File] = []
     for name in paths:
         path = Path(name)
-        if is_live(str(name)):
+        if is_live(str(name)) or not path.exists():
             raise VideoError(
-                f"{without_password(str(name))} is a live source: record it to a video first, and pass the video"
+                f"there is no file or folder {without_password(str(name))!r}: pass recorded videos, images, or folders"
             )
-        if not path.exists():
-            raise VideoError(f"there is no file or folder {str(path)!r}: pass videos, images, or folders of them")
         if is_new(path):
             files += below(path) if path.is_dir() else [File(path, tuple(pages_of(path)))]
     kinds = ", ".join(f"{number} {suffix}" for suffix, number in skipped.most_common())
@@ -132,3 +118,7 @@ def find_files(paths: Iterable[str | os.PathLike[str]]) -> list[File]:
     if skipped:
         _log.warning("not searched: %s (name a file to search it)", kinds)
     return files
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGES and not path.is_dir()

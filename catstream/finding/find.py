@@ -12,14 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from catstream.base.box import Box
-from catstream.base.settings import RunSettings
 from catstream.base.threads import cores
 from catstream.errors import SettingsError, VideoError
 from catstream.finding.files import File, NamedFrame, find_files
-from catstream.finding.scan import SIZES, THRESHOLD, Match, Scan
+from catstream.finding.scan import THRESHOLD, Match, Scan
 from catstream.jobs.saved_model import SavedModel
 from catstream.video.frames import Frame
 
@@ -55,40 +52,28 @@ class Detection:
 class Search:
     """Searches files for the objects of several models, in as many threads as there are cores.
 
-    models      name of each object -> its model
-    settings    for reading files: the frame rate of images, and whether damage is skipped
-    threshold   minimum score of a detection
-    every       seconds of a video between two frames that are searched, 0 for every frame
-    sizes       smallest and largest size that is searched, as multiples of the learned size
+    models     name of each object -> its model
+    threshold  minimum score of a detection
+    every      seconds of a video between two frames that are searched, 0 for every frame
     """
 
     models: Mapping[str, SavedModel]
-    settings: RunSettings = field(default_factory=RunSettings)
     threshold: float = THRESHOLD
     every: float = EVERY
-    sizes: tuple[float, float] = SIZES
     _scan: Scan = field(init=False)
 
     def __post_init__(self) -> None:
-        low, high = self.sizes
-        if not 0 < low <= high < 100:
-            raise SettingsError(f"expected the smallest and the largest size, got {low:g},{high:g}: for example 0.5,2")
-        self._scan = Scan(self.models.values(), self.threshold, self.sizes)
+        self._scan = Scan(self.models.values(), self.threshold)
 
     @property
     def digest(self) -> str:
         """A digest of the models and options: two searches with the same digest have the same results."""
-        parts = [self.threshold, self.every, *self.sizes, self.settings.image_rate, float(self.settings.skip_damaged)]
-        digest = hashlib.sha256(np.array(parts).tobytes())
-        for name, saved in self.models.items():
-            digest.update(name.encode())
-            digest.update(saved.model.weights.tobytes())
-            digest.update(np.array([saved.model.bias, *saved.box[2:]]).tobytes())
-        return digest.hexdigest()[:16]
+        models = [(name, saved.model.weights.tobytes(), saved.box) for name, saved in self.models.items()]
+        return hashlib.sha256(repr((models, self.threshold, self.every)).encode()).hexdigest()[:16]
 
     def file(self, file: File, problems: list[str]) -> Iterator[tuple[Frame, list[Detection]]]:
-        """Search a file, and yield each frame with its detections. At damage, VideoError follows the frames before."""
-        frames = file.frames(self.every, self.settings, problems)
+        """Yield each searched frame of a file with its detections. See `File.frames` for the problems and errors."""
+        frames = file.frames(self.every, problems)
         with closing(frames), closing(_scanned(self._scan, frames)) as scanned:
             for (frame, image), results in scanned:
                 place = str(file.path), frame.number, frame.time
@@ -106,25 +91,19 @@ def find(
     *,
     threshold: float = THRESHOLD,
     every: float = EVERY,
-    sizes: tuple[float, float] = SIZES,
-    skip_damaged: bool = False,
 ) -> Iterator[Detection]:
     """Find the objects of saved models in videos, folders and images.
 
     Parameters
     ----------
-    models : path, or iterable of paths
-        Files that `catstream save` wrote. An object without a name gets that of its file.
+    models : path or SavedModel, or iterable of them
+        An object without a name gets that of its file.
     paths : path, or iterable of paths
-        Videos, images, and folders, which are searched with all their subfolders.
+        Videos, images, and folders, which are searched with their subfolders.
     threshold : float
         Minimum score of a detection; the score is about 1 on the object.
     every : float
         Seconds of a video between two frames that are searched, 0 for every frame.
-    sizes : two floats
-        Smallest and largest size that is searched, as multiples of the size that was learned.
-    skip_damaged : bool
-        Continue after a damaged place in a video.
 
     Yields
     ------
@@ -136,16 +115,16 @@ def find(
     ServiceError, ProtocolError
         If a model does not exist, or is damaged or of other features.
     SettingsError
-        If two models have one name, the sizes are not positive, the smaller one first.
+        If two models have one name.
     VideoError
-        If a path does not exist or has nothing to search; after all other files, for the first file that is damaged.
+        If a path does not exist or has nothing to search; after all files, if one was damaged.
 
     Examples
     --------
     >>> for detection in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
     ...     print(detection.file, detection.time, detection.box, detection.score)
     """
-    search = Search(load_models(_several(models)), RunSettings(skip_damaged=skip_damaged), threshold, every, sizes)
+    search = Search(load_models(_several(models)), threshold, every)
     return _detections(search, find_files(_several(paths)))
 
 
@@ -164,18 +143,15 @@ def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[s
 
 
 def _detections(search: Search, files: list[File]) -> Iterator[Detection]:
-    errors: list[VideoError] = []
+    problems: list[str] = []
     for file in files:
-        problems: list[str] = []
         try:
             for _, detections in search.file(file, problems):
                 yield from detections
         except VideoError as error:
-            errors.append(error)
-        if file.pages:  # in a video, the caller asked to skip damaged frames
-            errors += map(VideoError, problems)
-    if errors:
-        raise errors[0]
+            problems.append(str(error))
+    if problems:
+        raise VideoError(problems[0])
 
 
 def _several(values: _One | Iterable[_One]) -> Iterable[_One]:

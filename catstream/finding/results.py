@@ -30,7 +30,7 @@ _PICTURES = 200  # of each object, at most
 
 @dataclass(slots=True)
 class Interval:
-    """Consecutive detections of one object in a file, the best of them, and a JPEG of it with its surroundings."""
+    """Consecutive detections of one object in a file, the best of them, and a JPEG of it."""
 
     detections: list[Detection]
     best: Detection
@@ -114,8 +114,7 @@ class SearchResults(AbstractContextManager["SearchResults"]):
             ) from None
         if any(row.search != search for row in rows):
             raise ServiceError(
-                f"{str(folder)!r} has the results of a search with other models or options: pass another folder, or "
-                "replace them with --overwrite"
+                f"{str(folder)!r} has the results of other models or options: pass another folder, or --overwrite"
             )
         self.files = {row.file: row for row in rows}
         self._stream = open_locked(self._path, size=whole, mode="ab")

@@ -30,9 +30,8 @@ from catstream.messages.kinds import Model
 
 #: The minimum score of a detection.
 THRESHOLD = 0.5
-#: The smallest and the largest size that is searched, as multiples of the learned size.
-SIZES = (0.4, 2.5)
 
+_SIZES = (0.4, 2.5)  # smallest and largest size that is searched, as multiples of the learned size
 _SIZE_STEP = 1.25  # ratio of successive sizes of the grid
 _ASPECT_STEP = 1.25  # ratio of successive aspect ratios
 _MOST_PIXELS = 4_000_000  # of a resized frame: bounds the cost of a search for a tiny object in a large frame
@@ -77,20 +76,14 @@ class Scan:
     appearance model, clipped at 1: about 1 on the object, and near 0 on an unknown background.
 
     threshold : minimum score of a detection
-    sizes : smallest and largest size, as multiples of the learned size
     """
 
-    def __init__(
-        self,
-        models: Iterable[SavedModel],
-        threshold: float = THRESHOLD,
-        sizes: tuple[float, float] = SIZES,
-    ) -> None:
+    def __init__(self, models: Iterable[SavedModel], threshold: float = THRESHOLD) -> None:
         self._threshold = threshold
         self._templates = [_Template.of(saved) for saved in models]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
         for number, template in enumerate(self._templates):
-            for entry in _entries(template.window, sizes):
+            for entry in _entries(template.window):
                 self._grid[entry].append(number)
 
     @one_thread()
@@ -137,11 +130,11 @@ def _fitted(frame: Pyramid, window: Window, template: _Template) -> Match:
     return template.match(ScoreMap.around(frame, best, WINDOW, template.model), 0, 0, best)
 
 
-def _entries(window: Window, sizes: tuple[float, float]) -> list[tuple[int, int]]:
+def _entries(window: Window) -> list[tuple[int, int]]:
     """The entries of the grid, exponents of size and aspect ratio, at which the object of a window is searched."""
-    low, high = (math.log(math.sqrt(window.area) * size, _SIZE_STEP) for size in sizes)
+    low, high = (math.log(math.sqrt(window.area) * size, _SIZE_STEP) for size in _SIZES)
     aspect = round(math.log(window.w / window.h, _ASPECT_STEP))
-    return [(size, aspect) for size in range(math.ceil(low), math.floor(high) + 1)] or [(round(low), aspect)]
+    return [(size, aspect) for size in range(math.ceil(low), math.floor(high) + 1)]
 
 
 def _window(size: int, aspect: int) -> Window:
