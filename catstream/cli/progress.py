@@ -123,7 +123,7 @@ class RunProgress:
 
     @property
     def _counters(self) -> dict[str, float]:
-        """The counters of the detector: those of its last health report, and after the end of the run the totals."""
+        """The counters in the last health report of the detector; after the end of the run, the totals."""
         return self._pipeline.health.get("detector", {}) | self._pipeline.totals
 
     def _rate(self) -> float:

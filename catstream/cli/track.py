@@ -331,8 +331,8 @@ class _Run:
 def _doubtful(boxes: Mapping[str, Box], width: int, height: int) -> list[str]:
     """Descriptions of boxes that can be tracked, but are probably a mistake.
 
-    Such a box is that of the whole frame, or one of two that are the same; or it reaches out of the frame or covers
-    more than a quarter of it, and its four numbers may be two corners.
+    The box is the whole frame, or two objects have the same box; or the box reaches out of the frame or covers more
+    than a quarter of it, and its four numbers may be two corners.
 
     >>> _doubtful({"anna": Box(8, 9, 40, 40), "ben": Box(8, 9, 40, 40)}, 320, 240)
     ['anna and ben have the same box: each costs time']

@@ -26,7 +26,7 @@ from catstream.sinks.events import check_zones
 from catstream.sinks.options import OPTIONS, parse
 from catstream.sinks.track_log import RunFiles
 
-_REPORTS = 12  # of all processes, in which one of the detector says what it tracks: those of four seconds
+_REPORTS = 12  # health reports of all processes in four seconds, one of which is from the detector
 
 
 def with_table(rows: Mapping[str, Any]) -> Callable[[Command], Command]:

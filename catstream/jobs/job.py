@@ -40,7 +40,7 @@ class Results:
     output      folder of the results files
     video       whether an annotated video is among the results files
     write       further files of tracks, see `catstream.sinks.destinations`
-    models      files for what was learned of each object, by name; a file without a name is for the only object
+    models      files for the model of each object, by name; a file without a name is for the only object
     """
 
     output: Path | None = None
@@ -138,7 +138,7 @@ class Job:
         results: Results | None = None,
         paused: bool = False,
     ) -> Job:
-        """The job of the next part of the run; what is not given stays."""
+        """The job of the next part of the run; arguments that are None keep their value."""
         return replace(
             self,
             source=self.source if source is None else source,

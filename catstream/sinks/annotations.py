@@ -1,8 +1,8 @@
 """Formats of annotation tools and data sets, made from a log: COCO, CVAT for video, YOLO and VIA tracks.
 
 Frames have their numbers in the source. The image of a frame is NAME_000000.jpg, with the name of the log and the
-number of the frame; if a folder of images was tracked, it has the name that it has there. A doubtful box is marked,
-except in YOLO, which has no place for it; CVAT also has `checked` of an annotation.
+number of the frame; an image of a folder keeps its name. A doubtful box is marked, except in YOLO, which has no field
+for it; CVAT also has `checked` of an annotation.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class About:
 
 
 class _Place(NamedTuple):
-    """A box of an object, whose number counts from 1; another object that was given the same name has another one."""
+    """A box of an object. Objects are numbered from 1; an object that reuses a name has a number of its own."""
 
     number: int
     label: str
@@ -112,10 +112,10 @@ def write_coco(frames: Iterable[TrackedFrame], path: Path, about: About) -> None
 
 
 def write_cvat(frames: Iterable[TrackedFrame], path: Path, about: About) -> str:
-    """Write `CVAT for video 1.1`: a keyframe for each box, and one that is outside where the object disappears.
+    """Write `CVAT for video 1.1`: a keyframe for each box, and an outside keyframe where the object disappears.
 
-    CVAT drops the boxes of a file that are no keyframes, and interpolates. So those that a person drew in an
-    annotation are marked by the attribute `checked`.
+    CVAT drops boxes that are not keyframes, and interpolates. So the attribute `checked` marks the boxes that a person
+    drew in an annotation.
 
     CVAT refuses a file with a frame that its video does not have, so a track that reaches the last frame of the source
     has no such end. If `about.frames` is None, this is the last frame of the log; returns a line that says so.
@@ -173,7 +173,7 @@ def write_yolo(frames: Iterable[TrackedFrame], folder: Path, about: About) -> No
 
 
 def _write_images(frames: Iterable[TrackedFrame], folder: Path, about: About) -> None:
-    """Write the images of the tracked frames: copies of those of a folder, otherwise as JPEG; none is replaced."""
+    """Write the images of the tracked frames: copies of the files of a folder, otherwise JPEG. Existing files stay."""
     numbers = {frame.tracks[0].source_frame for frame in frames}
     folder.mkdir(exist_ok=True)
     missing = {number for number in numbers if not (folder / _image(about, number)).exists()}

@@ -46,7 +46,7 @@ class _LockedError(VideoError):
 
 
 class SqliteSink:
-    """A table with the tracks of each frame at once; what was written remains, however this process ends.
+    """A table with the tracks of each frame at once; written rows remain if this process crashes.
 
     An existing file is replaced, unless it is a log that is continued. While another program locks the database, frames
     wait in memory, `_MOST_WAITING` at most; the oldest ones beyond that are missed. If the file is removed or renamed,
@@ -109,7 +109,7 @@ class SqliteSink:
     def _connect(self) -> sqlite3.Connection:
         with ExitStack() as stack:
             database = stack.enter_context(closing(sqlite3.connect(self._place, timeout=0)))
-            database.execute("PRAGMA journal_mode = WAL")  # nobody who reads makes the run wait
+            database.execute("PRAGMA journal_mode = WAL")  # readers do not block the run
             database.execute("PRAGMA synchronous = NORMAL")
             with database:
                 create(database, self._head)

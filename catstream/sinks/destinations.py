@@ -55,7 +55,7 @@ class Head:
     """The first line of an NDJSON log, as JSON, and the table `head` of a database: the run that its tracks are of.
 
     catstream  version of the format of the log
-    frame      -1: a program that reads the number of the frame in each line meets the head before frame 0
+    frame      -1: a program that reads the number of the frame in each line reads the head before frame 0
     source     path or address of the source, without a password; empty beside a running pipeline
     size       width and height of a frame, pixels; None if unknown
     rate       frames per second of the source; None if unknown
@@ -84,7 +84,7 @@ class Head:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Self | None:
-        """Read the head of a log; None if the text is none, VideoError if it is that of another version."""
+        """Read the head of a log; None if the text is not a head, VideoError if it is from another version."""
         try:
             written = json.loads(text)["catstream"]
         except (ValueError, TypeError, KeyError):
@@ -108,7 +108,7 @@ class SinkOptions:
     when         kinds of events that are sent, see `catstream.sinks.events.WHEN`
     rate         messages per second about each object, at most, between its events
     picture      whether each event has the newest picture of the pipeline
-    secret_file  file of the key that signs what is sent; None to sign nothing
+    secret_file  file of the key that signs events; None to sign nothing
     megabytes    limit of the size of a folder
     """
 
@@ -125,7 +125,7 @@ class Origin:
     """The run whose tracks a sink writes.
 
     head      of its log
-    address   of the running pipeline, for a sink that receives other messages, too
+    address   of the running pipeline, for a sink that also receives pictures
     options   of the destinations
     attached  whether another program runs the pipeline: its source is not read a second time
     last      last frame of the file if it is a log that is continued; None for a new file
@@ -141,7 +141,7 @@ class Origin:
 
 
 class Sink(Protocol):
-    """Takes the frames in their order; made as `Class(place, origin)`.
+    """Writes the frames in their order; created as `Class(place, origin)`.
 
     Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
     option is not valid, and a method `idle()`, which is called several times a second while no frame arrives.
@@ -151,7 +151,7 @@ class Sink(Protocol):
         """Add a frame; raise VideoError if that is not possible."""
 
     def close(self) -> None:
-        """Complete what was written, which remains; raise VideoError if that is not possible."""
+        """Complete the output; raise VideoError if that is not possible."""
 
 
 class Row(NamedTuple):

@@ -46,8 +46,8 @@ WHEN = dict.fromkeys(KINDS, 0.0) | {"lost": 2.0}
 #: Pixels by which a centre has to be outside a zone to leave it: hysteresis for a box that stays on the edge.
 MARGIN = 10.0
 
-#: More frames than these, with tracks of other objects, end an object without a track. A subscriber that loses messages
-#: may have no track of an object in two of the frames of which it has any, and in the next one that of another first.
+#: An object without a track ends after more frames than this with tracks of other objects. A subscriber that loses
+#: messages may miss an object in two frames, and receive another object first in the next.
 _FORGOTTEN_FRAMES = 3
 
 
@@ -83,7 +83,7 @@ class _Object:
 
 
 class Events:
-    """Detects events in the tracks of a run, in their order; it does no I/O, and time is that of the tracks.
+    """Detects events in the tracks of a run, in their order; it does no I/O, and uses the time of the tracks.
 
     A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `MARGIN` pixels
     outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.
@@ -100,7 +100,7 @@ class Events:
         self._frame, self._frames = -1, 0  # number of the newest frame, and how many there were
 
     def update(self, tracks: Sequence[Track]) -> list[Event]:
-        """Return the events of further tracks: those of a frame, together or one by one."""
+        """Return the events of further tracks of a frame, passed together or one by one."""
         events: list[Event] = []
         for track in tracks:
             if track.frame != self._frame:
@@ -183,7 +183,7 @@ def check_zones(zones: Mapping[str, Sequence[Point]], size: tuple[int, int] | No
 
 
 def _defect(corners: np.ndarray, size: tuple[int, int] | None) -> str:
-    """Return what is wrong with the corners of a zone, float32 (n, 2); empty if nothing is."""
+    """Return the defect of the corners of a zone, float32 (n, 2); empty if they are valid."""
     if len(corners) < 3:
         return f"a polygon has at least 3 corners, got {len(corners)}"
     if not np.isfinite(corners).all():

@@ -58,7 +58,7 @@ class MqttSink:
         self._availability = f"{self._topic}/availability"
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
         self._published = self._acknowledged = self.missed = 0
-        self._is_away = self._is_back = False  # a broker that is back may have lost what was retained
+        self._is_away = self._is_back = False  # a broker that is back may have lost retained messages
         self._link, self._attempted = _Link.CONNECTING, time.monotonic()
         self._client = client = Client(CallbackAPIVersion.VERSION2)
         client.max_queued_messages_set(QUEUED)
@@ -142,7 +142,7 @@ class MqttSink:
         return f"{self._topic}/objects/{name or '-'}"
 
     def _remove(self, name: str) -> None:
-        """Remove what is retained of an object."""
+        """Remove the retained state of an object."""
         del self._sent[name]
         self._publish(self._state_topic(name), b"", retain=True)
 

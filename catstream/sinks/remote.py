@@ -36,7 +36,7 @@ class Warnings:
     """Warns about a destination, whose address is logged without its password.
 
     Hysteresis: each problem is logged once, until the destination has worked for `_STABLE_SECONDS` without a failure.
-    So one that fails in turns for two reasons, or that accepts and closes each connection, does not fill the log.
+    So a receiver that alternates between two failures, or accepts and closes each connection, does not fill the log.
     """
 
     def __init__(self, place: str) -> None:
@@ -119,7 +119,7 @@ class EventStream:
 
 
 def split(place: str, form: str) -> SplitResult:
-    """Return the parts of an address; VideoError with its `form` and what is wrong, without its password."""
+    """Return the parts of an address; VideoError with its `form` and the defect, without its password."""
     host = place.partition("://")[2].partition("/")[0]
     wrong = ""
     if not all("!" <= letter <= "~" for letter in place):

@@ -59,7 +59,7 @@ _OPTIONAL = {"source_frame", "checked", "probability", "processing"}
 
 
 class LineSink(ABC):
-    """A file with a line for each track. What was written remains, however this process ends.
+    """A file with a line for each track. Written lines remain if this process crashes.
 
     An existing file is replaced, or continued after its first `origin.size` bytes. If it is removed, renamed or
     truncated meanwhile, that is logged, and a file with a first line of its own continues.
@@ -163,7 +163,7 @@ class CsvSink(LineSink):
         )
 
 
-#: The suffixes of all logs; of several, a run is continued after the first one that exists.
+#: The suffixes of all logs, in the order in which a run looks for the log to continue.
 LOGS = (".ndjson", ".sqlite", ".csv")
 
 
@@ -258,7 +258,7 @@ class Log:
                 try:
                     track = parse(line.decode("utf-8-sig"))
                 except (KeyError, TypeError, ValueError, ProtocolError) as error:
-                    if Head.from_json(line) is not None:  # the first line, or that of a log which was joined to another
+                    if Head.from_json(line) is not None:  # the first line of a log, or of a log that was appended
                         continue
                     problem = f"{self.path}, line {number} is no track ({error})"
                     is_cut = not line.endswith(b"\n") or not line.strip()
@@ -355,7 +355,7 @@ class RunFiles:
     def check(self, *, overwrite: bool, earlier: list[str], others: Mapping[str, Path] | None = None) -> None:
         """Raise VideoError before the run if a destination cannot be written, or must not be.
 
-        If `overwrite`, existing files may be replaced; those of an `earlier` part of this run are continued. All files,
+        If `overwrite`, existing files may be replaced; files of an `earlier` part of this run are continued. All files,
         also the `others` that the run writes, by their purpose, have to be different.
         """
         source = self.origin.head.source
@@ -384,7 +384,7 @@ class RunFiles:
         return [place for place in self.places if is_file(place) and not Path(place).exists()]
 
     def make_folder(self) -> None:
-        """Make the folder of the results, in which other files of the run may be, too."""
+        """Make the folder of the results, in which the run may also write other files."""
         if self.output is not None:
             with writing(self.output, VideoError):
                 self.output.mkdir(parents=True, exist_ok=True)
@@ -413,7 +413,7 @@ class RunFiles:
             return OpenFiles(sinks, stack.pop_all())
 
     def continued(self, endpoint: str, *, resume: bool) -> OpenFiles:
-        """The same for a run that nobody watches: a file that is not continued is renamed, and folders are made.
+        """The same for an unattended run: a file that is not continued is renamed, and folders are created.
 
         walk.ndjson becomes walk-20261128T133015.ndjson, by the time of its last change.
         """

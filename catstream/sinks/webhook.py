@@ -66,7 +66,7 @@ class Webhook:
         self._queue(self._events.update())
 
     def close(self) -> None:
-        """Queue the last events, and deliver for some seconds what waits; warn about what was missed."""
+        """Queue the last events, and deliver the backlog for some seconds; warn about missed events."""
         self._queue(self._events.close())
         self._bodies.put(None)
         self._hurry.set()

@@ -47,6 +47,13 @@ def test_start_server_imports_while_the_command_track_is_imported(monkeypatch):
     assert calls == ["start_server", "track", "status"]
 
 
+def test_the_help_of_track_fits_on_a_screen(said):
+    _, output, _ = said("track", "--help")
+    lines = output.splitlines()
+    assert len(lines) <= 50
+    assert sum(line.startswith("  -") for line in lines) <= 21  # with --help
+
+
 NUMBERS = [
     (name, option.opts[0])
     for name in COMMANDS

@@ -61,14 +61,8 @@ def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_p
     assert [float(row["seconds"]) for row in rows] == pytest.approx([k / 30 for k in range(4, 32, 4)], abs=1e-3)
     assert [int(row["source_frame"]) for row in rows] == list(range(4, 32, 4))
     head = Log(out / "demo.ndjson").head()
-    assert (head.source, head.size, head.rate, head.frames, head.start, head.stride) == (
-        source,
-        (320, 240),
-        30,
-        7,
-        4,
-        4,
-    )
+    stated = (head.source, head.size, head.rate, head.frames, head.start, head.stride)
+    assert stated == (source, (320, 240), 30, 7, 4, 4)
     assert head.boxes == {"": Box.parse(box)}
     for layout in ("coco", "cvat", "yolo"):  # they need the size
         succeed("export", out / "demo.ndjson", tmp_path / layout, "--format", layout)
@@ -154,29 +148,15 @@ def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succee
 
 REJECTED = {
     "a file that is not there": (["none.mp4"], "no video or folder"),
-    "an empty folder": (["."], "neither images nor a video"),
-    "a text": (["notes.txt"], "not a video|no video in"),
-    "a box outside": (["--box", "400,10,20,20"], "frame"),
-    "a box without size": (["--box", "10,10,0,20"], "10,10,0,20|width|area"),
-    "a box of three numbers": (["--box", "10,10,20"], "x,y,w,h"),
+    "a box outside": (["--box", "anna=400,10,20,20"], "anna: the box 400,10,20,20"),
     "two objects with one name": (["--box", "anna=1,2,30,40", "--box", "anna=5,6,30,40"], "its own name"),
     "two objects without a name": (["--box", "1,2,30,40", "--box", "5,6,30,40"], "NAME=5,6,30,40"),
-    "a name with a blank": (["--box", "a b=1,2,30,40"], "'a b' is not a name"),
-    "a box of an object outside": (["--box", "anna=400,10,20,20"], "anna: the box 400,10,20,20"),
-    "40 objects": (
-        [word for k in range(40) for word in ("--box", f"n{k}=1,2,30,40")],
-        "(40, limit 32)",
-    ),
     "a box and a model of one object": (["--box", "anna=1,2,30,40", "--model", "anna=notes.txt"], "mutually exclusive"),
     "a model of several objects": (["--box", "a=1,2,30,40", "--box", "b=1,2,30,40", "--save-model", "m"], "NAME=FILE"),
-    "two models of an object": (["--save-model", "a=m", "--save-model", "a=n"], "its own name"),
-    "a setting that does not exist": (["--set", "coreset_sise=9"], "did you mean 'coreset.size'"),
-    "a value that does not fit": (["--set", "coreset.size=x"], "coreset.size cannot be 'x'"),
     "a preset that does not exist": (["--preset", "cat11"], "cat11"),
     "a settings file that is not there": (["--settings", "none.toml"], "cannot read none.toml"),
     "a broker": (["--write", "mqtt://me:s3cret@10.0.0.7/yard"], "catstream sink mqtt://10.0.0.7/yard"),
     "a folder of events": (["--write", "events/"], "catstream sink events/"),
-    "an endpoint on the network": (["--set", "run.endpoint=tcp://0.0.0.0:5700"], "other machines"),
 }
 
 
@@ -187,7 +167,7 @@ def test_bad_input_is_rejected_in_one_line_and_nothing_is_written(video, fail, t
     given = arguments if not arguments[0].startswith("--") else [source, *arguments]
     given = given if "--box" in given else [*given, "--box", box]
     error = fail("track", *given, "--output", "out", cwd=tmp_path)
-    assert any(part in error for part in word.split("|")), error
+    assert word in error
     assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]
 
 
