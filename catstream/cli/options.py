@@ -45,7 +45,6 @@ with_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 with_keys = click.option(
     "--keys", default="", metavar="DIR", help="Folder of keys, if the pipeline or fleet requires keys."
 )
-with_skip_damaged = click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video.")
 
 
 def _collect(flag: str, convert: _Converter) -> Callable[..., object]:
@@ -140,5 +139,5 @@ with_settings = combined("settings", lambda overrides: Settings.from_values(over
 with_reading = combined(
     "overrides",
     lambda overrides, skip_damaged: overrides | ({"run.skip_damaged": True} if skip_damaged else {}),
-    with_skip_damaged,
+    click.option("--skip-damaged", is_flag=True, help="Continue after a damaged part of a video."),
 )

@@ -41,7 +41,6 @@ _EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a senso
 class _Link(Enum):
     CONNECTING = auto()
     CONNECTED = auto()
-    REFUSED = auto()
     LOST = auto()
 
 
@@ -178,22 +177,22 @@ class MqttSink:
 
     def _connected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
         if reason.is_failure:
-            self._lose(_Link.REFUSED, f"the broker refuses the connection ({reason})")
+            self._lose(f"the broker refuses the connection ({reason})")
         else:
             self._link, self._is_back, self._is_away = _Link.CONNECTED, self._is_away, False
 
     def _not_connected(self, _: Client, __: object) -> None:
-        self._lose(_Link.LOST, f"no connection ({reason_of(sys.exception())})")
+        self._lose(f"no connection ({reason_of(sys.exception())})")
 
     def _disconnected(self, _: Client, __: object, ___: object, reason: Any, ____: object) -> None:
         if reason.is_failure and self._link is _Link.CONNECTING:
             other = "mqtt:// without TLS" if self._is_tls else "mqtts:// with TLS"
-            self._lose(_Link.LOST, f"no MQTT reply: not an MQTT broker, another port, or {other}")
+            self._lose(f"no MQTT reply: not an MQTT broker, another port, or {other}")
         elif reason.is_failure and self._link is _Link.CONNECTED:
-            self._lose(_Link.LOST, f"the connection was lost ({reason})")
+            self._lose(f"the connection was lost ({reason})")
 
-    def _lose(self, link: _Link, problem: str) -> None:
-        self._link, self._is_away = link, True
+    def _lose(self, problem: str) -> None:
+        self._link, self._is_away = _Link.LOST, True
         self._warnings.failed(f"{problem}; reconnecting")
 
     def _was_published(self, *_: object) -> None:
