@@ -44,10 +44,8 @@ def _files_only(_: click.Context, __: click.Parameter, places: tuple[str, ...]) 
     """Check that no destination is an address or a folder."""
     for place in places:
         if place != STDOUT and not is_file(place):
-            raise click.UsageError(
-                f"--write takes files, and {redacted(place)} is none: attach it to the run with catstream sink "
-                f"{redacted(place)}"
-            )
+            where = redacted(place)
+            raise click.UsageError(f"--write takes files, not {where}: attach it to the run, catstream sink {where}")
     return places
 
 
