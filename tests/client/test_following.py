@@ -8,12 +8,10 @@ import pytest
 
 import catstream
 from catstream.errors import ServiceError, SilenceError
-from catstream.messages.kinds import Answer, Command, End, FleetStatus, StreamStatus
-from catstream.wire.channels import CONTROL, TRACKS
-from catstream.wire.commands import Responder
+from catstream.messages.kinds import End, FleetStatus, StreamStatus
+from catstream.wire.channels import TRACKS
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.keys import allow, clients, create, public_key, synchronise
 from catstream.wire.newest import Publisher
 from tests.wire.examples import present as track
 
@@ -146,31 +144,3 @@ def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
             with commanded(stream.runs()._endpoint) as second:
                 control.resume()
         assert (first, second, control.source) == (["pause"], ["resume"], "walk.mp4")
-
-
-def test_a_client_of_the_fleet_has_its_role_at_each_stream_until_it_is_revoked(stream, managing, keys, folder, tcp):
-    create(folder / "stream")
-    synchronise(folder / "stream", clients(keys))
-    allow(keys, "carl", "watch", output=folder / "carl")  # the stream does not know him yet
-    anna, carl, server = str(folder / "anna"), str(folder / "carl"), public_key(folder / "stream")
-    with managing(stream.status, "", str(keys)):
-        pipeline = stream.runs(str(folder / "stream"), tcp, server=server)
-        with catstream.subscribe("fleet://cam-7", "tracks", timeout=150, keys=anna) as tracks:
-            watched = stream.watched(tracks)
-            stream.send(pipeline, track(1), STOPPED)
-            with Responder[Command, Answer](CONTROL, pipeline._endpoint):
-                with (
-                    catstream.control("fleet://cam-7", timeout=150, keys=anna) as control,
-                    pytest.raises(ServiceError, match=r"rejects the key .* which control requires"),
-                ):
-                    control.stop()
-                with (
-                    catstream.subscribe("fleet://cam-7", "tracks", timeout=150, keys=carl) as rejected,
-                    pytest.raises(ServiceError, match=r"rejects the key .* which tracks requires"),
-                ):
-                    next(rejected)
-            (keys / "clients" / "anna").unlink()
-            synchronise(folder / "stream", clients(keys))
-            stream.update(token=7)  # the pipeline was started again: she connects again
-            with pytest.raises(ServiceError, match="rejects the key"):
-                watched.result(60)

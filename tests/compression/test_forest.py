@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -205,18 +206,6 @@ def test_a_checkpoint_has_the_detector_states_after_the_last_256_messages(settin
         assert known == [45, 45, 46, 300, 300], "or the nearest one"
 
 
-@pytest.mark.parametrize(("energy", "level"), [("0x1p9999", 0), ("nan", 0), ("0x1p3", 10**9)])
-def test_a_forged_state_is_rejected(energy, level, settings, messages, tmp_path):
-    """Its checksum fits: whoever writes one on purpose sees to that."""
-    forest, path = Forest(settings), tmp_path / "state"
-    take(forest, messages, 37)
-    arrays, metadata = forest.state()
-    metadata["objects"][0]["trees"]["object"]["nodes"][0] |= {"level": level, "energy": energy}
-    storage.write(path, arrays, metadata | {"kind": "forest 4"})
-    with pytest.raises(ProtocolError, match="use an older copy"):
-        Forest.load(path, settings)
-
-
 @pytest.mark.parametrize("kind", [None, "compressor 1"])
 def test_a_file_of_another_kind_or_version_is_rejected_with_one_line(settings, kind, tmp_path):
     arrays, metadata = Forest(settings).state()
@@ -259,6 +248,13 @@ def test_an_object_without_a_part_is_dropped_and_the_others_are_kept(settings, m
     assert forest.object_counters().keys() == {"ben"}
     forest.take(merged(3, ben=next(messages), anna=next(messages)))
     assert forest.object_counters()["anna"]["rows"] == 2 + 3 + 6 + 3, "those of one frame"
+
+
+def test_the_process_is_told_after_each_object_of_a_message(settings, messages):
+    """It counts an iteration for the watchdog: all objects together may take long."""
+    inserted = Mock()
+    Forest(settings).take(merged(1, anna=next(messages), ben=next(messages)), after_object=inserted)
+    assert inserted.call_count == 2
 
 
 def test_features_of_another_length_are_rejected(settings, messages):

@@ -10,7 +10,6 @@ The first is sharper than the (1 + epsilon)^q of the paper (section "Coreset Tre
 """
 
 import math
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -18,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from catstream.compression.node import sample, spread
-from catstream.compression.reduce import energy, reduce
+from catstream.compression.node import sample
+from catstream.compression.reduce import energy
 from catstream.compression.tree import CoresetTree, FrequentDirections
 from catstream.errors import ProtocolError
 from tests.learning import rows_of
@@ -168,15 +167,6 @@ def test_rows_shorter_than_a_reduction_stay_within_the_bound(kind, width, rng):
     assert width > SIZE or 0 <= tree.dropped_energy <= slack
 
 
-def test_a_leaf_is_reduced_on_one_thread_and_other_rows_do_not_change_the_number(stream, monkeypatch):
-    limits = []
-    monkeypatch.setattr("catstream.compression.tree.one_thread", lambda: limits.append(1) or nullcontext())
-    tree = CoresetTree(SIZE)
-    for count in (SIZE - 1, 1, 3 * SIZE, 1):
-        tree.insert(stream[:count])
-    assert len(limits) == 2
-
-
 @pytest.mark.parametrize(
     "rows",
     [np.ones((3, 5)), np.ones(6), np.full((2, 6), np.nan), np.full((2, 6), np.inf)],
@@ -224,15 +214,6 @@ def test_each_row_weighs_one_original_row(rng):
     row = rng.uniform(size=30).astype(np.float32)
     rows = grown(np.tile(row, (SIZE * 13, 1))).sample().rows
     assert_allclose(rows, np.tile(row, (len(rows), 1)), rtol=1e-4)
-
-
-@given(st.integers(1, 20), st.integers(0, 2**32 - 1))
-def test_spreading_is_a_rotation(count, seed):
-    rows = reduce(np.random.default_rng(seed).normal(size=(count, 12)).astype(np.float32), count)
-    turned = rows.copy()
-    spread(turned)
-    assert_allclose(turned.T @ turned, rows.T @ rows, atol=1e-4)
-    assert_allclose(turned @ rows[0], np.full(count, rows[0] @ rows[0] / np.sqrt(count)), atol=1e-3)
 
 
 def test_means_and_counts_are_those_of_all_rows_pending_ones_too(stream):

@@ -5,13 +5,7 @@ import numpy as np
 import pytest
 
 from catstream.base.box import Box, Window
-from catstream.base.settings import Settings
-from catstream.detection import extent, teacher
-from catstream.features.cells import Cells
-from catstream.features.layout import WINDOW as WINDOW_CELLS
-from catstream.features.pyramid import Pyramid
-from catstream.messages.heads import ASPECT, EXTENT, HEADS, SIZE
-from catstream.numerics import ridge
+from catstream.detection import extent
 from catstream.tracker import Tracker
 
 WINDOW = Window(60, 50, 48, 40)
@@ -49,19 +43,6 @@ def test_in_a_frame_that_does_not_change_the_box_keeps_its_size(draw):
     for _ in range(8):
         _, box = tracker.update(image)
     assert box.area == pytest.approx(truth.area, rel=0.04)
-
-
-@pytest.mark.parametrize("steps", [-2, -1, 1, 2])
-def test_the_heads_predict_by_how_many_steps_a_window_is_too_large_or_too_wide(draw, steps):
-    image, box = draw(60, 60)
-    frame, window = Pyramid(image), Window.around(box)
-    _, training = teacher.first_training(frame, window, np.random.default_rng(0), Settings())
-    rows = training[EXTENT]
-    regression = ridge.Regression(np.column_stack([rows.rows, np.ones(len(rows), np.float32)]))
-    for head, wrong in ((SIZE, window.scaled(extent.size(steps))), (ASPECT, window.scaled(*extent.stretch(steps)))):
-        weights, bias = regression.fit(rows.offsets[:, int(head == ASPECT)], HEADS[head].penalty)
-        row = Cells.within(frame.around(wrong, WINDOW_CELLS)).row(0, 0)
-        assert (row @ weights + bias - 0.5) * 16 == pytest.approx(steps, abs=0.7)
 
 
 def test_if_the_belief_is_low_only_the_place_is_followed_unless_the_window_is_redetected():

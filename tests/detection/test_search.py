@@ -6,9 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from catstream.base.box import Window
-from catstream.base.settings import Settings
-from catstream.detection import search
-from catstream.detection.context import FrameContext
 from catstream.detection.search import due_part
 from catstream.features.cells import Cells
 from catstream.features.pyramid import Pyramid, Region
@@ -36,34 +33,6 @@ def test_each_part_is_due_once_in_an_interval_or_in_as_many_frames_as_parts(seq,
     frames = max(interval, count)
     parts = [part for number in range(seq, seq + frames) if (part := due_part(number, interval, count)) is not None]
     assert sorted(parts) == list(range(count))
-
-
-@pytest.fixture
-def visited(monkeypatch):
-    """The regions that are searched, with the size of their windows, in order."""
-    found = []
-
-    def within(_, region, window, __, **___):
-        found.append((region, window))
-        return ScoreMap(Cells.of(np.zeros((64, 64, 3), np.uint8)), np.zeros((1, 1), np.float32), (0.0, 0.0), (1.0, 1.0))
-
-    monkeypatch.setattr(ScoreMap, "within", within)
-    return found
-
-
-@pytest.mark.parametrize("side", [6, 20, 60])
-@pytest.mark.parametrize("interval", [1, 10])
-def test_a_round_searches_each_window_of_each_size_within_the_budget_of_a_frame(visited, side, interval):
-    frame, window, model = Pyramid(np.zeros((240, 320, 3), np.uint8)), Window(100, 90, side, side), Model(0, 0, None, 0)
-    for seq in range(200):
-        before = len(visited)
-        search._search_elsewhere(FrameContext(frame, model, Settings(), seq), window, interval)
-        assert sum(region.cells(sized) for region, sized in visited[before:]) < 1.2 * 16_384
-    for factor in (0.8, 1.0, 1.25):
-        w = side * factor
-        parts = [region for region, sized in visited if sized.w == pytest.approx(w)]
-        for x, y in np.random.default_rng(1).uniform(0, (320 - w, 240 - w), (50, 2)):
-            assert any(r.left <= x <= r.left + r.width - w and r.top <= y <= r.top + r.height - w for r in parts)
 
 
 def test_a_maximum_between_cells_is_interpolated_from_its_neighbours(image):

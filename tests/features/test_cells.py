@@ -111,20 +111,8 @@ def test_any_size_gives_its_whole_cells(height, width, rng):
     assert np.isfinite(cells).all()
 
 
-def shades(image):
-    return features.shades(planes_of(image))
-
-
 def colour_features(image, row=0, column=0):
     return Cells.of(image).row(row, column)[COLOURS]
-
-
-def test_a_shade_is_the_lab_colour_in_levels(rng):
-    image = cv2.resize(rng.integers(0, 256, (20, 20, 3), np.uint8), (40, 40), interpolation=cv2.INTER_NEAREST)
-    lab = cv2.cvtColor(image[::2, ::2] // 8 * 8 + 4, cv2.COLOR_BGR2LAB).astype(int)
-    light, a, b = lab[..., 0] // 32, *((lab[..., k] - 98) // 10 for k in (1, 2))
-    expected = (light * 6 + a.clip(0, 5)) * 6 + b.clip(0, 5)
-    np.testing.assert_array_equal(shades(image), expected)
 
 
 def test_a_histogram_is_the_root_of_shares_in_the_middle_6_by_6_cells():

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.client.attach import subscribe
 from catstream.errors import VideoError
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
@@ -51,18 +50,3 @@ def test_a_process_that_a_signal_ends_before_the_run_is_started_again(video):
         assert pipeline.restarts == 1
     assert [track.frame for track in tracks] == list(range(len(video[1])))
     assert pipeline.totals["stored"] == len(video[1])
-
-
-@pytest.mark.parametrize("stays", [False, True], ids=["private folder", "folder of the user"])
-def test_a_subscriber_that_reads_nothing_from_a_restart_on_receives_the_end(video, folder, stays):
-    """Its subscription is sent to the restarted detector only once it reads."""
-    settings = Settings(run={"endpoint": str(folder) if stays else ""})
-    with Pipeline(video[0], video[1][0], settings) as pipeline, subscribe(pipeline.endpoint, "tracks") as tracks:
-        list(islice(pipeline, 3))
-        first = next(tracks)
-        os.kill(pipeline.pids["detector"], signal.SIGKILL)
-        list(pipeline)
-        pipeline.close()
-        rest = list(tracks)
-    assert [track.frame for track in [first, *rest]] == list(range(first.frame, first.frame + len(rest) + 1))
-    assert "did not receive its end" in tracks.end.reason

@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import numpy as np
-import psutil
 import pytest
 
 from catstream.base.settings import Settings
@@ -22,25 +21,14 @@ from tests.pipeline.conftest import share_found
 SETTINGS = Settings(run={"unstored_frames": 16})
 
 
-@pytest.fixture(scope="module")
-def run(video):
-    """Tracks of a whole run, and its pipeline afterwards."""
+def test_every_frame_gets_one_track_and_every_feature_is_stored(video):
     path, boxes = video
     pipeline = Pipeline(path, boxes[0], SETTINGS)
-    return list(pipeline), pipeline
-
-
-def test_every_frame_gets_one_track_and_every_feature_is_stored(run):
-    tracks, pipeline = run
-    n = pipeline.frames
+    tracks, n = list(pipeline), pipeline.frames
     assert [track.frame for track in tracks] == list(range(n))
     assert pipeline.totals == {"sent": n, "stored": n, "rows": n, "restarts": 0}
     assert pipeline.reason == "the source has ended"
-
-
-def test_the_object_is_followed_with_ever_newer_models(run, video):
-    tracks, _ = run
-    assert share_found(tracks, video[1]) > 0.8
+    assert share_found(tracks, boxes) > 0.8
     versions = [track.model_version for track in tracks]
     assert versions == sorted(versions)
     assert versions[0] == 0
@@ -79,25 +67,6 @@ def test_lockstep_with_keys_gives_the_tracks_of_one_process_if_processes_die(
         assert tracks == expected
     assert [[*each] for each in tracks] == [[*each] for each in expected]
     assert pipeline.totals["sent"] == pipeline.totals["stored"] == len(expected)
-
-
-def test_killing_the_processes_one_after_the_other_loses_no_frame(video, alive):
-    path, boxes = video
-    tracks, killed, versions, victims = [], [], [], list(NAMES)
-    near = Settings(run={"unstored_frames": 4, "lag_frames": 2})  # so few frames pass between two deaths
-    with Pipeline(path, boxes[0], near) as pipeline:
-        for track in pipeline:
-            tracks.append(track)
-            if track.frame >= 3 and victims and pipeline.restarts == len(killed) and victims[-1] in pipeline.pids:
-                killed.append(pipeline.pids[victims.pop()])
-                versions.append(track.model_version)
-                psutil.Process(killed[-1]).kill()
-        pids = pipeline.pids
-    assert [track.frame for track in tracks] == list(range(pipeline.frames))
-    assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (pipeline.frames, pipeline.frames)
-    assert len(killed) == pipeline.restarts == len(NAMES)
-    assert tracks[-1].model_version > versions[0], "the trainer, which died first, has learned on"
-    assert not any(map(alive, [*killed, *pids.values()]))
 
 
 def test_a_part_is_followed_whole_though_the_detector_dies(long_video):
@@ -177,8 +146,7 @@ def test_a_box_outside_the_first_frame_or_a_missing_source_is_rejected_at_once(v
         Pipeline(str(folder / "none.mp4"), (0, 0, 10, 10))
 
 
-@pytest.mark.parametrize("frames", [[np.zeros((9, 9, 3), np.uint8)], iter(()), np.zeros((9, 9, 3), np.uint8)])
-def test_frames_in_memory_are_rejected_with_the_way_to_go(frames):
+def test_frames_in_memory_are_rejected_with_the_way_to_go():
     said = r"the number of a camera, got \w+: pass frames in memory to catstream.Tracker"
     with pytest.raises(VideoError, match=said):
-        Pipeline(frames, (0, 0, 10, 10))
+        Pipeline(np.zeros((9, 9, 3), np.uint8), (0, 0, 10, 10))

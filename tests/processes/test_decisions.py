@@ -16,9 +16,6 @@ from catstream.processes.decisions import (
     DesiredObject,
     DesiredState,
     TrainingLag,
-    awaited,
-    checkpoint_is_due,
-    have_arrived,
     resume_at,
     stored,
     with_end,
@@ -107,21 +104,6 @@ def test_an_object_of_which_nothing_was_learned_begins_again_where_it_was_last()
     assert start.desired.objects["ben"] == DesiredObject(PLACE.box(), 9)
 
 
-@given(VERSIONS, VERSIONS, DESIRED)
-def test_lockstep_waits_for_the_compressors_version_of_the_models_of_all_objects(newest, arrived, desired):
-    here = {name: version for name, version in newest.items() if name in desired.objects}
-    assert have_arrived(Position(versions=newest), desired, newest)
-    assert have_arrived(Position(versions=newest), desired, arrived) == (here.items() <= arrived.items())
-
-
-@given(SEQ, SEQ, VERSIONS, VERSIONS)
-def test_a_detector_waits_until_its_models_include_the_features_that_are_due(due, processed, samples, newest):
-    waits = awaited(due, processed, samples, newest)
-    behind = any(newest[name] < version for name, version in samples.items() if name in newest)
-    assert (waits == "features") == (processed < due)
-    assert (waits == "models") == (processed >= due and behind)
-
-
 @given(st.lists(st.tuples(st.integers(1, 3), VERSIONS), max_size=20), SEQ)
 def test_a_sample_counts_from_the_first_message_that_may_have_led_to_it(replies, seq):
     """Each reply is some messages after the one before."""
@@ -175,8 +157,3 @@ class Storing(RuleBasedStateMachine):
 
 TestStoring = Storing.TestCase
 TestStoring.settings = settings(max_examples=60)
-
-
-@given(took=st.integers(0, 60), interval=st.integers(1, 20), since=st.integers(0, 1000))
-def test_checkpoints_take_at_most_a_tenth_of_the_time(took, interval, since):
-    assert checkpoint_is_due(since, took, interval) == (since >= interval and took * 10 <= took + since)

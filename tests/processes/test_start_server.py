@@ -88,13 +88,6 @@ def test_how_a_process_has_ended_is_known(start, until, number, code):
     assert process.pid == 0
 
 
-def test_an_error_before_the_first_turn_is_in_the_log_of_the_process(start, tmp_path, until):
-    (tmp_path / "job").write_text("not a job")
-    process, _, log = start(tmp_path / "job")
-    assert until(process.poll) == 2
-    assert "job" in log.last_line()
-
-
 @pytest.mark.usefixtures("own_server")
 def test_the_processes_end_with_their_start_server_and_a_new_one_starts_the_next(start, until):
     process, *_ = start()

@@ -122,32 +122,6 @@ def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
     assert "reconnected to source one after" in caplog.text
 
 
-def test_a_camera_whose_picture_stops_while_its_sound_goes_on_is_reconnected(tmp_path, served, caplog, until):
-    with av.open(str(tmp_path / "a.ts"), "w") as container:
-        picture, tone = container.add_stream("mpeg2video", rate=25), container.add_stream("mp2", rate=48000)
-        picture.width, picture.height, picture.pix_fmt = 128, 96, "yuv420p"
-        packets = [
-            packet
-            for number in range(25)
-            for packet in picture.encode(av.VideoFrame.from_ndarray(numbered(number), format="bgr24"))
-        ]
-        samples = av.AudioFrame.from_ndarray(np.zeros((1, 2 * 48000 * 20), np.int16), "s16", "stereo")
-        samples.sample_rate = 48000
-        container.mux([*packets, *picture.encode(None), *tone.encode(samples), *tone.encode(None)])
-    data = (tmp_path / "a.ts").read_bytes()
-
-    def send(request):
-        request.send_response(200)
-        request.end_headers()
-        for start in range(0, len(data), len(data) // 200):
-            request.wfile.write(data[start : start + len(data) // 200])
-            time.sleep(0.3 if start > len(data) // 4 else 0)
-
-    with open_source(f"{served(send)}/a.ts", read_timeout_seconds=1) as source:
-        until(lambda: source.reconnects)
-    assert "(data without video frames: check the camera" in caplog.text
-
-
 def test_the_reason_of_a_loss_is_logged_once(camera, monkeypatch, caplog, until):
     monkeypatch.setattr(reconnect, "_LONGEST_BACKOFF", 0.01)
     cam, tried = camera(numbered), []

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import get_args
 
 import pytest
 
-from catstream.video.reconnect import TABLE, Attempt, Kind, Loss, next_attempt
+from catstream.video.reconnect import Attempt, Kind, Loss, next_attempt
 
 #: A history of losses, as kinds with the number of frames, and the attempts that follow: how each begins, its demuxer.
 HTTP = {
@@ -41,10 +40,6 @@ def attempts(losses, *, is_http=True):
         attempt = next_attempt(attempt, Loss(kind, frames), is_http=is_http)
         result.append(attempt)
     return result
-
-
-def test_each_kind_of_loss_has_a_row_with_and_without_a_frame_before():
-    assert set(TABLE) == set(product(get_args(Kind), [False, True]))
 
 
 @pytest.mark.parametrize(("losses", "expected"), HTTP.values(), ids=HTTP)

@@ -467,11 +467,9 @@ def test_a_part_of_a_folder_has_its_images_from_any_start(images, part):
 @pytest.mark.parametrize(
     ("part", "message"),
     [
-        *(
-            (part, "frames count from 0")
-            for part in (slice(-1, None), slice(None, -1), slice(0, 9, 0), slice(9, 0, -1))
-        ),
-        *((part, "must be greater than the start") for part in (slice(5, 5), slice(7, 5), slice(0))),
+        (slice(-1, None), "frames count from 0"),
+        (slice(0, 9, 0), "frames count from 0"),
+        (slice(5, 5), "must be greater than the start"),
     ],
     ids=str,
 )
