@@ -135,30 +135,6 @@ def have_arrived(position: Position, desired: DesiredState, arrived: Mapping[str
     return all(arrived.get(name) == version for name, version in position.versions.items() if name in desired.objects)
 
 
-def awaited(
-    due: int, processed: int, samples: Mapping[str, int], newest: Mapping[str, int]
-) -> Literal["", "features", "models"]:
-    """The channel on which a detector waits before its next frame; "" to continue at once.
-
-    Parameters
-    ----------
-    due : seq of the newest features that the models must include
-    processed : seq of the newest features that the compressor has processed
-    samples : version of each object's newest sample from the features up to `due`
-    newest : version of the newest model of each object that had begun before `due`
-
-    >>> awaited(due=7, processed=6, samples={}, newest={"": 0})
-    'features'
-    >>> awaited(due=7, processed=8, samples={"": 3}, newest={"": 2})
-    'models'
-    >>> awaited(due=7, processed=8, samples={"": 3}, newest={"": 3})
-    ''
-    """
-    if processed < due:
-        return "features"
-    return "models" if any(newest[name] < version for name, version in samples.items() if name in newest) else ""
-
-
 class TrainingLag:
     """The samples that features have led to: a detector in lockstep, or with `lag_frames`, waits for their models.
 
@@ -188,8 +164,22 @@ class TrainingLag:
         return self._due
 
     def awaited(self, due: int, newest: Mapping[str, int]) -> Literal["", "features", "models"]:
-        """The channel on which a detector waits before its next frame, as `awaited` says."""
-        return awaited(due, self.processed, self.samples(due), newest)
+        """The channel on which a detector waits before its next frame; "" to continue at once.
+
+        due     seq of the newest features that the models must include
+        newest  version of the newest model of each object that had begun before `due`
+
+        >>> lag = TrainingLag(processed=6)
+        >>> lag.awaited(due=7, newest={"": 2})
+        'features'
+        >>> lag.reply(8, {"": 3})
+        >>> lag.awaited(due=7, newest={"": 2}), lag.awaited(due=7, newest={"": 3})
+        ('models', '')
+        """
+        if self.processed < due:
+            return "features"
+        samples = self.samples(due).items()
+        return "models" if any(newest[name] < version for name, version in samples if name in newest) else ""
 
 
 def checkpoint_is_due(since: float, took: float, interval: float) -> bool:

@@ -12,10 +12,8 @@ import random
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
@@ -135,13 +133,6 @@ class Child:
         turns, self._turns = self._turns, self.memory.watchdog.turns
         self.silent = self.silent + seconds if turns == self._turns and self.code is None else 0.0
         return self.silent > self.memory.watchdog.patience
-
-    def terminate(self, is_over: Callable[[], bool], turn: Callable[[], object]) -> None:
-        """Ask the process to end, and wait until it has or the time `is_over`; `turn` is called meanwhile."""
-        if self.process is not None:
-            self.process.send_signal(signal.SIGTERM)
-            while self.process.poll() is None and not is_over():
-                turn()
 
     def end(self) -> None:
         if self.process is not None:
@@ -345,14 +336,14 @@ class Supervisor:
             child.end()
             child.due = now + RESTART_SECONDS * 2 ** (recent - 2) * random.uniform(0.5, 1)
 
-    def _is_late(self, deadline: float) -> bool:
-        """Return True if no process is waited for any longer."""
-        return self._hurries.is_set() or self._clock() >= deadline
-
     def _shut_down(self) -> None:
         """End the processes, the detector first, as its last messages need the others; what does not end is killed."""
         deadline = self._clock() + SHUTDOWN_SECONDS
         for child in self._children.values():
-            least = self._clock() + LEAST_SECONDS  # for each, also if those before it have used all of the time
-            child.terminate(partial(self._is_late, max(deadline, least)), self._turn)
+            if child.process is None:
+                continue
+            child.process.send_signal(signal.SIGTERM)
+            limit = max(deadline, self._clock() + LEAST_SECONDS)
+            while child.code is None and not self._hurries.is_set() and self._clock() < limit:
+                self._turn()
         self._receive_health()
