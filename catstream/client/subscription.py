@@ -138,11 +138,6 @@ class Subscription(Generic[Message]):
         """
         return self._gaps.missed + self._gaps.before
 
-    @property
-    def missed_before(self) -> int:
-        """Number of those that were sent before the connection; 0 for one object, which may begin later."""
-        return self._gaps.before
-
     def losses(self) -> str:
         """Describe the missed messages in words."""
         before = f", {self._gaps.before} of them before this subscriber connected" if self._gaps.before else ""
