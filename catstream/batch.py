@@ -7,7 +7,6 @@ boxes in several frames, the video is annotated: `catstream.annotate` tracks bet
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, fields, replace
@@ -19,7 +18,7 @@ import msgspec
 from catstream.annotation.annotation import Annotation
 from catstream.annotation.keyframes import Keyframe, by_object, cells, format_keyframe, parse_row
 from catstream.base.box import Box
-from catstream.base.files import write_atomically, writing
+from catstream.base.files import write_csv
 from catstream.base.settings import Settings
 from catstream.base.text import listed
 from catstream.base.threads import one_thread
@@ -116,7 +115,7 @@ def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
 def write_boxes(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> None:
     """Write a table that `read_boxes` reads, atomically."""
     rows = ((file, name, *cells(box), frame) for file, drawn in boxes.items() for name, frame, box in drawn)
-    _write_table(table, ("file", "object", "x", "y", "w", "h", "frame"), rows)
+    write_csv(table, ("file", "object", "x", "y", "w", "h", "frame"), rows, VideoError)
 
 
 def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Video]:
@@ -187,7 +186,7 @@ class Batch:
 
     def _write(self) -> None:
         names = [field.name for field in fields(Summary)]
-        _write_table(self._table, names, (astuple(row) for row in self.rows if row is not None))
+        write_csv(self._table, names, (astuple(row) for row in self.rows if row is not None), VideoError)
 
 
 def _numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
@@ -224,15 +223,6 @@ def read_summaries(path: Path) -> list[Summary]:
             return [msgspec.convert(row, Summary, strict=False) for row in csv.DictReader(file)]
     except (OSError, UnicodeDecodeError, csv.Error, msgspec.ValidationError) as error:
         raise VideoError(f"{path} is not the table of a batch ({error}): pass another --output") from None
-
-
-def _write_table(path: Path, head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerows([head, *rows])
-    with writing(path, VideoError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text.getvalue().encode(errors="surrogateescape"))
 
 
 def _files(video: Video, output: Path, head: Head, *, overwrite: bool) -> RunFiles:

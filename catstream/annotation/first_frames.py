@@ -14,8 +14,6 @@ from catstream.base.settings import Settings
 from catstream.errors import VideoError
 from catstream.video.source import open_source
 
-_FIRST = slice(0, 1)
-
 
 @dataclass(frozen=True, slots=True)
 class _Frames(DecodedFrames):
@@ -36,35 +34,37 @@ class FirstFrames(Annotation):
     Parameters
     ----------
     folder : folder to which the paths of videos are relative
-    boxes : mapping of the path of each video to its boxes; the boxes in frame 0 can be edited
+    boxes : mapping of the path of each video to its boxes; those in frame 0 can be edited
     settings : for the readers of the videos
     progress : function that is called after each video
 
     Attributes
     ----------
     videos : paths of the videos that can be read
-    errors : dict of the reason why each other video cannot be read, by its path
+    errors : reasons why the other videos cannot be read
     """
 
     def __init__(
         self, folder: Path, boxes: Mapping[str, Sequence[Keyframe]], settings: Settings, progress: Progress
     ) -> None:
         self.videos: list[str] = []
-        self.errors: dict[str, VideoError] = {}
-        self._boxes = boxes
+        self.errors: list[VideoError] = []
+        self._files = list(boxes)
         super().__init__(folder, {}, settings, jobs=1, progress=progress)
-        editable = (
-            (number, key) for number, file in enumerate(self.videos) for key in boxes[file] if _is_editable(key)
-        )
-        self.set_boxes(by_object((name, number, box) for number, (name, _, box) in editable))
+        self._others: dict[str, list[Keyframe]] = {file: [] for file in boxes}  # boxes that cannot be edited
+        editable: list[Keyframe] = []
+        for file, keyframes in boxes.items():
+            for name, frame, box in keyframes:
+                if file in self.videos and frame == 0 and box is not None:
+                    editable.append((name, self.videos.index(file), box))
+                else:
+                    self._others[file].append((name, frame, box))
+        self.set_boxes(by_object(editable))
 
     @property
     def boxes(self) -> dict[str, list[Keyframe]]:
         """The boxes of each video by its path, also those in other frames, and of videos that cannot be read."""
-        boxes = {
-            file: [key for key in keyframes if file in self.errors or not _is_editable(key)]
-            for file, keyframes in self._boxes.items()
-        }
+        boxes = {file: [*others] for file, others in self._others.items()}
         for name, drawn in self.keyframes.items():
             for number, box in drawn.items():
                 boxes[self.videos[number]].append((name, 0, box))
@@ -75,21 +75,16 @@ class FirstFrames(Annotation):
 
     def _open(self, video: str, _: slice) -> tuple[None, DecodedFrames]:
         frames = _Frames(Path(self._folder.name), (0, 0), [], 0.0, "")
-        for number, file in enumerate(self._boxes):
+        for number, file in enumerate(self._files):
             try:
-                source = open_source(Path(video) / file, part=_FIRST, settings=self.settings.run)
+                source = open_source(Path(video) / file, part=slice(0, 1), settings=self.settings.run)
                 first = DecodedFrames(frames.path / str(number), source.size, [], source.rate, file)
                 decode(source, first, lambda *_: None)
             except VideoError as error:
-                self.errors[file] = error
+                self.errors.append(error)
             else:
                 self.videos.append(file)
                 frames.videos.append(first)
                 frames.times.extend(first.times)
-            self.progress("opening", number + 1, len(self._boxes))
+            self.progress("opening", number + 1, len(self._files))
         return None, frames
-
-
-def _is_editable(keyframe: Keyframe) -> bool:
-    _, frame, box = keyframe
-    return frame == 0 and box is not None

@@ -6,13 +6,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from catstream.base.box import Box
-from catstream.base.files import write_atomically, writing
+from catstream.base.files import write_csv
 from catstream.base.names import check_name, errors_about
 from catstream.base.text import listed
 from catstream.errors import BoxError, VideoError
@@ -72,13 +71,9 @@ def parse_row(path: Path, line: int, row: Mapping[str, str]) -> Keyframe:
 
 def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, Box | None]]) -> None:
     """Write the file that `read_keyframes` reads, atomically, in the order of the frames."""
-    text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(_HEADER)
-    for frame, name in sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn):
-        rows.writerow([frame, name, *cells(keyframes[name][frame])])
-    with writing(path, VideoError):
-        write_atomically(path, text.getvalue().encode())
+    places = sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn)
+    rows = ([frame, name, *cells(keyframes[name][frame])] for frame, name in places)
+    write_csv(path, _HEADER, rows, VideoError)
 
 
 def cells(box: Box | None) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import Progress
 
-from catstream.base.files import locked_folder, write_atomically, writing
+from catstream.base.files import locked_folder, write_csv
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.base.threads import cores
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from catstream.annotation.annotation import Annotation
     from catstream.annotation.session import Session
     from catstream.sinks.track_log import RunFiles
-    from catstream.web.server import Server
 
 
 @click.command()
@@ -95,7 +94,7 @@ def annotate(
     bar = line_of(messages())
     settings = Settings.from_values(overrides)
     with Annotation(
-        video, drawn, settings, jobs=jobs if drawn else 2 * jobs, progress=lambda *done: _show(bar, *done)
+        video, drawn, settings, jobs=jobs if drawn else 2 * jobs, progress=lambda *done: show_progress(bar, *done)
     ) as annotation:
         results = _ResultFiles(annotation, video, output or Path(f"{annotation.frames.name}-annotation"))
         if drawn:
@@ -132,13 +131,10 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
 def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: HostPort, token: str | None) -> bool:
     """Serve the page until it is done or interrupted, and write the results; return whether it was interrupted."""
     from catstream.annotation.session import Session
-    from catstream.web.annotator import AnnotationSite
-    from catstream.web.server import Server
 
     with Session(annotation, jobs, results.save, results.write) as session:
-        server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
         results.begin()
-        interrupted = wait_for(session, server)
+        interrupted = serve(session, listen, token)
     if interrupted and session.decoded:
         with INTERRUPTS.deferred():
             results.write()
@@ -147,8 +143,12 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
     return interrupted
 
 
-def wait_for(session: Session, server: Server) -> bool:
+def serve(session: Session, listen: HostPort, token: str | None) -> bool:
     """Serve the page of a session until it is done or interrupted; return whether it was interrupted."""
+    from catstream.web.annotator import AnnotationSite
+    from catstream.web.server import Server
+
+    server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
     with server.in_background():
         for url in server.urls:
             click.echo(url)
@@ -158,7 +158,8 @@ def wait_for(session: Session, server: Server) -> bool:
     return not session.finished.is_set()
 
 
-def _show(bar: Progress, work: str, done: int, total: int | None) -> None:
+def show_progress(bar: Progress, work: str, done: int, total: int | None) -> None:
+    """Show the progress of an annotation in the only task of a display."""
     (task,) = bar.tasks
     if task.description != work:  # the remaining time counts for this part of the work
         bar.reset(task.id)
@@ -196,9 +197,8 @@ class _ResultFiles:
         with self._log().opened("") as files:
             for tracks in zip(*self._annotation.tracks.values(), strict=True):
                 files.write(TrackedFrame(list(tracks)))
-        rows = [f"{frame},{name},{errors:.1f}\n" for frame, name, errors in self._annotation.next_frames()]
-        with writing(self._next, VideoError):
-            write_atomically(self._next, "".join(["frame,object,errors\n", *rows]).encode())
+        rows = ((frame, name, f"{errors:.1f}") for frame, name, errors in self._annotation.next_frames())
+        write_csv(self._next, ("frame", "object", "errors"), rows, VideoError)
 
     def _log(self) -> RunFiles:
         from catstream.sinks.destinations import Head, Origin

@@ -14,7 +14,7 @@ from catstream.base.files import locked_folder
 from catstream.base.settings import Settings
 from catstream.base.text import counted
 from catstream.base.threads import cores
-from catstream.cli.annotate import wait_for
+from catstream.cli.annotate import serve, show_progress
 from catstream.cli.common import INTERRUPTS, line_of, messages, screen, stopped, table
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
 from catstream.cli.view import HostPort, with_listen, with_token
@@ -23,8 +23,7 @@ from catstream.errors import BoxError, CatstreamError, VideoError
 _NUMBERS = ("objects", "frames", "present", "doubtful", "checked")
 
 if TYPE_CHECKING:
-    from catstream.annotation.keyframes import Keyframe
-    from catstream.batch import Summary, Video
+    from catstream.batch import Summary
 
 
 @click.command()
@@ -54,10 +53,9 @@ def batch(
     tracked from its box to the end of the video. If it has boxes in several
     frames, it is tracked between them and checked, as by catstream annotate.
 
-    With --ask, the command serves a page that shows the first frame of each VIDEO,
-    see --listen and --token of catstream view. Boxes are drawn in all of them, and
-    each is saved at once in boxes.csv; then Done begins to track. The same command
-    continues with these boxes, also for more videos.
+    With --ask, the command first serves a page on which boxes are drawn in the
+    first frame of each VIDEO, see --listen and --token of catstream view. Each box
+    is saved at once in boxes.csv, and the button Done begins to track.
 
     A video that fails does not stop the others; the exit status is then 1. The
     same command continues after Ctrl-C, and tracks only videos that failed, are
@@ -79,20 +77,15 @@ def batch(
     with INTERRUPTS.leaving():
         from catstream.batch import Batch, check_results, read_boxes, videos_of
 
-    drawn, settings = output / "boxes.csv", Settings.from_values(overrides)
-    if ask:
-        boxes = read_boxes(drawn) if drawn.exists() else {}
-        boxes |= {file: [] for file in (_relative(file, output) for file in files) if file not in boxes}
-        videos = videos_of(drawn, boxes)
-    else:
-        videos = videos_of(*files, read_boxes(*files)) if len(files) == 1 else []
+    if not files or (len(files) > 1 and not ask):
+        raise click.UsageError("expected one file BOXES, or videos after --ask")
+    settings = Settings.from_values(overrides)
+    boxes = _draw_boxes(files, output, settings, listen, token, overwrite=overwrite) if ask else files[0]
+    videos = videos_of(boxes, read_boxes(boxes))
     if not videos:
-        raise click.UsageError("expected one file BOXES with a row for each box, or videos after --ask")
+        raise VideoError(f"{boxes} has no box: add a row for each object")
     if not overwrite:
         check_results(videos, output)
-    if ask:
-        videos = _ask_for_boxes(drawn, boxes, settings, listen, token)
-
     batch = Batch(videos, output, overwrite=overwrite)
     try:
         with line_of(messages()) as progress, closing(batch.track(settings, jobs or cores())) as tracked:
@@ -110,51 +103,42 @@ def batch(
         )
 
 
-def _relative(file: Path, folder: Path) -> str:
-    """The path of a file relative to a folder, either of which may be in a symbolic link."""
-    path = file.parent.resolve() / file.name
-    try:
-        return os.path.relpath(path, folder.resolve())
-    except ValueError:  # on another drive of Windows
-        return str(path)
-
-
-def _ask_for_boxes(
-    path: Path, boxes: dict[str, list[Keyframe]], settings: Settings, listen: HostPort, token: str | None
-) -> list[Video]:
-    """Serve the page on which boxes are drawn until it is done; return the videos with boxes, and unreadable ones."""
+def _draw_boxes(
+    videos: tuple[Path, ...], output: Path, settings: Settings, listen: HostPort, token: str | None, *, overwrite: bool
+) -> Path:
+    """Serve the page on which boxes are drawn in first frames until it is done; return the table of boxes."""
     from catstream.annotation.first_frames import FirstFrames
     from catstream.annotation.session import Session
-    from catstream.batch import videos_of, write_boxes
-    from catstream.web.annotator import AnnotationSite
-    from catstream.web.server import Server
+    from catstream.batch import check_results, read_boxes, videos_of, write_boxes
 
-    bar = line_of(messages())
+    table = output / "boxes.csv"
+    boxes = read_boxes(table) if table.exists() else {}
+    for video in videos:
+        path = video.parent.resolve() / video.name  # the folders may be symbolic links, the video keeps its name
+        boxes.setdefault(os.path.relpath(path, output.resolve()), [])
+    named = videos_of(table, boxes)  # errors that are better reported before any box is drawn
+    if not overwrite:
+        check_results(named, output)
+
     with ExitStack() as stack:
-        stack.enter_context(locked_folder(path.parent, VideoError))  # which makes it
-        with bar:
-            task = bar.add_task("opening")
-            frames = stack.enter_context(
-                FirstFrames(
-                    path.parent, boxes, settings, lambda _, done, total: bar.update(task, completed=done, total=total)
-                )
-            )
-        for error in frames.errors.values():
+        stack.enter_context(locked_folder(output, VideoError))  # which makes it
+        with line_of(messages()) as bar:
+            bar.add_task("opening")
+            frames = FirstFrames(output, boxes, settings, lambda *done: show_progress(bar, *done))
+            stack.enter_context(frames)
+        for error in frames.errors:
             click.echo(f"skipped: {error}", err=True)
-        if frames.videos:
+        if not frames.videos:
+            raise VideoError("none of the videos can be read")
 
-            def check() -> None:
-                if not frames.keyframes:
-                    raise BoxError("no box is drawn: draw one, or press Ctrl-C where the command runs")
+        def check() -> None:
+            if not frames.keyframes:
+                raise BoxError("no box is drawn: draw one, or press Ctrl-C where the command runs")
 
-            session = stack.enter_context(Session(frames, 1, lambda: write_boxes(path, frames.boxes), check))
-            site = AnnotationSite(session)
-            if wait_for(session, Server(site, host=listen.host, port=listen.port, token=token)):
-                stopped(f"the boxes so far are saved in {path}; the same command continues")
-        videos = videos_of(path, frames.boxes)
-        if empty := [video.file for video in videos if not video.keyframes and video.file not in frames.errors]:
-            click.echo(f"not tracked, because no box is drawn: {', '.join(empty)}", err=True)
-        return [video for video in videos if video.file not in empty]
+        session = stack.enter_context(Session(frames, 1, lambda: write_boxes(table, frames.boxes), check))
+        if serve(session, listen, token):
+            stopped(f"the boxes so far are saved in {table}; the same command continues")
+    return table
 
 
 def _print(summaries: Iterable[Summary]) -> None:

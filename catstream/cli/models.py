@@ -64,7 +64,7 @@ def find(
     with INTERRUPTS.leaving():
         from catstream.finding.files import find_files
         from catstream.finding.find import Search, load_models
-        from catstream.finding.results import FileResult, SearchResults, write_csv, write_report
+        from catstream.finding.results import FileResult, SearchResults, write_detections, write_report
         from catstream.reports.report import clock
 
     search = Search(load_models(models), threshold, every)
@@ -93,7 +93,7 @@ def find(
         with INTERRUPTS.deferred():
             found = list(results.files.values())
             intervals = [interval for result in found for interval in result.intervals]
-            write_csv(output / "detections.csv", intervals)
+            write_detections(output / "detections.csv", intervals)
             intervals.sort(key=lambda interval: -interval.best.score)
             report = write_report(output / "report.html", search.models, found, intervals)
 

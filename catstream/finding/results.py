@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
@@ -14,7 +12,7 @@ import msgspec
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.files import open_locked, write_atomically, writing
+from catstream.base.files import open_locked, write_csv, writing
 from catstream.errors import ServiceError
 from catstream.finding.files import File
 from catstream.finding.find import Detection
@@ -135,16 +133,23 @@ class SearchResults(AbstractContextManager["SearchResults"]):
             self._stream.flush()
 
 
-def write_csv(path: Path, intervals: Iterable[Interval]) -> None:
-    """Write a row for each detection."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("file", "object", "frame", "seconds", "x", "y", "w", "h", "score", "image"))
-    for at in (detection for interval in intervals for detection in interval.detections):
-        box = (round(value, 2) for value in at.box)
-        writer.writerow((at.file, at.object, at.frame, round(at.time, 3), *box, round(at.score, 4), at.image))
-    with writing(path):
-        write_atomically(path, text.getvalue().encode(errors="surrogateescape"))  # the name of a file need not be UTF-8
+def write_detections(path: Path, intervals: Iterable[Interval]) -> None:
+    """Write a CSV file with a row for each detection."""
+    columns = ("file", "object", "frame", "seconds", "x", "y", "w", "h", "score", "image")
+    rows = (
+        (
+            at.file,
+            at.object,
+            at.frame,
+            round(at.time, 3),
+            *(round(side, 2) for side in at.box),
+            round(at.score, 4),
+            at.image,
+        )
+        for interval in intervals
+        for at in interval.detections
+    )
+    write_csv(path, columns, rows)
 
 
 def write_report(path: Path, objects: Iterable[str], results: Sequence[FileResult], intervals: list[Interval]) -> Path:

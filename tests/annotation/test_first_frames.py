@@ -19,7 +19,7 @@ def frames(demo_video, tmp_path):
 
 
 def test_boxes_in_other_frames_and_of_videos_that_cannot_be_read_are_kept(frames):
-    assert (frames.videos, [*frames.errors]) == (["cam.mp4"], ["broken.mp4"])
+    assert (frames.videos, len(frames.errors)) == (["cam.mp4"], 1)
     assert frames.keyframes == {"anna": {0: BOX}}
     moved = Box(1.0, 2.0, 30.0, 40.0)
     frames.set_boxes({"anna": {0: moved}})

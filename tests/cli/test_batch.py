@@ -95,7 +95,7 @@ def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ([], "expected one file BOXES with a row"),
+        ([], "boxes.csv has no box"),
         (["a.mp4,anna,1,2,30,x,0"], "line 2: expected the columns"),
         ([",anna,1,2,30,40,0"], "line 2: expected the path of a video"),
         (["a.mp4,anna,1,2,30,40,0", "a.mp4,anna,1,2,30,40,0"], "a.mp4: anna has two boxes in frame 0"),
@@ -105,11 +105,6 @@ def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
 def test_a_table_that_cannot_be_used_is_an_error_of_one_line(fail, tmp_path, rows, message):
     assert message in fail("batch", table(tmp_path, *rows), "--output", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_videos_without_ask_and_ask_without_videos_are_refused(fail, tmp_path):
-    for words in (["a.mp4", "b.mp4"], ["--ask"], []):
-        assert "or videos after --ask" in fail("batch", *words, "--output", tmp_path / "out")
 
 
 @pytest.mark.parametrize(

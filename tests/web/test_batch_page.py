@@ -53,9 +53,8 @@ def test_boxes_of_several_videos_are_drawn_before_they_are_tracked(
         "errors []",
     ]
     _, errors = process.communicate(timeout=150)
-    assert process.returncode == 1
-    assert "skipped: " in errors
-    assert "1 of 3 videos failed" in errors
+    assert process.returncode == 0, errors
+    assert "broken.mp4' is not a video that can be read" in errors
     with (out / "boxes.csv").open() as file:
         drawn = [(row["file"], row["object"], row["frame"]) for row in csv.DictReader(file)]
     places = ("../deep/videos/cam.mp4", "../deep/videos/images")
@@ -63,7 +62,6 @@ def test_boxes_of_several_videos_are_drawn_before_they_are_tracked(
     with (out / "batch.csv").open() as file:
         rows = {row["video"]: row for row in csv.DictReader(file)}
     assert [rows[place]["tracks"] for place in places] == [str(2 * FRAMES), str(FRAMES)]
-    assert "not a video that can be read" in rows["../deep/videos/broken.mp4"]["error"]
 
     code, *_ = said("batch", out / "boxes.csv", "--output", tmp_path / "again", "--jobs", 1)
     assert code == 0
