@@ -16,7 +16,7 @@ from pathlib import Path
 from catstream.base.names import boxes_by_name, split_name
 from catstream.base.settings import Settings
 from catstream.errors import CatstreamError, ObjectError
-from catstream.jobs.job import Job
+from catstream.jobs.job import Job, files_by_name
 from catstream.processes.process import run
 
 _ABOUT = {
@@ -39,8 +39,9 @@ def main(name: str) -> None:
     """Run a process with the arguments of the command line, and exit with its code; an error is one line."""
     options = vars(parser(name).parse_args())
     try:
-        pairs, boxes = options.pop("pairs"), options.pop("boxes", [])
-        job = Job(**options, settings=Settings.load(overrides=pairs), boxes=boxes_by_name(_by_name(boxes)))
+        settings = Settings.load(overrides=options.pop("pairs"))
+        boxes, models = (_by_name(option, options.pop(option, [])) for option in ("box", "model"))
+        job = Job(**options, settings=settings, boxes=boxes_by_name(boxes), models=files_by_name(models))
         sys.exit(run(name, job))
     except CatstreamError as error:
         sys.exit(f"catstream: {error}")
@@ -61,16 +62,20 @@ def parser(name: str) -> ArgumentParser:
         made.add_argument("--state", type=Path, help="Folder for the checkpoints or the desired state.")
     if name == "detector":
         made.add_argument("source", metavar="SOURCE", help="A video, a folder of images, a camera or a stream.")
-        box = "An object in the first frame, in pixels; may be repeated with names."
-        made.add_argument("--box", dest="boxes", action="append", default=[], metavar="[NAME=]X,Y,W,H", help=box)
+        box = "An object in the first frame, in pixels; may be repeated with names. Empty: none."
+        made.add_argument("--box", action="append", default=[], metavar="[NAME=]X,Y,W,H", help=box)
+        model = "Search for the object of a saved model; may be repeated with names. Empty: none."
+        made.add_argument("--model", action="append", default=[], metavar="[NAME=]FILE", help=model)
         resume = "Continue after the last message of an earlier detector."
         made.add_argument("--resume", action="store_true", help=resume)
     return made
 
 
-def _by_name(texts: list[str]) -> dict[str, str]:
-    """Boxes by the names of their objects; ObjectError if two have the same name."""
-    boxes = dict(split_name(text) for text in texts)
-    if len(boxes) < len(texts):
-        raise ObjectError(f"duplicate object (--box {' --box '.join(texts)}): give each object its own name")
-    return boxes
+def _by_name(option: str, texts: list[str]) -> dict[str, str]:
+    """The values of an option by the names of their objects, without empty ones; ObjectError if two have one name."""
+    texts = [text for text in texts if text]
+    values = dict(split_name(text) for text in texts)
+    if len(values) < len(texts):
+        given = " ".join(f"--{option} {text}" for text in texts)
+        raise ObjectError(f"duplicate object ({given}): give each object its own name")
+    return values
