@@ -1,4 +1,4 @@
-"""The services of the compose files run, without Docker: their commands, environment and health checks."""
+"""The services of docker-compose.yml, without Docker: their privileges, and a run of them without any variable."""
 
 import os
 import re
@@ -9,42 +9,57 @@ from pathlib import Path
 
 import yaml
 
-from catstream.client.attach import subscribe
+from catstream.client.attach import control, subscribe
 from catstream.processes.start_server import NAMES
-from catstream.wire import keys
+from catstream.video.live_demo import first_box
 
 ROOT = Path(__file__).parents[1]
-SERVICES, WITH_KEYS = (
-    yaml.safe_load((ROOT / name).read_text())["services"] for name in ("docker-compose.yml", "docker-compose.keys.yml")
-)
-SCRIPTS = "/opt/catstream/services"  # in the image
+TEXT = (ROOT / "docker-compose.yml").read_text()
+VARIABLE = r"\$\{(\w+):-([^}]*)\}"  # with its default
+SERVICES = yaml.safe_load(re.sub(VARIABLE, r"\2", TEXT).replace("$$", "$"))["services"]
 
 
-def filled_in(text, **variables):
-    """A text with its variables replaced, as docker compose does it."""
-    return re.sub(r"\$\{(\w+):[-?]([^}]*)\}", lambda match: variables.get(match[1], match[2]), text)
+def test_services_have_no_privileges_and_publish_only_the_page_on_loopback():
+    assert SERVICES.keys() == {*NAMES, "view", "tracks"}
+    assert [port for service in SERVICES.values() for port in service.get("ports", [])] == ["127.0.0.1:8000:8000"]
+    for service in SERVICES.values():
+        assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert service["restart"] == "unless-stopped"
+        assert service.get("network_mode", "none") == "none"
 
 
-def test_a_subscriber_outside_of_the_containers_receives_from_the_services(demo_video, tmp_path, tcp, monkeypatch):
-    path, truth = demo_video(60)
-    keys.create(tmp_path / "pipeline")
-    keys.allow(tmp_path / "pipeline", "phone", "watch", tmp_path / "phone")
-    here = {"/keys": str(tmp_path), "/state": str(tmp_path / "state"), SCRIPTS: str(ROOT / "services")}
-    here["tcp://0.0.0.0:5700"] = tcp.replace("127.0.0.1", "0.0.0.0")
-    monkeypatch.chdir(path.parent)
+def test_example_of_variables_has_each_variable():
+    assert "${" not in re.sub(VARIABLE, "", TEXT)
+    example = re.findall(r"^#?([A-Z_]+)=", (ROOT / ".env.example").read_text(), re.MULTILINE)
+    assert sorted(example) == sorted({name for name, _ in re.findall(VARIABLE, TEXT)})
+
+
+def test_services_track_an_object_whose_box_is_set_later(folder, tmp_path):
+    (folder / "run").mkdir(mode=0o700)
+    (tmp_path / "tracks").mkdir()
+    places = {"/opt/catstream": ROOT, "/state": folder, "/tracks": tmp_path / "tracks", "0.0.0.0:8000": "127.0.0.1:0"}
+
+    def here(words):
+        return [re.sub("|".join(places), lambda match: str(places[match[0]]), word) for word in words]
+
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    variables = os.environ | {"PATH": path, "CATSTREAM_RUN_ENDPOINT": str(folder / "run"), "SINK": ""}
+    processes = {}
     with ExitStack() as stack:
-        for name in NAMES:
-            variables = {**SERVICES[name]["environment"], **WITH_KEYS[name]["environment"]}
-            line = [filled_in(word, SOURCE=path.name, BOX=str(truth[0])) for word in SERVICES[name]["command"]]
-            for there, place in here.items():
-                variables = {key: value.replace(there, place) for key, value in variables.items()}
-                line = [word.replace(there, place) for word in line]
-            service = [sys.executable, "-P", *line]
-            process = stack.enter_context(subprocess.Popen(service, env=os.environ | variables))
+        for name, service in SERVICES.items():
+            words = service.get("entrypoint", [sys.executable, "-P"]) + service.get("command", [])
+            process = subprocess.Popen(here(words), env=variables, stdout=subprocess.PIPE, text=True)
+            processes[name] = stack.enter_context(process)
             stack.callback(process.kill)
-        with subscribe(tcp, "tracks", keys=str(tmp_path / "phone"), timeout=150) as tracks:
+        assert processes["view"].stdout.readline().startswith("http://127.0.0.1:")
+        for name in NAMES:
+            _, *check = here(SERVICES[name]["healthcheck"]["test"])
+            subprocess.run([sys.executable, *check[1:]], check=True)
+        with control(str(folder / "run")) as pipeline, subscribe(str(folder / "run"), "tracks", timeout=150) as tracks:
+            pipeline.set_box(first_box("demo:1"))
             assert next(tracks).box is not None
-        *_, script, address = SERVICES["trainer"]["healthcheck"]["test"]
-        monkeypatch.setenv("CATSTREAM_RUN_KEYS", str(tmp_path / "pipeline"))
-        health = address.replace("5707", str(int(tcp.rpartition(":")[2]) + 7))
-        subprocess.run([sys.executable, "-P", "-c", script, health], check=True)
+            processes["detector"].terminate()
+            assert [processes[name].wait(60) for name in (*NAMES, "tracks")] == [0] * 4
+    (log,) = (tmp_path / "tracks").glob("*.ndjson")
+    assert '"source":"demo:1"' in log.read_text()
