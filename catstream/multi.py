@@ -14,7 +14,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from catstream.base.box import Box
 from catstream.base.names import UNNAMED, Boxes, boxes_by_name, by_name, check_count, check_name
 from catstream.base.settings import Settings
 from catstream.base.text import listed
@@ -158,7 +157,10 @@ class MultiTracker:
             name: model if isinstance(model, SavedModel) else SavedModel.load(model)
             for name, model in by_name(search or {}).items()
         }
-        compressors = self._continued(models, boxes)
+        if both := models.keys() & boxes.keys():
+            raise ObjectError(f"{listed(sorted(both))}: a box and a saved model of one object are mutually exclusive")
+        check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.max_objects)
+        compressors = {name: saved.compressor(self.settings, name) for name, saved in models.items()}
         if image.shape[:2] != self._size:
             (height, width), (first_height, first_width) = image.shape[:2], self._size
             raise FrameError(
@@ -173,13 +175,6 @@ class MultiTracker:
                 self.detectors.seek(name, saved.model, saved.box, saved.similarity())
             self._train(*self.detectors.step(pyramid, time, results), compressors)
         return self.tracks
-
-    def _continued(self, models: Mapping[str, SavedModel], boxes: Mapping[str, Box]) -> dict[str, Compressor]:
-        """The compressors of the objects of saved models; raises an error if one of the objects cannot begin."""
-        if both := models.keys() & boxes.keys():
-            raise ObjectError(f"{listed(sorted(both))}: a box and a saved model of one object are mutually exclusive")
-        check_count(len(self.detectors.detectors.keys() | boxes.keys() | models.keys()), self.settings.run.max_objects)
-        return {name: saved.compressor(self.settings, name) for name, saved in models.items()}
 
     def forget(self, name: str) -> None:
         """Stop tracking an object; its trees are dropped with the next frame.

@@ -96,6 +96,7 @@ class Compressor:
 
     def take(self, frame: int, features: ObjectFeatures, version: int) -> Sample | None:
         """Insert the features of one frame; returns a sample if the trees have grown enough since the last one."""
+        # Step 1: insert the training rows into the trees of their group.
         if not self._origin and APPEARANCE in features.training:
             self._origin = blake2b(features.training[APPEARANCE].rows.tobytes(), digest_size=8).hexdigest()
         for name, tree in TREES.items():
@@ -104,10 +105,19 @@ class Compressor:
         self.frame, self.detector = frame, features.detector
         if features.box is not None:
             self.box = features.box
-        self._follow(features.box)
-        if not self._due():
+        # Step 2: append the centre. Samples contain complete blocks of them, so that motion is trained once per block.
+        self._path.append(features.box.centre if features.box else (np.nan, np.nan))
+        if len(self._path) == MOTION_FRAMES:
+            self.centres, self._path = np.array(self._path), []
+        # Step 3: a sample is due if there is a new leaf, and the trees have grown by an eighth or its interval is over.
+        if not all(self.trees[name].nodes for name, tree in TREES.items() if tree.required):
             return None
-        self._sampled_leaves = self.leaves
+        leaves = self.leaves
+        last_frame = self.last_sample.frame if self.last_sample is not None else math.inf
+        has_grown = leaves >= _GROWTH * self._sampled_leaves or frame - last_frame >= SAMPLE_INTERVAL
+        if leaves <= self._sampled_leaves or not has_grown:
+            return None
+        self._sampled_leaves = leaves
         self.last_sample = sample_of(self.trees, version, frame, self.centres, self.name, self.began)
         return self.last_sample
 
@@ -119,7 +129,7 @@ class Compressor:
     @property
     def leaves(self) -> int:
         """Number of leaves that were inserted into the trees."""
-        return sum(self._leaves().values())
+        return sum(tree.leaves for tree in self.trees.values())
 
     @property
     def origins(self) -> tuple[str, ...]:
@@ -132,7 +142,7 @@ class Compressor:
             "version": self.version,
             "rows": sum(tree.rows_seen for tree in self.trees.values()),
             "leaves": self.leaves,
-            **{f"{name}_leaves": leaves for name, leaves in self._leaves().items()},
+            **{f"{name}_leaves": tree.leaves for name, tree in self.trees.items()},
             "level": max((node.level for tree in self.trees.values() for node in tree.nodes), default=0),
             "nodes": sum(len(tree.nodes) for tree in self.trees.values()),
             "bytes": sum(tree.nbytes for tree in self.trees.values()),
@@ -174,26 +184,6 @@ class Compressor:
         self._origin, self._earlier = str(metadata["origin"]), tuple(map(str, metadata["earlier"]))
         self.trees |= unpack_trees(arrays, metadata["trees"])
         return self
-
-    def _leaves(self) -> dict[str, int]:
-        """Number of leaves of each tree."""
-        return {name: tree.leaves for name, tree in self.trees.items()}
-
-    def _follow(self, box: Box | None) -> None:
-        """Append the centre of a box. Samples contain complete blocks, so that motion is trained once per block."""
-        self._path.append(box.centre if box else (np.nan, np.nan))
-        if len(self._path) == MOTION_FRAMES:
-            self.centres = np.array(self._path)
-            self._path = []
-
-    def _due(self) -> bool:
-        """Return True if there is a new leaf, and the trees have grown by an eighth or the interval is over."""
-        if not all(self.trees[name].nodes for name, tree in TREES.items() if tree.required):
-            return False
-        leaves = self.leaves
-        last_frame = self.last_sample.frame if self.last_sample is not None else math.inf
-        is_interval_over = self.frame - last_frame >= SAMPLE_INTERVAL
-        return leaves > self._sampled_leaves and (is_interval_over or leaves >= _GROWTH * self._sampled_leaves)
 
 
 def sample_of(

@@ -131,8 +131,14 @@ class Forest:
 
     def save(self, path: str | os.PathLike[str], *, durable: bool = True) -> None:
         """Write everything to one file, as `storage.write` does."""
-        arrays, metadata = self.state()
-        storage.write(path, arrays, metadata | {"kind": _KIND}, durable=durable)
+        arrays: Arrays = {"states": np.frombuffer(_ENCODER.encode(list(self._states)), np.uint8)}
+        objects: list[Metadata] = []
+        for i, (name, compressor) in enumerate(self.compressors.items()):
+            own, metadata = compressor.state()
+            arrays |= {f"{i}.{key}": array for key, array in own.items()}
+            objects.append(metadata | {"name": name})
+        whole = {"seq": self.seq, "frame": self.frame, "time": self.time, "version": self.version}
+        storage.write(path, arrays, whole | {"objects": objects, "kind": _KIND}, durable=durable)
 
     @staticmethod
     def position_in(path: str | os.PathLike[str]) -> tuple[int, float]:
@@ -153,8 +159,14 @@ class Forest:
         """
         arrays, metadata = storage.read(path)
         _check_kind(path, metadata)
+        self = cls(settings)
         try:
-            self = cls.from_state(arrays, metadata, settings)
+            self.seq, self.frame, self.version = (int(metadata[name]) for name in ("seq", "frame", "version"))
+            self.time = float(metadata["time"])
+            for i, own in enumerate(metadata["objects"]):
+                name = str(own["name"])
+                self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)
+            self._states.extend(_DECODER.decode(arrays["states"].tobytes()))
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError, msgspec.DecodeError) as error:
             raise ProtocolError(f"{path} is not a compressor's state ({error!r}): use an older copy") from None
         trees = [tree for compressor in self.compressors.values() for tree in compressor.trees.values()]
@@ -163,30 +175,6 @@ class Forest:
                 f"{path} holds trees of size {max(sizes)}, the settings say {settings.coreset.size}: "
                 "continue with the same settings"
             )
-        return self
-
-    def state(self) -> tuple[Arrays, Metadata]:
-        """Arrays and metadata that `from_state` restores."""
-        arrays: Arrays = {}
-        objects: list[Metadata] = []
-        for i, (name, compressor) in enumerate(self.compressors.items()):
-            own, metadata = compressor.state()
-            arrays |= {f"{i}.{key}": array for key, array in own.items()}
-            objects.append(metadata | {"name": name})
-        arrays["states"] = np.frombuffer(_ENCODER.encode(list(self._states)), np.uint8)
-        whole = {"seq": self.seq, "frame": self.frame, "time": self.time, "version": self.version}
-        return arrays, whole | {"objects": objects}
-
-    @classmethod
-    def from_state(cls, arrays: Arrays, metadata: Metadata, settings: Settings) -> Forest:
-        """Restore a forest from its `state`; KeyError, TypeError or ValueError if it is something else."""
-        self = cls(settings)
-        self.seq, self.frame, self.version = (int(metadata[name]) for name in ("seq", "frame", "version"))
-        self.time = float(metadata["time"])
-        for i, own in enumerate(metadata["objects"]):
-            name = str(own["name"])
-            self.compressors[name] = Compressor.from_state(with_prefix(arrays, f"{i}."), own, settings, name)
-        self._states.extend(_DECODER.decode(arrays["states"].tobytes()))
         return self
 
 

@@ -82,15 +82,6 @@ class Node:
         return Node(self.level + 1, rows, self.count + newer.count, total, self.energy + newer.energy)
 
 
-def share(level: int, top: int, size: int) -> int:
-    """Number of rows to take from a node: n w with w = 2**(level - top), rounded down.
-
-    >>> [share(level, top=3, size=64) for level in (3, 2, 0)]
-    [64, 32, 8]
-    """
-    return size >> (top - level)
-
-
 def sample(
     nodes: Sequence[Node], size: int, last_nodes: Sequence[Node] = (), last_rows: np.ndarray = _EMPTY
 ) -> np.ndarray:
@@ -101,21 +92,19 @@ def sample(
     """
     if not nodes:
         return _EMPTY
-    counts = [share(node.level, nodes[0].level, size) for node in nodes]
+    counts = [size >> (nodes[0].level - node.level) for node in nodes]  # n w with w = 2**(level - top), rounded down
     # If the oldest node is the same, so are the counts of all nodes that are.
     same = sum(1 for _ in takewhile(lambda pair: pair[0] is pair[1], zip(nodes, last_nodes, strict=False)))
     reused = last_rows[: sum(counts[:same])]
     if same == len(nodes):
         return reused
-    new = [_sample_node(node, count) for node, count in zip(nodes[same:], counts[same:], strict=True) if count]
-    return np.concatenate([reused, *new] if same else new)
-
-
-def _sample_node(node: Node, count: int) -> np.ndarray:
-    """The first rows of a node, reflected and rescaled."""
-    rows: np.ndarray = node.directions(count) * np.float32(np.sqrt(count / node.count))
-    spread(rows)
-    return rows
+    parts = [reused] if same else []
+    for node, count in zip(nodes[same:], counts[same:], strict=True):
+        if count:
+            rows = node.directions(count) * np.float32(np.sqrt(count / node.count))
+            spread(rows)
+            parts.append(rows)
+    return np.concatenate(parts)
 
 
 def spread(rows: np.ndarray) -> None:

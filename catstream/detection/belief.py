@@ -41,7 +41,6 @@ from catstream.numerics import kalman
 from catstream.numerics.kalman import TRANSITION
 
 _COASTING = TRANSITION @ np.diag([1, 1, 0.8, 0.8])  # a lost object coasts 0.8 + 0.8**2 + ... = 4 frames far
-_REDETECTION_MARGIN = 0.4  # by which the score elsewhere must exceed the local one; with 0.1, similar objects win
 _JUMP = 6.0  # Mahalanobis distance beyond which a measured centre resets the filter
 _INITIAL_VARIANCE = 100.0  # of the velocity, in process variances of a frame
 
@@ -94,11 +93,6 @@ def update_level(state: DetectorState, score: float, redetected: bool, belief: B
     if state.first_window is None or still_lost:
         return replace(state, level="lost", trusted=trusted)
     return replace(state, level=level_of(score, trusted, belief), trusted=trusted)
-
-
-def is_redetection(score: float, local_score: float, belief: BeliefSettings) -> bool:
-    """Return True if the best window elsewhere replaces the local one: it is confident, and leads by the margin."""
-    return score > belief.confident_score and score > local_score + _REDETECTION_MARGIN
 
 
 def at_rest(centre: tuple[float, float], motion: Motion) -> np.ndarray:

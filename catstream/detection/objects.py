@@ -62,19 +62,17 @@ class Detectors:
         detector = self.detectors.get(name) or self._new_detector(name)
         with errors_about(name):
             box = Box(*map(float, box)).validated(*frame.size)
-            result = detector.init(frame, self.seq + 1, time, box, self._together(name, box))
+            # It is together with each object whose box is at a part of its own, or the other way round.
+            together = {
+                other: state.first_frame
+                for other, one in self.detectors.items()
+                if other != name and (state := one.state) is not None and state.level != "lost"
+                if max(box.share_in(state.window.box()), state.window.box().share_in(box)) > _PART
+            }
+            result = detector.init(frame, self.seq + 1, time, box, together)
         self.detectors.pop(name, None)
         self.detectors[name] = detector  # the last one, even if another object had the name
         return self._catch_up(detector, result, time, later)
-
-    def _together(self, name: str, box: Box) -> dict[str, int]:
-        """The other objects whose boxes overlap that of an object that begins: see `DetectorState`."""
-        states = {other: one.state for other, one in self.detectors.items() if other != name}
-        return {
-            other: state.first_frame
-            for other, state in states.items()
-            if state is not None and state.level != "lost" and _overlap(box, state.window.box())
-        }
 
     def _catch_up(self, detector: Detector, result: Result, time: float, later: Iterable[Pyramid]) -> Result:
         """Track an object through later frames, and return its result in the last one, with the rows of the box."""
@@ -219,11 +217,6 @@ def _without_separated(state: DetectorState, states: Mapping[str, DetectorState]
         and (not state.level == states[name].level == "confident" or box.overlap(states[name].window.box()))
     }
     return replace(state, together=together)
-
-
-def _overlap(box: Box, other: Box) -> bool:
-    """Return True if a box is at a part of the other one, or the other way round."""
-    return max(box.share_in(other), other.share_in(box)) > _PART
 
 
 def _conflict(box: Box, other: Box, uncertain: bool = False) -> bool:

@@ -27,6 +27,7 @@ _FINE_SIDE = WINDOW + 2  # cells searched at each size: the best position may be
 _FULL_FACTORS = (1.0, 0.8, 1.25)  # of the object's size, at which a whole frame is searched
 _INITIAL_FACTORS = tuple(1.25**k for k in range(-4, 5))  # the same before the first detection of a saved model's object
 _DISTANCE_PENALTY = 0.1  # weight of the squared displacement, in windows, in the local search
+_REDETECTION_MARGIN = 0.4  # by which the score elsewhere must exceed the local one; with 0.1, similar objects win
 _MAX_SIZE_STEPS = 8  # steps of size that are tried, either way, at the first detection of a saved model's object
 _MIN_SIGHTINGS = 3  # successive frames that must agree before the object of a saved model counts as detected
 _MIN_LEAD = 0.1  # difference of score to the best window elsewhere that each of them needs
@@ -69,7 +70,7 @@ def find(context: FrameContext, state: DetectorState) -> Detection:
     level = belief.level_of(nearby.score, state.trusted, settings.belief)
     interval = belief.policies(settings.search.full_interval)[level].search_interval
     other = _search_elsewhere(context, last_confident, interval) if interval else None
-    if other is not None and belief.is_redetection(other.score, nearby.score, settings.belief):
+    if other is not None and other.score > max(settings.belief.confident_score, nearby.score + _REDETECTION_MARGIN):
         other = _search_near(context, other.window, state.first_window)
         if other.score > nearby.score:
             return replace(other, redetected=True)

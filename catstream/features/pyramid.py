@@ -83,7 +83,10 @@ class Pyramid:
         while 2 << level <= scale and min(self._halves[level].shape[:2]) > 1:
             level += 1
             if level not in self._halves:
-                self._halves[level] = _half(self._halves[level - 1])
+                larger = self._halves[level - 1]
+                height, width = larger.shape[0] // 2, larger.shape[1] // 2
+                half = cv2.resize(larger[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+                self._halves[level] = half
         return self._halves[level], 1 << level
 
     def around(self, window: Window, side: int) -> np.ndarray:
@@ -167,9 +170,3 @@ def reduced(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     output = np.empty((size[1], size[0], 3), np.uint8)
     average(image, across, down, output)
     return output
-
-
-def _half(image: np.ndarray) -> np.ndarray:
-    """The mean of each 2 x 2 pixels."""
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    return cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)

@@ -32,7 +32,7 @@ from catstream.messages import storage
 from catstream.messages.heads import TREES
 from catstream.messages.kinds import LARGEST_GIVEN_MODEL, LARGEST_GIVEN_MODELS, Features, Model
 from catstream.messages.schema import check_message
-from catstream.messages.storage import Arrays, Metadata, pack, unpack
+from catstream.messages.storage import Metadata, pack, unpack
 
 _KIND = "saved model 5"  # kind of file, and the version of its contents
 
@@ -154,7 +154,18 @@ class SavedModel:
         try:
             if metadata.get("kind") != _KIND:
                 raise ValueError(f"it is of kind {metadata.get('kind')!r}, not {_KIND!r}")
-            learned = cls._of(arrays, metadata)
+            trees = unpack_trees(arrays, metadata["trees"])
+            if missing := [name for name in TREES if name not in trees]:
+                raise ValueError(f"it has no tree {missing[0]!r}: track the object again with this version")
+            learned = cls(
+                check_name(metadata["object"]),
+                {name: trees[name] for name in TREES},
+                arrays["centres"],
+                tuple(map(str, metadata["origins"])),
+                Box(*map(float, metadata["box"])),
+                unpack(Model, arrays, metadata["model"], "model"),
+                Settings.from_values(metadata["settings"]),
+            )
             learned._check()
         except (AttributeError, LookupError, OverflowError, TypeError, ValueError) as error:
             raise ProtocolError(f"{name} is not a saved model ({error}): `catstream save` writes one") from None
@@ -165,21 +176,6 @@ class SavedModel:
                 "track the object again with this version"
             )
         return learned
-
-    @classmethod
-    def _of(cls, arrays: Arrays, metadata: Metadata) -> Self:
-        trees = unpack_trees(arrays, metadata["trees"])
-        if missing := [name for name in TREES if name not in trees]:
-            raise ValueError(f"it has no tree {missing[0]!r}: track the object again with this version")
-        return cls(
-            check_name(metadata["object"]),
-            {name: trees[name] for name in TREES},
-            arrays["centres"],
-            tuple(map(str, metadata["origins"])),
-            Box(*map(float, metadata["box"])),
-            unpack(Model, arrays, metadata["model"], "model"),
-            Settings.from_values(metadata["settings"]),
-        )
 
     def _check(self) -> None:
         """Raise ValueError if the parts do not belong together."""

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -334,20 +335,12 @@ class Track(_Numbered):
         >>> Track(12, 0.4, "absent", None, 0.12, 4).to_dict()["box"] is None
         True
         """
-        fields = {
-            "frame": int(self.frame),
-            "time": float(self.time),
-            "state": self.state,
-            "box": None if self.box is None else [float(side) for side in self.box],
-            "score": float(self.score),
-            "model_version": int(self.model_version),
-            "pts": None if self.pts is None else float(self.pts),
-            "object": self.object,
-            "began": int(self.began),
-            "doubtful": bool(self.doubtful),
-            "source_frame": int(self.source_frame),
-        }
-        return fields | ({"checked": self.checked, "probability": self.probability} if self.checked else {})
+        values: dict[str, Any] = msgspec.to_builtins(self, enc_hook=lambda number: number.item())  # one of numpy
+        if self.box is not None:
+            values["box"] = list(values["box"])
+        if not self.checked:
+            del values["checked"], values["probability"]
+        return values
 
 
 @dataclass(frozen=True, slots=True)

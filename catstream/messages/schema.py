@@ -109,13 +109,9 @@ class Field:
         return self.meta is not None and self.meta.pattern is not None
 
 
+@cache
 def fields(kind: type) -> tuple[Field, ...]:
     """The fields of a message, in their order."""
-    return _fields(kind)
-
-
-@cache
-def _fields(kind: type) -> tuple[Field, ...]:
     hints = get_type_hints(kind, include_extras=True)
     return tuple(_field(field.name, hints[field.name]) for field in dataclasses.fields(kind))
 

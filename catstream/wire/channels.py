@@ -42,7 +42,6 @@ from catstream.messages.kinds import (
     Track,
     Tracks,
 )
-from catstream.messages.schema import fields
 
 #: The permissions of a client: each role includes those before it.
 Role = Literal["watch", "control", "pipeline"]
@@ -81,7 +80,7 @@ class Channel(Generic[Message]):
     @property
     def by_object(self) -> bool:
         """True if each message is about one object."""
-        return any(field.name == "object" for field in fields(self.messages[0]))
+        return "object" in self.messages[0].__annotations__
 
     @property
     def limit(self) -> int:
