@@ -345,11 +345,12 @@ def turning():
 
 @pytest.fixture
 def managing():
-    """Serves the registry of a fleet, of which a function returns the status: its endpoint."""
+    """Serves the registry of a fleet of this status, or of what a function returns: its endpoint."""
 
     @contextmanager
     def manage(status, address="", keys=""):
-        with closing(RegistryServer(address, keys, status)) as server, _turning(server.turn):
+        current = status if callable(status) else lambda: status
+        with closing(RegistryServer(address, keys, current)) as server, _turning(server.turn):
             yield server.endpoint
 
     return manage

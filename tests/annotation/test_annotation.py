@@ -5,7 +5,6 @@ import multiprocessing
 import pytest
 
 from catstream.annotation import annotation as module
-from catstream.annotation import passes
 from catstream.annotation.annotation import Annotation, annotate
 from catstream.base.box import Box
 from catstream.errors import BoxError, CatstreamError, ObjectError, VideoError
@@ -75,16 +74,6 @@ def test_two_processes_give_the_same_tracks_as_one_and_remain_for_added_boxes(de
         annotation.add(12, truth[12], "anna")
         assert {*multiprocessing.active_children()} == processes
     assert not multiprocessing.active_children()
-
-
-def test_the_model_of_a_box_is_trained_once(both_ends, monkeypatch):
-    def second_pass():
-        keyframes = both_ends.keyframes["anna"]
-        return passes.run_pass(both_ends.frames, 0, 3, keyframes, both_ends.settings, use_memory=True).boxes.tolist()
-
-    trained = second_pass()
-    monkeypatch.delattr(passes, "MultiTracker")
-    assert second_pass() == trained
 
 
 def test_absent_object_has_no_box(demo):

@@ -185,18 +185,6 @@ def test_features_are_copied_to_all_subscribers_and_missing_ones_are_counted(end
     assert subscription.losses() == "5 missed, 2 of them before this subscriber connected"
 
 
-def test_a_message_without_a_subscriber_is_not_encoded(endpoint, until):
-    no_message = object()
-    with Publisher(FEATURES, endpoint) as training:
-        training.send(no_message)
-        with catstream.subscribe(str(endpoint), "features"):
-            until(lambda: training.has_subscribers, training.serve_late_joiners)
-            with pytest.raises(TypeError):
-                training.send(no_message)
-        until(lambda: not training.has_subscribers, training.serve_late_joiners)
-        training.send(no_message)
-
-
 def test_iteration_may_continue_after_a_timeout_and_the_end_counts_missed_frames(endpoint, tracks, until):
     with catstream.subscribe(str(endpoint), "tracks", timeout=0.1) as subscription:
         with pytest.raises(SilenceError, match="is a pipeline running there"):

@@ -1,8 +1,5 @@
 """Cells: HOG, mean colours and histograms of colours; rows and scores of every window; and their kernels."""
 
-from concurrent.futures import ThreadPoolExecutor
-from multiprocessing import get_context
-
 import cv2
 import numpy as np
 import pytest
@@ -147,12 +144,6 @@ def test_colours_are_converted_as_by_opencv_but_for_one_level_in_few_colours():
     assert np.mean(off > 0) < 1e-3
 
 
-def test_no_root_is_so_near_to_a_half_that_a_processor_could_round_it_otherwise():
-    light = np.arange(len(kernels._ROOTS)) / kernels._LINEAR[-1]
-    root = np.where(light < 216 / 24389, light * (841 / 108) + 16 / 116, light ** (1 / 3)) * (1 << kernels._ROOT_BITS)
-    np.testing.assert_array_less(np.abs(root - kernels._ROOTS), 0.5 - 1e-6)
-
-
 def doubled(array):
     for place in range(len(array)):
         array[place] *= 2
@@ -191,21 +182,3 @@ def test_kernels_are_compiled_in_memory_if_no_folder_can_be_written(compiles, tm
 def test_the_numbers_that_the_kernels_repeat_are_those_of_the_layout():
     for name in ("CELL", "WINDOW", "CHANNELS", "SIDE"):
         assert getattr(kernels, name) == getattr(layout, name)
-
-
-def test_a_forked_process_and_threads_can_call_kernels():
-    white, found = np.full((8, 1000, 3), 255, np.uint8), np.empty((8, 1000, 3), np.uint8)
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(kernels.convert_to_lab, white, found))
-    assert (found == [255, 128, 128]).all()
-    fork = get_context("fork")
-    receiver, sender = fork.Pipe(duplex=False)
-
-    def child():
-        kernels.convert_to_lab(white[0] // 255, found[0])
-        sender.send(found[0, 0].tolist())
-
-    process = fork.Process(target=child)
-    process.start()
-    assert receiver.recv() == [1, 128, 128]
-    process.join()

@@ -9,7 +9,6 @@ import pytest
 
 from catstream.base.settings import Settings
 from catstream.client.attach import control, subscribe
-from catstream.errors import ProtocolError, ServiceError, SettingsError
 from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
@@ -147,20 +146,6 @@ def test_paused_live_source_skips_frames(video, camera):
     assert all(track.box.overlap(boxes[0]) > 0.8 for track in tracks)
     assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(tracks), len(tracks))
     assert pipeline.totals["skipped"] > passed["skipped"]
-
-
-def test_unusable_model_is_rejected_before_the_start(video, saved, tmp_path):
-    path, boxes = video
-    torn = tmp_path / "torn"
-    torn.write_bytes(saved.read_bytes()[:-9])
-    with pytest.raises(ProtocolError, match="not an undamaged file"):
-        Pipeline(path, model=torn)
-    with pytest.raises(ServiceError, match="no saved model"):
-        Pipeline(path, model=tmp_path / "none")
-    with pytest.raises(SettingsError, match="box and model of the object without a name are mutually exclusive"):
-        Pipeline(path, boxes[0], model=saved)
-    with pytest.raises(SettingsError, match=r"learned with coreset.size=\d+, this run has coreset.size=5"):
-        Pipeline(path, settings={"coreset.size": 5}, model=saved)
 
 
 @pytest.mark.parametrize("victims", [(), ("detector", "compressor", "trainer")], ids=str)

@@ -1,4 +1,4 @@
-"""The demo video: the same every time, and its truth is where the dahlia is."""
+"""The demo video: the same pixels every time, and a story with an occlusion and an absence."""
 
 from __future__ import annotations
 
@@ -15,13 +15,6 @@ def film():
     return list(render(FRAMES, (160, 120)))
 
 
-def warmth(image: np.ndarray, box) -> float:
-    """How much more red than blue there is in the middle of a box."""
-    x, y = (int(value) for value in box.centre)
-    middle = image[max(y - 3, 0) : y + 4, max(x - 3, 0) : x + 4].astype(float)
-    return float((middle[..., 2] - middle[..., 0]).mean())
-
-
 def test_the_same_arguments_give_the_same_pixels(film):
     for (image, box), (again, other) in zip(film[:5], render(5, (160, 120)), strict=True):
         np.testing.assert_array_equal(image, again)
@@ -35,15 +28,6 @@ def test_the_dahlia_is_occluded_once_and_leaves_once(film):
     assert 90 < absent.sum() < 150
     assert not absent[0]
     assert not absent[-1]
-
-
-def test_the_ground_truth_box_contains_the_dahlia(film):
-    inside = [
-        (image, box) for image, box in film[::10] if box and 0 <= box.x < 160 - box.w and 0 <= box.y < 120 - box.h
-    ]
-    shares = [warmth(image, box) > 40 for image, box in inside]
-    assert len(inside) > 30
-    assert np.mean(shares) > 0.95  # now and then a corner of the pagoda or the look-alike is before it
 
 
 def test_the_video_is_written_with_its_ground_truth(tmp_path):

@@ -181,11 +181,6 @@ def test_a_camera_that_does_not_exist_is_an_error():
         open_source("987")
 
 
-def test_a_device_that_cannot_decode_a_stream_is_an_error(camera):
-    with pytest.raises(VideoError, match=r"run.hwaccel=abacus cannot decode.*omit it"):
-        open_source(camera(numbered).url, hwaccel="abacus")
-
-
 def test_with_an_idle_function_the_first_frame_is_waited_for_too(camera):
     cam, turns = camera(numbered), []
     cam.leave()
