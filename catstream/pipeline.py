@@ -100,6 +100,8 @@ class Pipeline:
         The files that the program writes, including those of the resumed run; and the files of the resumed run alone.
     first_frame : int or None
         With `resume`: number of the next frame that the caller needs, `after` + 1. It may be set before the start.
+    first_time : float
+        Seconds at which the caller's last frame was; the times of a live source go on after it.
     saved_models : list of Path
         At the end: the files of `save_model` that were written.
 
@@ -155,6 +157,7 @@ class Pipeline:
         self.results, self.earlier_results = job.results, self._earlier.results if self._earlier else Results()
         self.saved_models: list[Path] = []
         self.first_frame = None if after is None else after + 1
+        self.first_time = 0.0
         self._stack: ExitStack | None = None  # cleans up at the end, once the pipeline has started
         self._endpoint = ""
         self._rows = 0
@@ -187,13 +190,14 @@ class Pipeline:
         """
         passed = 0.0
         if self.live and self._earlier is not None and self._state is not None:
-            passed = last_time(self._state) + self.settings.run.checkpoint_seconds
+            passed = max(last_time(self._state), self.first_time) + self.settings.run.checkpoint_seconds
         return replace(
             self._job,
             endpoint=endpoint,
             state=self._state,
             resume=self._earlier is not None,
             since=time.monotonic() - passed,
+            first=self._start if self.live else 0,
         )
 
     def __exit__(

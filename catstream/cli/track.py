@@ -249,7 +249,8 @@ class _Run:
         """Run to the end, and print a summary, also of a run that an error ends."""
         pipeline, files = self.pipeline, self.files
         if self.is_resumed:
-            pipeline.first_frame = files.position(skip_damaged=pipeline.settings.run.skip_damaged)
+            skip_damaged = pipeline.settings.run.skip_damaged
+            pipeline.first_frame, pipeline.first_time = files.position(skip_damaged=skip_damaged)
         progress, interrupted = RunProgress(pipeline), False
         try:
             # The files are closed after the processes, which would track on meanwhile, for none of them; the page is

@@ -90,6 +90,11 @@ class Forest:
         self._states.append((self.seq, states))
         return samples
 
+    def skip_to(self, seq: int) -> None:
+        """Continue after message `seq`. The ones before it are lost: of a live source, after a power cut."""
+        if seq > self.seq:
+            self.seq, self.frame = seq, seq - 1
+
     def states_at(self, seq: int | None) -> dict[str, DetectorState]:
         """The detector states of the objects, by name, after message `seq`, or after the nearest one that is stored.
 

@@ -198,7 +198,7 @@ class Stream:
         origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), options)
         files = RunFiles(origin, None, list(self._spec.write))
         if resume and any(path.exists() for path in map(Path, files.places) if is_log(path)):
-            pipeline.first_frame = files.position()
+            pipeline.first_frame, pipeline.first_time = files.position()
         return files
 
     def _sockets(self, stack: ExitStack) -> dict[str, object]:

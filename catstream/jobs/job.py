@@ -80,6 +80,7 @@ class Job:
     run       id of this start of the run, which its messages carry, and whose program receives every track on the
               channel `results`; empty if the processes were started by hand
     since     value of `time.monotonic` from which the times of a live source count; None for its first frame
+    first     number of its last frame before this start: of a live source, the newest checkpoint may be older
     """
 
     source: str = field(default="", repr=False)  # it may contain a password
@@ -96,6 +97,7 @@ class Job:
     resume: bool = False
     run: str = ""
     since: float | None = None
+    first: int = 0
 
     def __post_init__(self) -> None:
         if both := self.boxes.keys() & self.models.keys():

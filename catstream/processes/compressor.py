@@ -57,6 +57,7 @@ class CompressorLoop:
         self._process = process
         self._checkpoints = CheckpointStore(stack.enter_context(locked(process.state / CHECKPOINTS, _LOCK_SECONDS)))
         self._forest = self._checkpoints.load(settings)
+        self._forest.skip_to(process.job.first)
         seq = self._forest.seq
         self._position = Position(seq, seq, versions=self._forest.versions)
         self._tried, self._took = monotonic(), 0.0  # when the last checkpoint was written, and for how long

@@ -369,15 +369,17 @@ class RunFiles:
                     raise VideoError(f"{place} cannot be continued: pass other destinations to resume (--write DEST)")
                 check_result(Path(place), overwrite=overwrite or continued, source=source, made=self.output)
 
-    def position(self, *, skip_damaged: bool = False) -> int | None:
-        """Return the number of the frame after the last whole one of the log; None if there is to be no log.
+    def position(self, *, skip_damaged: bool = False) -> tuple[int | None, float]:
+        """Return the number of the frame after the last whole one of the log, and the seconds of that one.
+
+        None and 0 if there is to be no log.
 
         VideoError if the log is damaged, unless damaged lines are skipped.
         """
         if (path := self._log()) is None:
-            return None
+            return None, 0.0
         last, _ = Log(path, skip_damaged=skip_damaged).last_whole_frame()
-        return 0 if last is None else last.number + 1
+        return (0, 0.0) if last is None else (last.number + 1, last.tracks[0].time)
 
     def missing(self) -> list[str]:
         """Return the files that do not exist, as another program has removed them."""

@@ -10,6 +10,7 @@ from catstream.errors import ServiceError
 from catstream.jobs.state import files, last_seq, restore
 from catstream.pipeline import Pipeline
 from catstream.processes.decisions import DESIRED, DesiredState
+from catstream.video.live_demo import first_box
 from tests.pipeline.conftest import share_found
 
 
@@ -82,3 +83,24 @@ def test_a_run_continues_after_the_last_frame_that_the_program_has_whole(video, 
 def test_a_model_that_could_not_be_saved_is_an_error_before_the_run(video, tmp_path):
     with pytest.raises(ServiceError, match="none/anna: pass a file in an existing folder"):
         Pipeline(video[0], video[1][0], save_model=tmp_path / "none" / "anna")
+
+
+def test_a_live_run_continues_its_frames_and_times_after_a_power_cut(tmp_path):
+    """The log is ahead of the newest checkpoint on disk, by up to a minute."""
+    state, trees, settings = tmp_path / "state", tmp_path / "state" / "trees", {"run.checkpoint_seconds": 0.1}
+    with Pipeline("demo:1", first_box("demo:1"), settings, state=state) as pipeline:
+        tracks = iter(pipeline)
+        while last_seq(state) < 10:
+            next(tracks)
+        shutil.copytree(trees, tmp_path / "older")
+        *_, last = islice(tracks, 60)
+    shutil.rmtree(trees)
+    shutil.copytree(tmp_path / "older", trees)
+    assert last_seq(state) < last.frame
+    pipeline = Pipeline(resume=state, after=last.frame)
+    pipeline.first_time = last.time
+    with pipeline:
+        again = list(islice(pipeline, 5))
+    assert [track.frame for track in again] == list(range(last.frame + 1, last.frame + 6))
+    assert again[0].time > last.time
+    assert again[0].model_version > 0, "the models were kept"
