@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import cached_property
-from time import sleep
+from time import monotonic, sleep, time
 
 import cv2
 
@@ -248,6 +248,8 @@ class DetectorLoop:
         if self._source is not None:
             (own["width"], own["height"]), own["rate"] = self._source.size, self._source.rate
             own["start"], own["stride"] = self.process.job.part.start or 0, self.process.job.part.step or 1
+            if self._source.zero is not None:  # as Unix time, which other machines have as well
+                own["zero_time"] = time() - monotonic() + self._source.zero
         return own | self._source_counters()
 
     def _source_counters(self) -> dict[str, float]:

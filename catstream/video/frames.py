@@ -59,10 +59,12 @@ class Source(ABC):
     size          (width, height) of the first frame in pixels
     pixel_aspect  width of a pixel divided by its height
     live          whether the source is live: frames that are not read in time are lost
+    zero          of a live source: zero of the times of its frames, as `time.monotonic` gives it; None before the first
     images        files of the images of a folder, one for each of its frames; empty for a video
     """
 
     live = False
+    zero: float | None = None
     images: Sequence[Path] = ()
     pixel_aspect = Fraction(1)
 

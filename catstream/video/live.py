@@ -84,7 +84,7 @@ class LiveSource(Source):
         self._address, self._settings = without_password(text), settings
         self._parses = not self._text.startswith("rtsp") or bool(settings.hwaccel)  # by FFmpeg's parser
         self._paced = (-math.inf, 0.0)  # time stamp of the last frame of a segment, and when it was returned
-        self._number, self._zero, self._idle = start, since, idle
+        self._number, self.zero, self._idle = start, since, idle
         self._upright = UprightConverter()
         self._condition = threading.Condition()  # guards the fields below
         self._newest: tuple[float, VideoFrame] | None = None
@@ -152,8 +152,8 @@ class LiveSource(Source):
         self.size = self.size if any(self.size) else size
         if size != self.size:
             image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
-        self._zero = moment if self._zero is None else self._zero
-        frame = Frame(self._number, max(0.0, moment - self._zero), image, decoded.time)
+        self.zero = moment if self.zero is None else self.zero
+        frame = Frame(self._number, max(0.0, moment - self.zero), image, decoded.time)
         self._number += 1
         return frame
 

@@ -61,7 +61,7 @@ class LiveDemo(Source):
         super().__init__(f"demo-{self._seed}", rate, _SIZE)
         self._images: dict[int, np.ndarray] = {}  # rendered ones, by number
         self._start = self._number = start
-        self._zero, self._idle = since, idle
+        self.zero, self._idle = since, idle
         self._opened: float | None = None  # time at which the first frame was read
         self._last = start - 1  # number of the last image
         self._closed = threading.Event()
@@ -83,11 +83,11 @@ class LiveDemo(Source):
         if self._closed.is_set():
             raise StopIteration
         now = monotonic()
-        self._zero = now if self._zero is None else self._zero
+        self.zero = now if self.zero is None else self.zero
         self._last = max(self._last + 1, self._start + int((now - self._opened) * self.rate))
         self._number += 1
         image = self._image(self._last).copy()
-        return Frame(self._number - 1, max(0.0, now - self._zero), image, self._last / self.rate)
+        return Frame(self._number - 1, max(0.0, now - self.zero), image, self._last / self.rate)
 
     def close(self) -> None:
         self._closed.set()

@@ -90,7 +90,7 @@ class Site:
         await asyncio.to_thread(self.feed.stop)
 
     async def _metrics(self, _: Request) -> Response:
-        return prometheus.response(prometheus.of_pipeline(self.feed))
+        return prometheus.response(prometheus.of_pipeline(self.feed), self.feed.latency.histogram)
 
     async def _readyz(self, _: Request) -> Response:
         problem = self.feed.problem

@@ -21,6 +21,7 @@ from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
 from catstream.messages.kinds import Answer, End
 from catstream.web.dashboard import Dashboard
+from catstream.web.prometheus import Latency
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 
@@ -48,6 +49,7 @@ class PipelineFeed:
         self.viewers = 0  #: open pages
         self.pictured = -inf  #: time of the last request for a picture
         self.dashboard = Dashboard()
+        self.latency = Latency()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
@@ -142,6 +144,7 @@ class PipelineFeed:
                 if (message := _next(subscriptions[channel])) is None:
                     continue
                 now = monotonic()
+                self.latency.take(message, subscriptions[channel].run)
                 if over == inf or not isinstance(message, End):  # the next pipeline may have begun at this endpoint
                     self._call(self.dashboard.take, message, now, subscriptions[channel].run)
                 if channel == "health":

@@ -2,10 +2,14 @@
 
 import re
 from dataclasses import replace
+from time import time
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
+from catstream.base.settings import Settings
 from catstream.client.address import Address
+from catstream.compression.forest import Forest
 from catstream.messages.kinds import Health
 from catstream.web import prometheus
 from catstream.web.feed import PipelineFeed
@@ -34,12 +38,47 @@ def test_each_counter_of_a_process_is_a_metric_with_the_object_as_its_label(feed
     feed.dashboard.take(Health("trainer", 1.0, {"rejected": 2.0}, objects={"": {"trained": 5.0}}), 0.0)
     found = samples(prometheus.of_pipeline(feed))
     of, anna, ben = (f'{name}source="rtsp://door/1"' for name in ("", 'object="anna",', 'object="ben",'))
-    assert found["catstream_detector_sent"] == [(of, 6.0)]
-    assert found["catstream_compressor_stored"] == [(of, 4.0)]
+    assert found["catstream_detector_sent_total"] == [(of, 6.0)]
+    assert found["catstream_compressor_stored_total"] == [(of, 4.0)]
     assert found["catstream_detector_score"] == [(anna, 0.75), (ben, 0.75)]
-    assert found["catstream_compressor_rows"] == [(anna, 3.0), (ben, 4.0)], "no sum among them"
-    assert found["catstream_trainer_trained"] == [(f'object="",{of}', 5.0)]
+    assert found["catstream_compressor_rows_total"] == [(anna, 3.0), (ben, 4.0)], "no sum among them"
+    assert found["catstream_trainer_trained_total"] == [(f'object="",{of}', 5.0)]
     assert found["catstream_trainer_age_seconds"][0][1] > 0
+
+
+def test_each_metric_has_a_type_and_help_of_its_own(feed, facts, fleet):
+    report = facts.tracking(6.0, "anna")
+    report.counters.update(dict.fromkeys(("processed", "stored", "skipped", "reconnects", "rejected", "rate"), 1.0))
+    feed.dashboard.take(report, 0.0)
+    feed.dashboard.take(Health("compressor", 1.0, Forest(Settings()).counters()), 0.0)
+    fleet.stream("cam-7", node="north")
+    fleet.node("north")
+    of_pipeline = prometheus.response(prometheus.of_pipeline(feed), feed.latency.histogram)
+    texts = of_pipeline.body.decode(), prometheus.response(prometheus.of_fleet(fleet.status())).body.decode()
+    families = {family.name: family for text in texts for family in text_string_to_metric_families(text)}
+    names = "sent", "processed", "stored", "skipped", "reconnects", "rejected"
+    counts = {
+        *(f"catstream_detector_{name}" for name in names),
+        "catstream_compressor_frames",
+        "catstream_stream_skipped",
+    }
+    assert {name for name, family in families.items() if family.type == "counter"} == counts
+    assert [name for name, family in families.items() if family.type == "histogram"] == [
+        "catstream_track_latency_seconds"
+    ]
+    assert [name for name, family in families.items() if family.documentation.startswith("A counter of")] == []
+
+
+def test_latency_counts_from_the_arrival_of_a_frame_as_the_health_report_of_its_run_states_it(facts):
+    latency = prometheus.Latency()
+    latency.take(facts.track(5), "run")  # when its frame arrived is not known yet
+    latency.take(Health("detector", 1.0, {"zero_time": time() - 2.0}), "run")
+    latency.take(facts.track(19), "run")
+    latency.take(facts.track(20), "another run")
+    (family,) = latency.histogram.collect()
+    found = {sample.name.rpartition("_")[2]: sample.value for sample in family.samples}
+    assert found["count"] == 1
+    assert 0.1 <= found["sum"] < 5
 
 
 def test_a_pipeline_that_does_not_run_has_no_old_values(feed, facts):

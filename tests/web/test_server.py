@@ -114,8 +114,8 @@ def test_server_is_healthy_alone_and_ready_while_all_processes_report(page, pipe
     until(lambda: answer("detector", "compressor", "trainer").status_code == 200)
     shown = page.get("/metrics").text
     assert '\ncatstream_up{source=""} 1.0\n' in shown
-    assert '\ncatstream_detector_sent{source=""} 3.0\n' in shown
-    assert '\ncatstream_trainer_rejected{source=""} 1.0\n' in shown
+    assert '\ncatstream_detector_sent_total{source=""} 3.0\n' in shown
+    assert '\ncatstream_trainer_rejected_total{source=""} 1.0\n' in shown
     until(lambda: answer("detector", "compressor").status_code == 503)
     assert answer("detector", "compressor").text == "no health report from: trainer\n"
 

@@ -99,7 +99,7 @@ def test_the_token_of_a_page_is_from_an_option_or_a_variable_or_that_of_the_user
 
 BOARD = Path(__file__).parents[2] / "docs" / "grafana.json"
 #: A counter of a live source, and those of a run that tracks.
-OTHERS = {"catstream_detector_skipped", "catstream_detector_present", "catstream_detector_score"}
+OTHERS = {"catstream_detector_skipped_total", "catstream_detector_present", "catstream_detector_score"}
 
 
 def test_the_initial_box_can_come_from_the_page_which_shows_the_end_of_the_run(
