@@ -12,16 +12,15 @@ opens, and one of these files:
 
 Each file has one line for each frame; NaN, or a box without area, means that
 the object is absent. So do the flags of a data set beside the file, since boxes
-of frames without the object repeat the last one: see `_ABSENCE`. Numbers may
-have a decimal comma, if commas do not also separate them. Boxes are used as
-published; OTB's pixel coordinates, which start at 1, are not shifted.
+of frames without the object repeat the last one: see `_ABSENCE`. Boxes are used
+as published; OTB's pixel coordinates, which start at 1, are not shifted.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Generator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -126,15 +125,11 @@ def find_sequences(*paths: str | Path, failed: Callable[[VideoError], None] | No
 
 
 def _folders(path: Path) -> list[Path]:
-    """Return the folder of a sequence itself, or the folders and dead links in a folder."""
+    """Return the folder of a sequence itself, or the folders in a folder."""
     if _truths(path) or not path.is_dir():
         return [path]
     inner = (inner for inner in path.iterdir() if not inner.name.startswith("."))
-    return sorted((folder for folder in inner if folder.is_dir() or _is_dead_link(folder)), key=natural_order)
-
-
-def _is_dead_link(path: Path) -> bool:
-    return path.is_symlink() and not path.exists()
+    return sorted((folder for folder in inner if folder.is_dir()), key=natural_order)
 
 
 class _Layout(NamedTuple):
@@ -181,19 +176,21 @@ class _Truth(NamedTuple):
 
 
 def _truths(folder: Path) -> list[_Truth]:
-    """Return the ground truth of each sequence in a folder; a dead link counts as a file, which cannot be read."""
-    if _is_dead_link(folder):
-        return [_Truth(folder.name, folder, folder, _OTB)]
+    """Return the ground truth of each sequence in a folder."""
     target = folder.resolve()
     name = target.name if folder.name in ("", "..") else folder.name  # a symbolic link has its own
-    rects = [file for file in sorted(folder.glob("*.txt"), key=natural_order) if _RECT.fullmatch(file.name)]
+    rects = [
+        file
+        for file in sorted(folder.glob("*.txt"), key=natural_order)
+        if _RECT.fullmatch(file.name) and file.is_file()
+    ]
     # One of the two files of an OTB sequence with two objects is empty.
-    rects = [file for file in rects if _is_dead_link(file) or file.stat().st_size] or rects
+    rects = [file for file in rects if file.stat().st_size] or rects
     if rects:
         ends = [file.stem.removeprefix("groundtruth_rect") if len(rects) > 1 else "" for file in rects]
         return [_Truth(name + end, folder, file, _OTB) for file, end in zip(rects, ends, strict=True)]
     for file, layout in {"gt.txt": _TLD, "groundtruth.txt": _VOT, f"{target.name}.txt": _PRINCETON}.items():
-        if (folder / file).is_file() or _is_dead_link(folder / file):
+        if (folder / file).is_file():
             return [_Truth(name, folder, folder / file, layout)]
     return []
 
@@ -212,29 +209,7 @@ def _sequence(truth: _Truth) -> Sequence:
             f"{str(file)!r} has {'one box' if present else 'no box'}: expected a line with {layout.line} for each "
             "frame, and the object in at least two frames"
         )
-    if layout is not _TLD and _look_like_corners(sequence):
-        raise VideoError(
-            f"{str(file)!r} looks like corners x1,y1,x2,y2, expected {layout.line}: for corners, name the file gt.txt"
-        )
     return sequence
-
-
-def _look_like_corners(sequence: Sequence) -> bool:
-    """Return True if x,y,w,h are rather x1,y1,x2,y2.
-
-    Then w > x and h > y in each frame, and w and h change with x and y, or reach out of the frame.
-    """
-    x, y, w, h = sequence.boxes[sequence.present].T
-    if (w <= x).any() or (h <= y).any():
-        return False
-    if 2 * (np.var(w - x) + np.var(h - y)) < np.var(w) + np.var(h):
-        return True
-    try:
-        width, height = sequence.size()
-    except VideoError:  # the run reports it
-        return False
-    fits = ((w <= width + 1) & (h <= height + 1)).mean() > 0.5
-    return bool(fits and ((x + w > width + 2) | (y + h > height + 2)).mean() > 1 / 3)
 
 
 def _absent(folder: Path, frames: int) -> Bool:
@@ -271,33 +246,16 @@ def _numbers(file: Path, layout: _Layout) -> Float64:
     for number, line in enumerate(_text(file).splitlines(), start=1):
         if not line.strip():  # skipping the line would shift all later boxes by one frame
             raise VideoError(f"{str(file)!r}, line {number} is blank: if the object is absent, write nan,nan,nan,nan")
-        columns = [len(rows[0])] if rows else layout.columns
-        readings = [row for row in _readings(line) if len(row) in columns]
-        if len(readings) != 1:
+        try:
+            row = [float(field) for field in re.split(r"\s*[,;]\s*|\s+", line.strip(" \t,;"))]
+        except ValueError:
+            row = []
+        if len(row) not in ([len(rows[0])] if rows else layout.columns):
             expected = f"{len(rows[0])} numbers as in line 1" if rows else layout.line
             raise VideoError(
                 f"{str(file)!r}, line {number}: expected {expected}, with decimal points, got {line.strip()[:60]!r}"
             )
-        rows += readings
+        rows.append(row)
     if not rows:
         raise VideoError(f"{str(file)!r} is empty: expected one line for each frame")
     return np.array(rows)
-
-
-def _readings(line: str) -> list[list[float]]:
-    """Return the numbers of a line, with its commas as separators, and as decimal commas if there are other separators.
-
-    >>> _readings("215,90 61,18 50,02 50")
-    [[215.9, 61.18, 50.02, 50.0]]
-    >>> _readings("215,90 61,18 50,20 50,30")
-    [[215.0, 90.0, 61.0, 18.0, 50.0, 20.0, 50.0, 30.0], [215.9, 61.18, 50.2, 50.3]]
-    """
-    readings: list[list[float]] = []
-    line = line.strip(" \t,;")
-    separated, words = re.split(r"\s*[,;]\s*|\s+", line), re.split(r",?[;\s]+", line)
-    if not any(re.match(r"[-+]?0\d", field) for field in separated):  # 02 has been the decimals of a number
-        with suppress(ValueError):
-            readings.append([float(field) for field in separated])
-    if "," in "".join(words) and all(re.fullmatch(r"[-+]?\d+(,\d+)?|nan", word, re.IGNORECASE) for word in words):
-        readings.append([float(word.replace(",", ".")) for word in words])
-    return readings
