@@ -176,7 +176,9 @@ class Supervisor:
         self._error: Exception | None = None
         self._clock = RunningClock()  # of the time without progress of a process
         self._checked = self._clock()
-        self._ending, self._hurries, self._ended = threading.Event(), threading.Event(), threading.Event()
+        self._ending = threading.Event()  # set by `stop`
+        self._hurries = threading.Event()  # set if `stop` is interrupted: no process is waited for
+        self._ended = threading.Event()  # set once all processes have ended
         file = replace(job, state=job.state or folder, run=token_hex(8)).save(folder)
         endpoint = Endpoint.parse(job.endpoint, job.settings.run.keys)
         with starting(), ExitStack() as stack:
@@ -256,14 +258,15 @@ class Supervisor:
                     self._receive_health()
                 except Exception as error:
                     self._error = error
-                self._is_over()
+                self._end_frames()
                 self._ending.wait()
                 self._shut_down()
         finally:
-            self._is_over()
+            self._end_frames()
             self._ended.set()
 
-    def _is_over(self) -> None:
+    def _end_frames(self) -> None:
+        """Let `next_frame` wait no longer."""
         with self._changed:
             self._over = True
             self._changed.notify_all()

@@ -13,7 +13,6 @@ from catstream.jobs.saved_model import SavedModel
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.video.source import open_source
-from tests.pipeline.conftest import share_found
 
 #: A small window keeps the detector near the frame that a test has reached.
 SETTINGS = Settings(run={"unstored_frames": 16})
@@ -92,21 +91,6 @@ def test_set_box_replaces_the_object_from_its_frame_on_if_processes_die(long_vid
     assert all(track.model_version == 0 or track.model_version > newest for track in after)
 
 
-def test_run_continues_with_its_original_boxes_if_the_desired_state_is_torn(video, tmp_path):
-    path, boxes = video
-    settings = SETTINGS.replace({"run.lockstep": True})  # the video does not end before the second model
-    with Pipeline(path, boxes[0], settings, state=tmp_path / "kept") as pipeline:
-        before = next(track for track in pipeline if track.model_version >= 2)
-    (tmp_path / "kept" / "desired_state.json").write_text("{")
-    with Pipeline(resume=tmp_path / "kept", settings=settings) as pipeline:
-        tracks = list(pipeline)
-    assert "cannot read the desired state" in pipeline.trouble["detector"]
-    assert pipeline.restarts == 0
-    assert 0 < tracks[0].frame <= before.frame + SETTINGS.run.unstored_frames
-    assert tracks[0].model_version > 0, "what was learned is whole"
-    assert tracks[-1].frame == len(boxes) - 1
-
-
 def test_box_drawn_in_a_past_picture_is_tracked_up_to_now(walker):
     url, find = walker
     with (
@@ -180,19 +164,3 @@ def test_search_gives_the_tracks_of_one_process_if_processes_die(video, saved, v
             expected += tracker.tracks.values()
     assert tracks == expected
     assert tracks[-1].box.overlap(video[1][-1]) > 0.5
-
-
-def test_search_continues_after_a_resume_without_the_file(video, saved, tmp_path):
-    path, boxes = video
-    copy = tmp_path / "anna.safetensors"
-    copy.write_bytes(saved.read_bytes())
-    with steered(path, state=tmp_path / "kept") as (pipeline, steering, _):
-        told(pipeline, lambda counters: counters["waiting"])
-        steering.pause()
-        assert steering.search(copy, "anna").reason.startswith("anna is searched for from frame 0 on")
-    copy.unlink()
-    with steered(None, resume=tmp_path / "kept") as (pipeline, steering, _):
-        steering.resume()
-        tracks = list(pipeline)
-    assert [track.frame for track in tracks] == list(range(len(boxes)))
-    assert share_found(tracks, boxes) > 0.8

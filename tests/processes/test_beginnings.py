@@ -12,7 +12,7 @@ from catstream.jobs.job import Job
 from catstream.messages.kinds import Command
 from catstream.processes.beginnings import Beginnings
 from catstream.processes.commands import Commands
-from catstream.processes.decisions import DesiredObject, DesiredState, Start
+from catstream.processes.decisions import DESIRED, DesiredObject, DesiredState, Start
 from catstream.processes.outputs import Previews
 from catstream.processes.process import Process
 from catstream.video.frames import Frame
@@ -88,6 +88,15 @@ def test_a_pause_with_a_limit_ends_by_itself(stream, monkeypatch):
     assert stream.commands.hold
     now[0] += 31
     assert not stream.commands.hold
+
+
+def test_run_resumes_with_its_original_boxes_if_its_state_is_torn(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # the handlers of this process stay
+    (tmp_path / DESIRED).write_text("{")
+    job = Job("walk.mp4", {"anna": BOX}, endpoint=str(folder), run="one", state=tmp_path, resume=True)
+    with closing(Process("detector", job)) as process, Commands(process, Detectors(process.settings)) as commands:
+        assert commands.desired == DesiredState({"anna": DesiredObject(BOX, begins=1)})
+        assert "cannot read the desired state" in process.trouble
 
 
 def test_resumed_object_without_a_state_begins_again_where_it_was(stream):
