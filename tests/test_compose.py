@@ -32,7 +32,7 @@ def test_services_have_no_privileges_and_publish_only_the_page_on_loopback():
 def test_example_of_variables_has_each_variable():
     assert "${" not in re.sub(VARIABLE, "", TEXT)
     example = re.findall(r"^#?([A-Z_]+)=", (ROOT / ".env.example").read_text(), re.MULTILINE)
-    assert sorted(example) == sorted({name for name, _ in re.findall(VARIABLE, TEXT)})
+    assert set(example) == {name for name, _ in re.findall(VARIABLE, TEXT)}
 
 
 def test_services_track_an_object_whose_box_is_set_later(folder, tmp_path):
