@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from catstream.base.settings import Settings
-from catstream.errors import BoxError, ServiceError, VideoError
+from catstream.errors import ServiceError, VideoError
 from catstream.multi import MultiTracker
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
@@ -136,14 +136,6 @@ def test_a_second_pipeline_at_the_same_endpoint_is_rejected(video, transport, fo
         assert set(first.pids) == set(NAMES), "the first one goes on"
     with Pipeline(path, boxes[0], settings) as next_one:
         assert next(iter(next_one)).frame == 0, "the place is free at once"
-
-
-def test_a_box_outside_the_first_frame_or_a_missing_source_is_rejected_at_once(video, folder):
-    for box in ((0, 0, 0, 10), (400, 10, 20, 20), (10, 10, float("nan"), 20)):
-        with pytest.raises(BoxError):
-            Pipeline(video[0], box)
-    with pytest.raises(VideoError, match="no video or folder"):
-        Pipeline(str(folder / "none.mp4"), (0, 0, 10, 10))
 
 
 def test_frames_in_memory_are_rejected_with_the_way_to_go():
