@@ -23,8 +23,8 @@ def report(log: Path, page: Path | None, skip_damaged: bool, overwrite: bool) ->
     catstream batch, whose .ndjson files are reported together. PAGE is by default
     LOG with the extension .html, or report.html in the folder.
 
-    The page shows a timeline of each object, its mean speed, and the frames
-    to look at. The video is read for the pictures; without it, the page has none.
+    The page shows a timeline of each object, its speed, and the frames to look
+    at. The video is read for the pictures; without it, the page has none.
 
     \b
     EXAMPLES

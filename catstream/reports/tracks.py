@@ -1,4 +1,4 @@
-"""The report of a run, or of the runs of a batch: timelines of the objects, and frames to look at."""
+"""The report of a run, or of the runs of a batch: where each object was, how fast, and which frames to look at."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from catstream.video.source import open_source
 
 _PICTURES = 8  #: most frames to look at in a video
 _SIDE = 480  #: of a picture, pixels
+_BINS = 200  #: of the plot of the speed
 
 
 class _Bar(NamedTuple):
@@ -103,6 +104,15 @@ class _Object:
             bars.append(_Bar(state, scale * first, scale * (last - first), text))
         return bars
 
+    def speeds(self, edges: Float64) -> Float64:
+        """Mean speed in px/s between neighbours of `edges`, seconds; NaN while it is absent."""
+        tracked = ~np.isnan(self.steps)
+        middles, seconds = ((self.times[1:] + self.times[:-1]) / 2)[tracked], np.diff(self.times)[tracked]
+        distances, _ = np.histogram(middles, edges, weights=self.steps[tracked])
+        durations, _ = np.histogram(middles, edges, weights=seconds)
+        speeds: Float64 = np.where(durations > 0, distances / np.where(durations > 0, durations, 1), np.nan)
+        return speeds
+
 
 class Section:
     """The part of the report about a video; its attributes are the values of the template.
@@ -125,6 +135,7 @@ class Section:
         self.duration = max(item.times[-1] for item in self._objects.values()) + 1 / (self._head.rate or RATE)
         self.rows = [item.row(name) for name, item in self._objects.items()]
         self.lanes = {name: item.lane(self.duration) for name, item in self._objects.items()}
+        self.speeds, self.top_speed = self._speeds()
         self.pictures, self.problem = list[_Picture](), ""
 
     def add_pictures(self) -> None:
@@ -156,6 +167,21 @@ class Section:
         ]
         longest = sorted(runs, reverse=True)[:_PICTURES]
         return {frame: f"{name or 'the object'}, {counted(count, 'doubtful frame')}" for count, frame, name in longest}
+
+    def _speeds(self) -> tuple[dict[str, list[str]], float]:
+        """The polylines of the speed of each object in a plot of 1000 x 460, and the speed at its upper end."""
+        edges = np.linspace(0, self.duration, min(_BINS, max(2, int(self.duration * 4))) + 1)
+        speeds = {name: item.speeds(edges) for name, item in self._objects.items()}
+        fastest = max(1.0, *(float(np.nanmax(item, initial=0)) for item in speeds.values()))
+        step = 10 ** np.floor(np.log10(fastest)) / 2
+        top = step * np.ceil(fastest / step)  # a round number
+        xs = 1000 * (edges[1:] + edges[:-1]) / 2 / self.duration
+        lines = {}
+        for name, values in speeds.items():
+            points = np.column_stack([xs, 460 - 440 * values / top])
+            parts = np.split(points, np.flatnonzero(np.diff(np.isnan(values))) + 1)
+            lines[name] = [" ".join(f"{x:.1f},{y:.1f}" for x, y in part) for part in parts if not np.isnan(part[0, 1])]
+        return lines, float(top)
 
 
 def write_report(path: Path, sections: Iterable[Section]) -> Path:

@@ -84,6 +84,7 @@ def test_the_logs_of_a_folder_have_a_section_each_and_names_are_escaped(succeed,
     succeed("report", tmp_path)
     page = (tmp_path / "report.html").read_text()
     assert re.findall(r"<h2>(.*?) <small>", page) == ["a&amp;b", "c"]
+    assert len(re.findall("<polyline", page)) == 3 * 2
 
 
 @pytest.mark.parametrize("name", ["none.ndjson", "walk.txt", "empty"])
