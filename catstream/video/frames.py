@@ -101,14 +101,16 @@ class Source(ABC):
 def describe_counters(counters: Mapping[str, float]) -> list[str]:
     """The counters of a file or of images in words, a line each.
 
-    >>> describe_counters({"scaled": 2})
-    ['scaled: 2 frames had another size than the first one']
+    >>> describe_counters({"truncated": 2})
+    ['truncated: the video ends 2 s before the end that its header states']
     """
     lines = []
     if damaged := counters.get("damaged"):
         lines.append(f"damaged: {counted(damaged, 'frame')} could not be decoded, and skipped")
     if scaled := counters.get("scaled"):
         lines.append(f"scaled: {counted(scaled, 'frame')} had another size than the first one")
+    if missing := counters.get("truncated"):
+        lines.append(f"truncated: the video ends {missing:.0f} s before the end that its header states")
     return lines
 
 

@@ -63,6 +63,9 @@ _FOLDERS = ("img", "imgs", "color", "rgb")
 #: Number of errors of the container without a packet between them after which a file is treated as ended.
 _MAX_FAILURES = 3
 
+#: A Matroska file whose pictures end this much (in seconds) before the end that its header states may be truncated.
+_TRUNCATED_SECONDS = 1.0
+
 #: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
 _MAX_COUNTED_BYTES = 1 << 30
 
@@ -94,8 +97,8 @@ class _FileSource(Source):
     @property
     def counters(self) -> dict[str, float]:
         """`damaged`: number of skipped packets, one for each frame; `scaled`: number of frames that were
-        scaled to the size of the first one."""
-        names = ("damaged", "scaled")
+        scaled to the size of the first one; `truncated`: seconds at the end that are missing."""
+        names = ("damaged", "scaled", "truncated")
         return {name: count for name in names if (count := getattr(self._reader, name))}
 
     def __next__(self) -> Frame:
@@ -220,7 +223,7 @@ def source_text(source: object) -> str:
 class _Images:
     """Images that are read as frames. `scaled` is the number of images that had another size than the first one."""
 
-    damaged, pixel_aspect = 0, Fraction(1)
+    damaged, truncated, pixel_aspect = 0, 0, Fraction(1)
 
     def __init__(self, pages: list[tuple[Path, int]], settings: RunSettings) -> None:
         self.settings, self.rate, self.scaled = settings, settings.image_rate, 0
@@ -274,14 +277,14 @@ def prepare() -> None:
 
 class _Video:
     """A video file that is read once. `damaged` is the number of skipped packets, `scaled` the number of frames that
-    had another size than the first one."""
+    had another size than the first one, `truncated` the seconds that its header states after the last frame."""
 
     images: Sequence[Path] = ()
 
     def __init__(self, path: Path, settings: RunSettings) -> None:
         import av  # imported here because it takes 0.1 s and folders do not need it
 
-        self.path, self.settings, self.damaged, self.scaled = path, settings, 0, 0
+        self.path, self.settings, self.damaged, self.scaled, self.truncated = path, settings, 0, 0, 0
         try:
             self.container = open_video(str(path.absolute()), settings.hwaccel)
         except (av.FFmpegError, OSError) as error:
@@ -315,8 +318,10 @@ class _Video:
         """Yield the frames with these numbers, from the one at index `start` on."""
         shape, upright, rest = None, UprightConverter(), wanted[start:]
         clock = FrameClock(self.rate, self.stream.time_base if self._has_times else None)
+        end = 0.0
         with self.container:
             for number, frame in enumerate(self._decoded()):
+                end = max(end, frame.time or 0.0)
                 time = clock.time(number, None if self._is_avi else frame.pts, frame.dts)
                 if number in rest or (number in wanted and shape is None):
                     image = upright(frame)
@@ -330,6 +335,21 @@ class _Video:
                         yield Frame(wanted.index(number), time, scaled)
                 if number + 1 >= wanted.stop:  # damage after the part must not be an error
                     return
+            if (missing := self._stated_end() - end) > _TRUNCATED_SECONDS:
+                self.truncated = round(missing)
+
+    def _stated_end(self) -> float:
+        """The time of the end that the header of a Matroska file states in seconds, else 0.
+
+        FFmpeg ends without an error where such a file is truncated. It does not for others, or estimates their
+        durations from the available data.
+        """
+        if "matroska" not in self.container.format.name:
+            return 0.0
+        if tag := re.fullmatch(r"(\d+):(\d+):([\d.]+)", self.stream.metadata.get("DURATION", "")):  # without the sound
+            hours, minutes, seconds = map(float, tag.groups())
+            return 3600 * hours + 60 * minutes + seconds
+        return (self.container.duration or 0) / 1e6
 
     def _decoded(self) -> Iterator[VideoFrame]:
         """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next keyframe."""

@@ -249,6 +249,15 @@ def test_a_whole_file_is_read_to_its_last_frame_and_its_times_grow(video, name, 
         assert [frame.time for frame in frames] == pytest.approx(wanted, abs=0.002)
 
 
+def test_the_seconds_that_a_truncated_matroska_file_lacks_are_counted(video):
+    path = video("a.mkv", 100, sound=4.0)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    for part, lacks in ((slice(None), True), (slice(0, 5), False)):
+        with open_source(path, part=part) as source:
+            last = [frame.time for frame in source][-1]
+            assert source.counters.get("truncated", 0) == (round(4 - last) if lacks else 0)
+
+
 @pytest.mark.parametrize("name", ["joined.ts", "list.m3u8"])
 def test_joined_segments_are_read_to_the_end_and_time_goes_on(video, tmp_path, name):
     part = video("part.ts", 30, options={"v:bf": "2"})
