@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from itertools import islice
+from pathlib import Path
 
 import psutil
 import pytest
@@ -18,6 +19,7 @@ from catstream.jobs.job import Job
 from catstream.jobs.state import CHECKPOINTS
 from catstream.messages.kinds import End, Track
 from catstream.pipeline import Pipeline
+from catstream.processes import by_hand as scripts
 from catstream.processes.shared import RUNNING_SECONDS
 from catstream.processes.start_server import NAMES
 from catstream.processes.supervisor import Child, Supervisor
@@ -128,3 +130,13 @@ def test_hanging_processes_are_replaced_while_the_program_waits(video, until):
         assert not any(map(psutil.pid_exists, stopped.values()))
         assert (pipeline.totals["sent"], pipeline.totals["stored"]) == (len(boxes), len(boxes))
     assert [track.frame for track in tracks] == list(range(len(boxes)))
+
+
+def test_detector_started_by_hand_takes_boxes_and_models_and_ignores_empty_ones(monkeypatch):
+    jobs = []
+    monkeypatch.setattr(scripts, "run", lambda _, job: jobs.append(job))
+    words = ["walk.mp4", "--box=", "--box=anna=1,2,30,30", "--model=", "--model=ben=ben.safetensors"]
+    monkeypatch.setattr(sys, "argv", ["detector.py", *words])
+    with pytest.raises(SystemExit):
+        scripts.main("detector")
+    assert (jobs[0].boxes, jobs[0].models) == ({"anna": Box(1, 2, 30, 30)}, {"ben": Path("ben.safetensors")})
