@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from urllib.parse import quote, urlencode
+from urllib.parse import quote
 
 import uvicorn
 from starlette.datastructures import MutableHeaders
@@ -216,8 +216,7 @@ def _reject_foreign(request: Request) -> Response | None:
 
 def _enter(request: Request, cookie: str, digest: str) -> Response:
     """Set the cookie, and redirect to the same page without the token in its URL."""
-    query = urlencode([pair for pair in request.query_params.multi_items() if pair[0] != "token"])
-    answer = RedirectResponse("./" + (f"?{query}" if query else ""), 303)
+    answer = RedirectResponse("./", 303)
     secure = request.headers.get("x-forwarded-proto") == "https"
     answer.set_cookie(cookie, digest, httponly=True, samesite="lax", secure=secure)
     return answer

@@ -62,10 +62,10 @@ class Wall:
         self._used: dict[str, float] = {}  # moment of the last request to each of them
         self._closing = asyncio.Event()
         routes = [
-            Route("/", self._index),
+            Route("/", lambda _: FileResponse(PAGE / "fleet.html")),
             Route("/status", self._all),
             Route("/metrics", self._metrics),
-            Route("/healthz", self._healthz),
+            Route("/healthz", lambda _: PlainTextResponse("ok\n")),
             Route("/readyz", self._readyz),
             Route("/streams/{stream}/readyz", self._readyz),
             Mount("/streams/{stream}", self._stream),
@@ -138,9 +138,6 @@ class Wall:
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
         await self.site(scope["path_params"]["stream"]).app(scope, receive, send)
 
-    async def _index(self, _: Request) -> Response:
-        return FileResponse(PAGE / "fleet.html")
-
     async def _all(self, _: Request) -> Response:
         age = monotonic() - self._answered if self._problem else 0.0
         return JSONResponse(
@@ -155,9 +152,6 @@ class Wall:
 
     async def _metrics(self, _: Request) -> Response:
         return prometheus.response(prometheus.of_fleet(None if self._problem else self._status))
-
-    async def _healthz(self, _: Request) -> Response:
-        return PlainTextResponse("ok\n")
 
     async def _readyz(self, request: Request) -> Response:
         """Answer for the fleet, without a token and therefore without an address; or for a stream."""

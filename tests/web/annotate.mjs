@@ -39,6 +39,7 @@ await withBrowser(executablePath, profile, async (browser) => {
   await page.waitForSelector('#picture[src="frames/23.jpg"]', patience);
   await keys("d", "ArrowLeft", "Shift+ArrowUp", "Enter");
   await says("#check", "anna in frame 23: your box");
+  await page.waitForSelector("#stage .shade", { state: "detached", ...patience }); // the answer may come after the news
   await keys("u");
   await undone();
   await draw(last);

@@ -50,12 +50,12 @@ const STATES = {
   "another one chosen": {},
   "drawing one more": {},
   forgetting: {},
+  forgotten: {},
   "two objects": { tracks: tracks(anna, carl) },
   drawing: { ...all },
   "drawing the next one while the answer comes": {},
   "cancelled, begun and cancelled": {},
   "cancelled during a pause": changed(paused),
-  stopping: {},
   "the end": changed({ phase: "ended", reason: "the source has ended" }),
   "the end, and of the server": { closed: true },
 };
@@ -77,6 +77,10 @@ const draw = async (page, viewport) => {
   await page.waitForSelector("#follow:not([disabled])");
 };
 const pausing = (page) => page.waitForFunction(() => document.querySelector("#message").textContent === "Paused for your box.");
+const forget = (page, answer) => {
+  page.once("dialog", (dialog) => dialog[answer]());
+  return page.click(`[aria-label="Forget ${ben.name}"]`);
+};
 let answered = null; // what the answer to a command waits for
 const doing = {
   drawing: draw,
@@ -86,9 +90,9 @@ const doing = {
     await page.press("#name", "Control+A");
     await page.keyboard.type("dora");
     await page.keyboard.press("Escape");
-    await page.click(`[aria-label="Forget ${ben.name}"]`);
+    await forget(page, "dismiss");
   },
-  "two objects": (page) => Promise.all([page.waitForRequest("**/control"), page.click("dialog .danger")]),
+  forgotten: (page) => Promise.all([page.waitForRequest("**/control"), forget(page, "accept")]),
   "drawing the next one while the answer comes": async (page) => {
     let answer;
     answered = new Promise((resolve) => { answer = resolve; });
@@ -116,10 +120,6 @@ const doing = {
     await pausing(page);
     await page.press("#stage", "Escape");
   },
-  stopping: async (page) => {
-    await page.click("#stop");
-  },
-  "the end": (page) => page.click("dialog button:not(.danger)"),
   "the end, and of the server": (page) => page.evaluate(() => events.onerror()),
 };
 

@@ -255,8 +255,8 @@ def test_host_header_that_looks_like_a_public_path_does_not_open_another_path(lo
 def test_link_sets_a_cookie_and_the_browser_does_not_show_the_token(locked):
     answer = locked.get(f"/?token={TOKEN}", headers={"X-Forwarded-Proto": "https"})
     assert "Secure" in answer.headers["set-cookie"]
-    answer = locked.get(f"/?search=a%3Db&token={TOKEN}")
-    assert (answer.status_code, str(answer.next_request.url)) == (303, str(locked.base_url.join("/?search=a%3Db")))
+    answer = locked.get(f"/?token={TOKEN}")
+    assert (answer.status_code, answer.next_request.url) == (303, locked.base_url.join("/"))
     kept = answer.headers["set-cookie"]
     assert [word in kept for word in (TOKEN, "HttpOnly", "SameSite=lax", "Secure")] == [False, True, True, False]
     assert locked.get("/").status_code == 200

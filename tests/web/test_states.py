@@ -15,7 +15,7 @@ from catstream.web.server import Server
 pytestmark = pytest.mark.system
 
 RESUMED = {"verb": "pause", "seconds": 0}
-SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgetting", "two objects")
+SEVERAL = ("three objects", "another one chosen", "drawing one more", "forgetting", "forgotten", "two objects")
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_each_state_of_the_page_is_accessible_and_correct(seen):
         check_end(seen[scheme, "the end"], seen[scheme, "the end, and of the server"])
 
 
-def check_several(three, chosen, drawing, forgetting, two):
+def check_several(three, chosen, drawing, forgetting, forgotten, two):
     """One of several objects is chosen, for the charts; a new one gets the next name; one is dropped once confirmed."""
     assert (three["pill"], three["objects"][:2]) == ("2 of 3 present", ["anna", "constructor"])
     assert three["chosen"] == ["anna"]
@@ -66,7 +66,7 @@ def check_several(three, chosen, drawing, forgetting, two):
     assert (drawing["name"], drawing["sent"]) == ("object-4", {"verb": "pause", "seconds": 30})
     assert forgetting["name"] == "dora", "as it was typed"
     assert forgetting["sent"] == RESUMED, "nothing is dropped before it is confirmed"
-    assert two["sent"] == {"verb": "forget", "object": "constructor"}
+    assert forgotten["sent"] == {"verb": "forget", "object": "constructor"}
     assert (len(two["objects"]), two["chosen"]) == (2, ["anna"])
 
 

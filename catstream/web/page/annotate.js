@@ -1,7 +1,7 @@
 // The page of `catstream annotate`: a frame, the timelines of the objects, and changes of boxes, which are sent at once.
 // That of `catstream batch --ask` is the same, with the first frame of each video, and nothing to check.
 
-import { $, add, duration, Items, make, many, post, write } from "./dom.js";
+import { $, add, Items, make, many, post, write } from "./dom.js";
 import { Stage } from "./stage.js";
 
 const JUMP = 25; // frames of a page key
@@ -26,7 +26,6 @@ class FrameStage extends Stage {
 class AnnotatePage {
   constructor() {
     Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: "" });
-    this.work = { began: 0, done: 0, remaining: 0 }; // time of the start of the passes that run, and their frames
     this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {} });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
@@ -50,11 +49,7 @@ class AnnotatePage {
     if (!closed && this.state && state.server !== this.state.server) return this.end("Another command serves this address now: reload the page.");
     this.silent = Boolean(closed);
     if (!closed) {
-      const { work } = this;
       const before = this.state;
-      if (!work.remaining) Object.assign(work, { began: Date.now(), done: 0 });
-      work.done += Math.max(0, work.remaining - state.remaining);
-      work.remaining = state.remaining;
       this.state = state;
       if (!before?.objects.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
       if (state.revision !== before?.revision) this.load();
@@ -293,13 +288,12 @@ class AnnotatePage {
 
   /** What the server does, as a state for its colour and in words. */
   progress() {
-    const { state, ended, silent, work } = this;
+    const { state, ended, silent } = this;
     if (ended) return ["ended", "page ended"];
     if (silent || !state) return ["silent", silent ? "page stopped" : "connecting"];
     if (!state.decoded) return ["bootstrapping", `decoding: ${many(state.frames, "frame")}`];
     if (!state.remaining) return ["present", "all boxes saved"];
-    const seconds = work.done ? Math.ceil(state.remaining * (Date.now() - work.began) / work.done / 1000) : null;
-    return ["bootstrapping", `tracking${seconds === null ? "" : `: ${duration(seconds)} left`}`];
+    return ["bootstrapping", `tracking: ${many(state.remaining, "frame")} left`];
   }
 
   overlay() {

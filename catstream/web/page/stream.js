@@ -8,7 +8,7 @@ import { Trees } from "./trees.js";
 
 const PAUSE = { seconds: 30, renewed: 10_000 }; // of the pipeline while a box is drawn; milliseconds until it is renewed
 const TONES = { lost: "silent", starting: "waiting" };
-const MESSAGE = { delay: 8000, duration: 1000 }; // milliseconds that a message is shown, and fades
+const MESSAGE = 9000; // milliseconds that a message is shown about which nothing has to be done
 
 export class StreamPage {
   /** server: {closed, silent}, whether it has announced its shutdown, and the time since which it does not answer. */
@@ -19,7 +19,7 @@ export class StreamPage {
     this.frame = null; // number and time of the newest frame
     this.charts = new Charts($(".charts"));
     this.trees = new Trees($(".trees"), $("#tree-summary"));
-    this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.askToForget(name) });
+    this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.forget(name) });
     this.form = new BoxForm(this.objects, { accept: () => this.stage.accept(), cancel: () => this.stage.cancel() });
     this.stage = new Stage($("#stage"), this.objects, { hold: () => this.hold(), follow: (box, still) => this.follow(box, still),
       changed: (drawing, box) => this.showDrawing(drawing, box) });
@@ -32,8 +32,9 @@ export class StreamPage {
   listen() {
     $("#draw").onclick = () => { $("#stage").focus(); this.stage.begin(); };
     $("#pause").onclick = () => this.send(this.status.paused ? "resume" : "pause");
-    $("#stop").onclick = () => this.ask("Stop the pipeline?", "Everything learned is stored first. The pipeline cannot be restarted from this page.",
-      "Stop it", "Continue", () => this.send("stop"));
+    $("#stop").onclick = () => {
+      if (confirm("Stop the pipeline?\n\nEverything learned is stored first. The pipeline cannot be restarted from this page.")) this.send("stop");
+    };
     addEventListener("pagehide", () => this.stage.cancel()); // else the pipeline resumes only once its pause is over
     const sizes = new ResizeObserver(() => { this.stage.draw(); this.charts.draw(); this.trees.redraw(); });
     for (const drawn of [$("#stage"), $(".charts"), $(".trees")]) sizes.observe(drawn);
@@ -118,29 +119,20 @@ export class StreamPage {
     return true;
   }
 
-  askToForget(name) {
-    this.ask(`Forget ${name || "the object without a name"}?`,
-      "It is no longer tracked, and everything learned about it is dropped. The other objects continue.", "Forget it", "Keep it",
-      () => this.send("forget", { object: name }));
+  forget(name) {
+    const question = `Forget ${name || "the object without a name"}?`;
+    if (confirm(`${question}\n\nIt is no longer tracked, and everything learned about it is dropped. The other objects continue.`)) {
+      this.send("forget", { object: name });
+    }
   }
 
-  /** Ask a question, and act if the answer is yes. */
-  ask(question, consequence, yes, no, act) {
-    const dialog = $("dialog");
-    for (const [selector, text] of [["h2", question], ["p", consequence], [".danger", yes], ["[value='']", no]]) write(dialog.querySelector(selector), text);
-    dialog.returnValue = "";
-    dialog.onclose = () => dialog.returnValue && act();
-    dialog.showModal();
-  }
-
-  /** Show a message until the next one; one that nothing has to be done about fades. */
+  /** Show a message until the next one, or only for some seconds. */
   showMessage(text, wrong = false, fades = !wrong) {
     const message = $("#message");
     message.textContent = text;
     message.classList.toggle("wrong", wrong);
-    this.fading?.cancel();
-    this.fading = fades ? message.animate({ opacity: [1, 0] }, MESSAGE) : null;
-    if (fades) this.fading.onfinish = () => write(message, "");
+    clearTimeout(this.clearing);
+    if (fades) this.clearing = setTimeout(() => write(message, ""), MESSAGE);
   }
 
   showDrawing(drawing, box) {

@@ -1,10 +1,9 @@
 // The coreset trees. Of a tree its leaves are known: the levels of its nodes are the binary digits of their number,
-// since two nodes of a level are always merged. So each node, kept or merged, has its place above its leaves.
+// since two nodes of a level are always merged. Each node is drawn at the height of its level, above the bar of its leaves.
 
 import { add, figure, make, many } from "./dom.js";
 
 const [HEIGHT, EDGE] = [120, 8];
-const CLOSEST = 7; // pixels between two nodes of a level that is still drawn
 
 export class Trees {
   constructor(element, kept) {
@@ -46,37 +45,16 @@ export class Trees {
   }
 
   draw(tree, count) {
-    const before = new Set(nodes(Math.max(0, tree.leaves)).map(key));
     const kept = nodes(count);
-    const top = kept.length ? kept[0].level : 0;
     const apart = (tree.drawing.clientWidth - 2 * EDGE) / Math.max(count, 1);
-    const rise = Math.min(26, (HEIGHT - 34) / Math.max(top, 1));
-    const x = ({ level, from }) => EDGE + apart * (from + 2 ** level / 2);
-    const y = ({ level }) => HEIGHT - 16 - rise * level;
-    const [lines, fans, merged, filled] = [[], [], [], []];
-    const ends = ({ level, from }) => [EDGE + apart * from, EDGE + apart * (from + 2 ** level)];
-    const below = (node) => {
-      if (!node.level) return;
-      if (apart * 2 ** (node.level - 1) < CLOSEST) { // too close to be distinguished
-        fans.push(`M${x(node)} ${y(node)}L${ends(node).map((end) => `${end} ${HEIGHT - 14}`).join("L")}Z`);
-        return;
-      }
-      const half = 2 ** (node.level - 1);
-      for (const child of [{ level: node.level - 1, from: node.from }, { level: node.level - 1, from: node.from + half }]) {
-        lines.push(`M${x(node)} ${y(node)}L${x(child)} ${y(child)}`);
-        merged.push(make("circle", { cx: x(child), cy: y(child), r: 2.2 }));
-        below(child);
-      }
-    };
-    for (const node of kept) {
-      below(node);
-      const [from, to] = ends(node);
-      const r = Math.max(2.5, Math.min(6, (to - from) / 2));
-      filled.push(make("rect", { class: "span", x: from + 0.5, y: HEIGHT - 10, width: Math.max(1, to - from - 1), height: 4 }));
-      filled.push(make("circle", { class: before.has(key(node)) ? "node" : "node new", cx: x(node), cy: y(node), r }));
-      if (to - from > 9) filled.push(make("text", { x: x(node), y: y(node) - 9 }, String(node.level)));
-    }
-    tree.drawing.replaceChildren(make("path", { class: "fan", d: fans.join("") }), make("path", { d: lines.join("") }), ...merged, ...filled);
+    const rise = Math.min(26, (HEIGHT - 34) / Math.max(kept[0]?.level ?? 0, 1));
+    const drawn = kept.flatMap(({ level, from }) => {
+      const width = apart * 2 ** level, x = EDGE + apart * from, y = HEIGHT - 16 - rise * level;
+      const node = make("circle", { cx: x + width / 2, cy: y, r: Math.max(2.5, Math.min(6, width / 2)) });
+      const span = make("rect", { x: x + 0.5, y: HEIGHT - 10, width: Math.max(1, width - 1), height: 4 });
+      return width > 9 ? [span, node, make("text", { x: x + width / 2, y: y - 9 }, String(level))] : [span, node];
+    });
+    tree.drawing.replaceChildren(...drawn);
     tree.right.textContent = count ? `${many(count, "leaf", "leaves")} in ${many(kept.length, "node")}` : "no leaf yet";
     tree.drawing.setAttribute("aria-label", count ? `levels ${kept.map(({ level }) => level).join(", ")}` : "empty");
     tree.leaves = count;
@@ -93,5 +71,3 @@ function nodes(count) {
   }
   return found;
 }
-
-const key = ({ level, from }) => `${level}:${from}`;
