@@ -30,13 +30,14 @@ from catstream.cli.options import (
 from catstream.client.address import Address
 from catstream.client.attach import control, subscribe, wait_until_running
 from catstream.client.control import Control
-from catstream.client.subscription import Subscription
+from catstream.client.subscription import REASON_SECONDS, Subscription
 from catstream.errors import SilenceError
 from catstream.jobs.job import Job
 from catstream.jobs.state import learned
 from catstream.wire.channels import PUBLIC
 
-_SILENT_SECONDS = 5.0  # without a message, after which `watch` and `sink` say why
+_IDLE_SECONDS = REASON_SECONDS  # without a message, after which `idle` is called; then repeated
+_SILENT_SECONDS = 3 * _IDLE_SECONDS  # after which `watch` and `sink` say why
 _OLD_SECONDS = 5.0  # age of the newest message from which they say that the reader is slow
 
 
@@ -137,11 +138,11 @@ def watch(channel: str, address: Address, wait: float, name: str | None, as_json
 
 def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] = lambda: None) -> Iterator[Any]:
     """Yield the messages; warn if they are old, and if none arrives, once for each reason, and call `idle` then."""
-    messages.timeout, reason, old = _SILENT_SECONDS, "", False
+    messages.timeout, reason, old, silent = _IDLE_SECONDS, "", False, 0.0
     while True:
         try:
             for message in messages:
-                reason = ""
+                reason, silent = "", 0.0
                 if not old and messages.behind >= _OLD_SECONDS:
                     old = True
                     click.echo(f"lagging {messages.behind:.0f} s behind: this subscriber is too slow", err=True)
@@ -149,6 +150,9 @@ def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] 
             return
         except SilenceError as error:
             idle()
+            silent += _IDLE_SECONDS
+            if silent < _SILENT_SECONDS:
+                continue
             before, reason = reason, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
             if reason != before:
                 click.echo(f"waiting: {error}", err=True)

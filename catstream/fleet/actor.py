@@ -161,7 +161,10 @@ class Stream:
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
                 self._take(pipeline, tracks)
                 if tracks and files.places:
-                    outputs = outputs or closed_last.enter_context(files.continued(pipeline.endpoint, resume=resume))
+                    if outputs is None:
+                        outputs = files.continued(pipeline.endpoint, resume=resume)
+                        closed_last.enter_context(outputs)
+                        stack.callback(outputs.end)  # before the processes, and before the store
                     outputs.write(TrackedFrame([*tracks.values()]))
                 elif outputs is not None:
                     outputs.idle()

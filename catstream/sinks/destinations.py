@@ -144,7 +144,8 @@ class Sink(Protocol):
     """Writes the frames in their order; created as `Class(place, origin)`.
 
     Its class may have a function `check(place, options)`, which raises VideoError before the run if the address or an
-    option is not valid, and a method `idle()`, which is called several times a second while no frame arrives.
+    option is not valid; a method `idle()`, which is called every few seconds while no frame arrives; and `end()`, which
+    is called before any sink is closed, and sends the last events without waiting until they have arrived.
     """
 
     def write(self, frame: TrackedFrame) -> None:

@@ -1,4 +1,4 @@
-"""Events of objects, detected in their tracks.
+"""Events of objects, detected in their tracks, and of the source.
 
 >>> from catstream.base.box import Box
 >>> events = Events({"door": ((50, 0), (90, 0), (90, 90), (50, 90))}, WHEN | {"lost": 1.0})
@@ -38,9 +38,11 @@ KINDS = {
     "entered": "the centre of its box is in a zone",
     "left": "the centre is outside the zone again, by more than 10 pixels; or the object was lost or ended in it",
     "ended": "it was forgotten, another object got its name, or the tracks ended",
+    "source_lost": "a live source has been lost for the seconds of `lost`",
+    "source_back": "it is connected again after that",
 }
 
-#: All kinds, with the seconds without a box after which an object is lost.
+#: All kinds; the value of "lost" is the seconds without a box after which an object is lost, and without a source.
 WHEN = dict.fromkeys(KINDS, 0.0) | {"lost": 2.0}
 
 #: Pixels by which a centre has to be outside a zone to leave it: hysteresis for a box that stays on the edge.
@@ -53,19 +55,26 @@ _FORGOTTEN_FRAMES = 3
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of an object.
+    """An event of an object or of the source.
 
-    kind   one of `KINDS`
-    track  its track in the frame of the event; its last one if it ended
-    zone   name of the zone; empty if it is about none
+    kind     one of `KINDS`
+    track    of the object in the frame of the event; its last one if it ended; None if it is of the source
+    zone     name of the zone; empty if it is about none
+    source   of an event of the source: its name or address
+    seconds  the same: for how long it has been lost
     """
 
     kind: str
-    track: Track
+    track: Track | None
     zone: str = ""
+    source: str = ""
+    seconds: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """The fields by name, of plain types for JSON, with the object and time of the track."""
+        if self.track is None:
+            about = dict.fromkeys(("object", "time", "zone", "track"))
+            return {"event": self.kind, **about, "source": self.source, "seconds": round(self.seconds, 1)}
         track = self.track.to_dict()
         about = {"event": self.kind, "object": track["object"], "time": track["time"], "zone": self.zone or None}
         return {**about, "track": track}
@@ -73,23 +82,30 @@ class Event:
 
 @dataclass(slots=True)
 class _Object:
-    """An object: its newest track, the number of frames up to it, the time of its last box (None before the first)."""
+    """An object: its newest track, the number of frames up to it, the time of its last box (None before the first).
+
+    is_known  whether the source has not been lost since that track
+    """
 
     track: Track
     frames: int = 0
     box_time: float | None = None
     lost: bool = False
+    is_known: bool = True
     zones: list[str] = field(default_factory=list)
 
 
 class Events:
     """Detects events in the tracks of a run, in their order; it does no I/O, and uses the time of the tracks.
 
+    source_lost  whether the source is lost
+    tracks       newest track of each object
+
     A zone is entered as soon as the centre of a box is in it, and left if the centre is more than `MARGIN` pixels
     outside, or the object is lost or ends. So `left` follows each `entered`, and a lost object is in no zone.
 
     zones : corners x, y of each polygon, in pixels, by name; SettingsError if one is invalid, see `check_zones`
-    when : kinds of events that are returned; the value of `lost` is the seconds without a box
+    when : kinds of events that are returned; the value of `lost` is the seconds without a box or a source
     """
 
     def __init__(self, zones: Mapping[str, Sequence[Point]], when: Mapping[str, float] = WHEN) -> None:
@@ -97,6 +113,7 @@ class Events:
         self._zones = {name: np.array(corners, np.float32) for name, corners in zones.items()}
         self._when, self._lost_seconds = when, when.get("lost", WHEN["lost"])
         self._objects: dict[str, _Object] = {}
+        self.source_lost, self._source_seconds = False, 0.0
         self._frame, self._frames = -1, 0  # number of the newest frame, and how many there were
 
     def update(self, tracks: Sequence[Track]) -> list[Event]:
@@ -111,15 +128,39 @@ class Events:
                 events += self._end(name)
         return self._selected(events)
 
+    def update_source(self, source: str, seconds: float) -> list[Event]:
+        """Return the event of a source that has been lost for some seconds, 0 if it is connected; at most one.
+
+        The status of an object is unknown from `source_lost` to its next track.
+        """
+        kind, lost_seconds = "", max(seconds, self._source_seconds)
+        if seconds and seconds >= self._lost_seconds and not self.source_lost:
+            kind, self.source_lost = "source_lost", True
+            for item in self._objects.values():
+                item.is_known = False
+        elif not seconds and self.source_lost:
+            kind, self.source_lost = "source_back", False
+        self._source_seconds = seconds
+        return self._selected([Event(kind, None, source=source, seconds=lost_seconds)])
+
+    @property
+    def tracks(self) -> list[Track]:
+        return [item.track for item in self._objects.values()]
+
     def close(self) -> list[Event]:
         """Return the last events: all objects end."""
         return self._selected([event for name in [*self._objects] for event in self._end(name)])
 
     def status(self, name: str) -> dict[str, Any] | None:
-        """The status of an object: whether it is present, and the names of its zones; None if it ended."""
+        """The status of an object: whether it is present, and the names of its zones; None if it ended.
+
+        If it is unknown, `present` is None, and there are no zones.
+        """
         item = self._objects.get(name)
         if item is None:
             return None
+        if not item.is_known:
+            return {"present": None, "zones": []}
         return {"present": item.box_time is not None and not item.lost, "zones": [*item.zones]}
 
     def _selected(self, events: list[Event]) -> list[Event]:
@@ -132,7 +173,7 @@ class Events:
             yield from self._end(track.object)
             item = None
         item = item or self._objects.setdefault(track.object, _Object(track))
-        item.track, item.frames = track, self._frames
+        item.track, item.frames, item.is_known = track, self._frames, True
         if track.box is None:
             if item.box_time is None or item.lost or track.time - item.box_time < self._lost_seconds:
                 return

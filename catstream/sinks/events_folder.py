@@ -65,6 +65,8 @@ class EventsFolder:
         """Write the last events."""
         self._write(self._events.close())
 
+    end = close
+
     def _write(self, events: Iterable[tuple[Event, Preview | None]]) -> None:
         for event, picture in events:
             try:
@@ -79,7 +81,8 @@ class EventsFolder:
         """Write the picture of an event, remove the oldest ones above the limit, and return the name of the file."""
         tracks = self._tracks.get(picture.frame, [])
         self._colours.keep(track.object for track in tracks)
-        words = (f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3] + "Z", event.kind, event.track.object, event.zone)
+        name = "" if event.track is None else event.track.object
+        words = (f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3] + "Z", event.kind, name, event.zone)
         file = self._folder / ("-".join(_UNSAFE.sub("_", word) for word in words if word) + ".jpg")
         data = draw_preview(picture, tracks, self._colours)
         write_atomically(file, data)

@@ -1,10 +1,11 @@
 """An MQTT broker: events, the state of each object, and its discovery by Home Assistant.
 
     TOPIC/availability     "online"; "offline" at the end, and as last will if the connection breaks; retained
+    TOPIC/source           "online", or "lost" while the source is lost; retained
     TOPIC/events           each event, as `EventStream.to_json` makes it
     TOPIC/objects/NAME     the newest track of an object, with `present`, `zones` and `sent`, as often as the option
                            `rate` says, and as soon as `present` or `zones` changes; retained, and removed if the object
-                           ends. NAME is "-" for the object without a name
+                           ends. While the source is lost, `present` is null. NAME is "-" for the object without a name
     homeassistant/binary_sensor/catstream/ID/config     a sensor for each object, and for each object in each zone
 
 All have QoS 1. While the broker is away, events wait for it, and states are dropped, as the next one replaces them.
@@ -16,7 +17,7 @@ import json
 import ssl
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import Enum, auto
 from hashlib import blake2b
 from typing import Any
@@ -27,7 +28,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from catstream.base.text import counted
 from catstream.errors import VideoError
-from catstream.messages.kinds import Preview
+from catstream.messages.kinds import Preview, Track
 from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, redacted
 from catstream.sinks.events import Event
 from catstream.sinks.remote import CLOSE_SECONDS, QUEUED, EventStream, Warnings, reason_of, split
@@ -36,6 +37,9 @@ _LONGEST_PAUSE = 30  # seconds between two attempts to connect, from 1 on
 _KEEPALIVE = 30  # seconds without a message after which client and broker test whether the other one is there
 _REPLY_SECONDS = 10  # in which a broker accepts or refuses a connection
 _EXPIRE_SECONDS = 10  # without a state after which Home Assistant shows a sensor as unavailable, at least
+
+
+_STATES = "{true: 'ON', false: 'OFF'}"  # in a template of Home Assistant
 
 
 class _Link(Enum):
@@ -54,7 +58,8 @@ class MqttSink:
         url = _checked(place)
         self._topic, self._options = unquote(url.path)[1:], origin.options
         self._events, self._warnings = EventStream(origin, has_pictures=origin.options.picture), Warnings(place)
-        self._availability = f"{self._topic}/availability"
+        self._availability, self._source = f"{self._topic}/availability", f"{self._topic}/source"
+        self._source_state, self._deadline = "", 0.0  # state that was published; of the delivery, once it has ended
         self._sent: dict[str, tuple[object, float]] = {}  # of each object, the last status, and when the next is due
         self._published = self._acknowledged = self.missed = 0
         self._is_away = self._is_back = False  # a broker that is back may have lost retained messages
@@ -82,43 +87,56 @@ class MqttSink:
 
     def write(self, frame: TrackedFrame) -> None:
         """Publish the events of a frame, and the states that have changed or are due."""
+        self._update(frame.tracks)
+
+    def idle(self) -> None:
+        """Publish the events that have waited for a picture, and whether the source is lost."""
+        self._update(())
+
+    def _update(self, tracks: Sequence[Track]) -> None:
         self._check_link()
         if self._is_back:
-            self._is_back = False
+            self._is_back, self._source_state = False, ""
             self._publish(self._availability, "online", retain=True)
             for name in self._sent:
                 self._announce(name)
                 self._sent[name] = None, 0.0
-        self._publish_events(self._events.update(frame.tracks))
-        now, status_of = time.monotonic(), self._events.events.status
-        for track in frame.tracks:
+        ready, events = self._events.update(tracks), self._events.events
+        if (source := "lost" if events.source_lost else "online") != self._source_state:
+            self._source_state = source
+            self._publish(self._source, source, retain=True)
+        self._publish_events(ready)
+        now = time.monotonic()
+        for track in events.tracks:
             if track.object not in self._sent:
                 self._announce(track.object)
-            status = status_of(track.object)
+            status = events.status(track.object) or {}
             last, due = self._sent.get(track.object, (None, now))
-            if status and (status != last or now >= due):
+            if status != last or (tracks and now >= due):
                 self._sent[track.object] = status, now + 1 / self._options.rate
                 state = {**track.to_dict(), **status, "sent": time.time()}
                 if self._is_away:
                     self.missed += 1
                 else:
                     self._publish(self._state_topic(track.object), json.dumps(state), retain=True)
-        for name in [name for name in self._sent if status_of(name) is None]:
+        for name in [name for name in self._sent if events.status(name) is None]:
             self._announce(name, ended=True)
             self._remove(name)
 
-    def idle(self) -> None:
-        """Publish the events that have waited for a picture."""
-        self._publish_events(self._events.update())
-
-    def close(self) -> None:
-        """Publish the last events; wait some seconds until the broker has everything, and warn about what it missed."""
+    def end(self) -> None:
+        """Publish the last events, and that this program is offline."""
+        if self._deadline:
+            return
+        self._deadline = time.monotonic() + CLOSE_SECONDS
         self._publish_events(self._events.close())
         for name in [*self._sent]:
             self._remove(name)
         self._publish(self._availability, "offline", retain=True)
-        deadline = time.monotonic() + CLOSE_SECONDS
-        while self._acknowledged < self._published and time.monotonic() < deadline:
+
+    def close(self) -> None:
+        """Wait some seconds after the end until the broker has everything, and warn about what it missed."""
+        self.end()
+        while self._acknowledged < self._published and time.monotonic() < self._deadline:
             time.sleep(0.02)
         self._client.disconnect()
         if self._acknowledged == self._published:  # else it would wait for the broker; the thread ends by itself
@@ -149,14 +167,21 @@ class MqttSink:
         """Have Home Assistant make the sensors of an object, or remove them if it has ended."""
         state, label = self._state_topic(name), name or "object"
         sensors = {label: "value_json.present"}
-        sensors |= {f"{label} in {zone}": f"'{zone}' in value_json.zones" for zone in self._options.zone}
+        sensors |= {
+            f"{label} in {zone}": f"value_json.present and '{zone}' in value_json.zones" for zone in self._options.zone
+        }
         for sensor, condition in sensors.items():
             number = _id(state + condition)
             config = {
                 **{"name": sensor, "unique_id": f"catstream_{number}", "device_class": "occupancy"},
                 **{"state_topic": state, "json_attributes_topic": state},
-                "value_template": f"{{{{ 'ON' if value_json is defined and {condition} else 'OFF' }}}}",
-                "availability_topic": self._availability,
+                # "None" makes the state unknown
+                "value_template": f"{{{{ {_STATES}.get(value_json is defined and {condition}) }}}}",
+                "availability": [
+                    {"topic": self._availability},
+                    {"topic": self._source, "payload_not_available": "lost"},
+                ],
+                "availability_mode": "all",
                 "expire_after": max(_EXPIRE_SECONDS, round(3 / self._options.rate)),
                 "device": {"identifiers": [f"catstream_{_id(self._topic)}"], "name": self._topic},
                 "origin": {"name": "catstream"},

@@ -88,7 +88,7 @@ OPTIONS = {
         str,
         'a text, for example "lost=10,entered"',
         "EVENT,...",
-        f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box, default: 2.",
+        f"Send only these events: {', '.join(KINDS)}; lost=10 after 10 s without a box or source, default: 2.",
         _MQTT + _HTTP + _FOLDER,
         parse_when,
     ),

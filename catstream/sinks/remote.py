@@ -16,7 +16,7 @@ from uuid import uuid4
 from catstream.client.attach import subscribe
 from catstream.client.subscription import Subscription
 from catstream.errors import SilenceError, VideoError
-from catstream.messages.kinds import Preview, Track
+from catstream.messages.kinds import Health, Preview, Track
 from catstream.sinks.destinations import Origin, redacted
 from catstream.sinks.events import Event, Events
 
@@ -27,6 +27,7 @@ QUEUED = 256
 CLOSE_SECONDS = 5.0
 
 _STABLE_SECONDS = 10.0  # without a failure, after which a destination has recovered
+_REPORT_SECONDS = 0.5  # between two looks for a health report; a process sends one a second
 _PICTURE_SECONDS = 2.0  # that an event waits for a picture of its frame
 
 _log = logging.getLogger(__name__)
@@ -66,8 +67,8 @@ class Warnings:
 class EventStream:
     """Detects events, each with a picture if that is wanted: the first one of the frame of the event or a later one.
 
-    If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none. Without pictures,
-    events do not wait.
+    If none arrives within `_PICTURE_SECONDS`, an event has the newest picture, None if there is none, as at once an
+    event of the source, which is detected in the health reports. Without pictures, events do not wait.
     """
 
     def __init__(self, origin: Origin, *, has_pictures: bool) -> None:
@@ -75,6 +76,10 @@ class EventStream:
         self._waiting: deque[tuple[Event, float]] = deque()  # with the times up to which they wait
         self._newest: Preview | None = None
         self._previews: Subscription[Preview] | None = None
+        self._reports: Subscription[Health] | None = None
+        self._next_look = 0.0
+        if str(origin.address):
+            self._reports = subscribe(origin.address, "health", timeout=0)
         if has_pictures:
             self._previews = subscribe(origin.address, "previews", timeout=0)
 
@@ -84,24 +89,34 @@ class EventStream:
         Call it without tracks while no frame arrives, so that their wait ends in time.
         """
         now = time.monotonic()
-        self._waiting += [(event, now + _PICTURE_SECONDS) for event in self.events.update(tracks)]
+        events = self.events.update(tracks)
+        if now >= self._next_look:
+            self._next_look = now + _REPORT_SECONDS
+            with suppress(SilenceError):  # no further report has arrived
+                for report in self._reports or ():
+                    if report.process == "detector":
+                        events += self.events.update_source(report.source, report.counters.get("lost_seconds", 0.0))
+        self._waiting += [(event, now + _PICTURE_SECONDS) for event in events]
         with suppress(SilenceError):  # no further picture has arrived
             for preview in self._previews or ():
                 self._newest = preview
         ready = []
         while self._waiting:
             event, due = self._waiting[0]
-            is_early = self._newest is None or self._newest.frame < event.track.frame
+            is_early = event.track is not None and (self._newest is None or self._newest.frame < event.track.frame)
             if self._previews is not None and is_early and now < due:
                 break
             ready.append((self._waiting.popleft()[0], self._newest))
         return ready
 
     def close(self) -> list[tuple[Event, Preview | None]]:
-        """Return the last events."""
-        if self._previews is not None:
-            self._previews.close()
-        return [(event, self._newest) for event in (*(event for event, _ in self._waiting), *self.events.close())]
+        """Return the last events; none if it is closed already."""
+        for subscription in (self._previews, self._reports):
+            if subscription is not None:
+                subscription.close()
+        events = [*(event for event, _ in self._waiting), *self.events.close()]
+        self._waiting.clear()
+        return [(event, self._newest) for event in events]
 
     def to_json(self, event: Event, picture: Preview | None) -> bytes:
         """Return a JSON object: `Event.to_dict`, `id`, `sent` in seconds since 1970, and `picture` if that is wanted.

@@ -451,5 +451,12 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
             if hasattr(sink, "idle"):
                 sink.idle()
 
+    def end(self) -> None:
+        """Tell the destinations that no frame follows, before one of them waits for its delivery."""
+        for sink in self._sinks:
+            if hasattr(sink, "end"):
+                sink.end()
+
     def __exit__(self, *details: Any) -> None:
+        self.end()
         self._stack.__exit__(*details)

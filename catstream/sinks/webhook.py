@@ -45,6 +45,7 @@ class Webhook:
         self._bodies: SimpleQueue[bytes | None] = SimpleQueue()
         self._count = self._delivered = self.missed = 0
         self._hurry, self._closed = Flag(), False  # the event ends a pause
+        self._deadline: float | None = None  # of the delivery, once the sink has ended
         self._retry_after, self._is_working = 0.0, False  # what the last answer says
         self._thread = Thread(target=self._deliver_all, name="webhook", daemon=True)
         self._thread.start()
@@ -65,12 +66,18 @@ class Webhook:
         """Queue the events that have waited for a picture."""
         self._queue(self._events.update())
 
+    def end(self) -> float:
+        """Queue the last events; return the time until which the backlog is delivered."""
+        if self._deadline is None:
+            self._deadline = time.monotonic() + CLOSE_SECONDS
+            self._queue(self._events.close())
+            self._bodies.put(None)
+            self._hurry.set()
+        return self._deadline
+
     def close(self) -> None:
-        """Queue the last events, and deliver the backlog for some seconds; warn about missed events."""
-        self._queue(self._events.close())
-        self._bodies.put(None)
-        self._hurry.set()
-        self._thread.join(CLOSE_SECONDS)
+        """Deliver the backlog for some seconds after the end, and warn about missed events."""
+        self._thread.join(max(0.0, self.end() - time.monotonic()))
         self._closed = True
         self._hurry.set()
         self.missed = self._count - self._delivered

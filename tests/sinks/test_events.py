@@ -66,6 +66,18 @@ def test_only_the_events_that_are_wanted_are_told():
     assert told([*events.update([*tracks("5.1")]), *events.close()]) == ["0 entered door", "1 lost"]
 
 
+def test_a_source_is_lost_after_the_seconds_of_lost_and_objects_are_unknown_until_their_next_track():
+    events = Events(DOOR, WHEN | {"lost": 3.0})
+    events.update([*tracks("5")])
+    reports = [events.update_source("cam", seconds) for seconds in (0.0, 1.0, 3.0, 9.0, 0.0, 2.0, 0.0)]
+    assert [[(event.kind, event.seconds) for event in each] for each in reports] == [
+        [], [], [("source_lost", 3.0)], [], [("source_back", 9.0)], [], [],
+    ]  # fmt: skip
+    assert events.status("") == {"present": None, "zones": []}
+    assert told(events.update([*tracks("5", first=1)])) == []
+    assert events.status("") == {"present": True, "zones": ["door"]}
+
+
 def test_another_object_of_the_same_name_ends_the_one_before():
     events = Events(DOOR)
     assert told(events.update([*tracks("5"), *tracks("1", began=1, first=1)])) == [

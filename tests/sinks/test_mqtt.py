@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 
@@ -15,9 +16,13 @@ import paho.mqtt.client as mqtt
 import pytest
 
 from catstream.base.box import Box
-from catstream.messages.kinds import Track
-from catstream.sinks import mqtt_sink
+from catstream.client.address import Address
+from catstream.messages.kinds import Health, Track
+from catstream.sinks import mqtt_sink, remote
 from catstream.sinks.destinations import Origin, SinkOptions, TrackedFrame, open_sink
+from catstream.sinks.track_log import RunFiles
+from catstream.wire.channels import HEALTH
+from catstream.wire.newest import Publisher
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
 needs_broker = pytest.mark.skipif(MOSQUITTO is None, reason="no MQTT broker: apt-get install mosquitto")
@@ -120,7 +125,7 @@ def test_a_subscriber_gets_events_states_and_availability(broker, until):
     with opened(broker.url, zone=DOOR, rate=1e-3) as sink:
         online(sink, until)
         late = broker.subscriber()  # who gets what is retained
-        until(lambda: len(late) == 4)
+        until(lambda: len(late) == 5)
         sink.write(lost(9))
     assert sink.missed == 0
     until(lambda: got["yard/cam/availability"][-1] == "offline")
@@ -133,13 +138,62 @@ def test_a_subscriber_gets_events_states_and_availability(broker, until):
     ]  # fmt: skip
     assert json.loads(late["yard/cam/objects/anna"][0]) == json.loads(states[0])
     configs = [json.loads(each[0]) for topic, each in late.items() if topic.startswith("homeassistant/")]
-    assert {config["name"]: config["value_template"] for config in configs} == {
-        "anna": "{{ 'ON' if value_json is defined and value_json.present else 'OFF' }}",
-        "anna in door": "{{ 'ON' if value_json is defined and 'door' in value_json.zones else 'OFF' }}",
-    }
+    assert {config["name"] for config in configs} == {"anna", "anna in door"}
     for config in configs:
         assert config["state_topic"] in late
-        assert config["availability_topic"] in late
+        assert {each["topic"] for each in config["availability"]} == {"yard/cam/availability", "yard/cam/source"}
+
+
+@needs_broker
+def test_a_lost_source_is_an_event_and_its_objects_are_unknown(broker, until, endpoint):
+    broker.start()
+    got = broker.subscriber()
+    with Publisher(HEALTH, endpoint, "detector") as health:
+        origin = Origin(address=Address(str(endpoint)), options=SinkOptions(zone=DOOR, rate=1e-3))
+        with closing(open_sink(broker.url, origin)) as sink:
+            online(sink, until)
+
+            def report(seconds, state):
+                def turn():
+                    health.send(Health("detector", 0.0, {"lost_seconds": seconds}, source="rtsp://cam"))
+                    sink.idle()
+
+                until(lambda: got["yard/cam/source"][-1] == state, turn)
+
+            report(7.0, "lost")
+            report(0.0, "online")
+            online(sink, until)
+    until(lambda: got["yard/cam/availability"][-1] == "offline")
+    assert got["yard/cam/source"] == ["online", "lost", "online"]
+    about = [each for each in map(json.loads, got["yard/cam/events"]) if each["track"] is None]
+    assert [(each["event"], each["source"], each["seconds"]) for each in about] == [
+        ("source_lost", "rtsp://cam", 7.0), ("source_back", "rtsp://cam", 7.0),
+    ]  # fmt: skip
+    states = [json.loads(each) for each in got["yard/cam/objects/anna"] if each]
+    assert [(state["present"], state["zones"]) for state in states] == [(True, ["door"]), (None, []), (True, ["door"])]
+    jinja2 = pytest.importorskip("jinja2")  # the templates of Home Assistant
+    configs = [json.loads(each[0]) for topic, each in got.items() if topic.startswith("homeassistant/")]
+    for config in configs:
+        template = jinja2.Template(config["value_template"])
+        assert [template.render(value_json=state) for state in states] == ["ON", "None", "ON"]
+        assert template.render(value_json={"present": False, "zones": []}) == template.render() == "OFF"
+
+
+@needs_broker
+def test_the_last_events_are_sent_before_a_slow_delivery(broker, until, tmp_path):
+    broker.start()
+    got = broker.subscriber()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        places = [broker.url, f"http://127.0.0.1:{silent.getsockname()[1]}/hook", f"{tmp_path / 'events'}/"]
+        files = RunFiles(Origin(), None, places)
+        with files.opened(str(tmp_path)) as outputs:
+            outputs.write(TrackedFrame([ANNA]))
+            outputs.end()
+            until(lambda: got.get("yard/cam/availability") == ["online", "offline"])
+            assert '"ended"' in (tmp_path / "events" / "events.ndjson").read_text()
+            began = time.monotonic()
+    assert events(got)[-1] == ("ended", 0.0)
+    assert time.monotonic() - began < 2 * remote.CLOSE_SECONDS, "destinations share the time"
 
 
 @needs_broker
@@ -162,7 +216,7 @@ def test_a_process_that_is_killed_is_offline_by_its_last_will(broker, until):
     killed = (
         "import os, sys, time; from catstream.sinks.destinations import *; from catstream.messages.kinds import *\n"
         "sink = open_sink(sys.argv[1], Origin())\n"
-        "while sink._acknowledged < 4:\n"
+        "while sink._acknowledged < 5:\n"
         "    sink.write(TrackedFrame([Track(0, 0.0, 'absent', None, 0.0, 0)])); time.sleep(0.01)\n"
         "os.kill(os.getpid(), 9)"
     )
@@ -209,9 +263,10 @@ def test_a_broker_that_never_answers_holds_nothing_up_and_what_it_misses_is_coun
         for time in range(1, 21):
             sink.write(lost(10 * time))
             sink.write(TrackedFrame([replace(ANNA, frame=10 * time + 1, time=10.0 * time + 1)]))
-    # 42 events: found, 20 lost, 20 returned, ended; a state after all but the last; online, sensor, removal, offline
-    assert sink.missed == 42 + 41 + 4
-    assert "the broker has not received 87 messages" in caplog.text
+    # 42 events: found, 20 lost, 20 returned, ended; a state after all but the last; online and offline, the state of
+    # the source, sensor, removal
+    assert sink.missed == 42 + 41 + 5
+    assert "the broker has not received 88 messages" in caplog.text
 
 
 @contextmanager
