@@ -5,18 +5,15 @@ import json
 import os
 import select
 import signal
-import time
 
 import pytest
 
 from catstream.cli.status import Status
 from catstream.client.attach import control
 from catstream.features.layout import ROW_LENGTH
-from catstream.messages.kinds import End, Health, Track
+from catstream.messages.kinds import Health, Track
 from catstream.pipeline import Pipeline
 from catstream.processes.start_server import NAMES
-from catstream.wire.channels import HEALTH, TRACKS
-from catstream.wire.newest import Publisher
 
 SECONDS = 60  # that anything may take on a busy machine
 
@@ -55,35 +52,6 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(l
     words = ("frame ", "training (", "appearance (", "labels ")
     assert any(all(word in line for word in words) for line in lines), "not all frames are taught"
     assert (tracks.returncode, features.returncode) == (0, 0)
-
-
-@pytest.fixture
-def two_objects(endpoint, turning):
-    """The endpoint of a pipeline of anna and an object without a name, whose source ends after four frames."""
-    frames = [(seq, name) for seq in range(1, 5) for name in ("anna", "")]
-    messages = [Track(seq - 1, 0.1, "absent", None, 0.0, 0, object=name) for seq, name in frames]
-    messages.append(End(4, "the source has ended"))
-
-    def turn():
-        health.send(Health("detector", time.time()))
-        tracks.serve_late_joiners()
-        while messages and len(tracks._subscribed) == 2:  # to its tracks, and to their end
-            tracks.send(messages.pop(0))
-
-    with Publisher(TRACKS, endpoint) as tracks, Publisher(HEALTH, endpoint, "detector") as health, turning(turn):
-        yield endpoint
-
-
-@pytest.mark.parametrize(
-    ("options", "objects"),
-    [((), ["anna", ""] * 4), (("--object", "anna"), ["anna"] * 4)],
-    ids=["all", "anna"],
-)
-def test_all_objects_are_watched_or_one(two_objects, said, options, objects):
-    code, output, errors = said("watch", "tracks", *options, "--endpoint", two_objects, "--json")
-    *_, last = errors.splitlines()  # before it, a publisher in this process may tell of a connection that ended early
-    assert (code, last) == (0, f"{len(objects)} tracks, 0 missed: the source has ended")
-    assert [json.loads(line)["object"] for line in output.splitlines()] == objects
 
 
 def test_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, said):

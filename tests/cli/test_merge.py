@@ -56,15 +56,5 @@ def test_models_of_different_objects_are_merged_only_with_force(fail, succeed, m
     error = fail("merge", door, lake, "-o", tmp_path / "both")
     assert "saved models 1 and 2 look like different objects" in error
     assert "--force" in error
-    assert not (tmp_path / "both").exists()
     output, errors = succeed("merge", door, lake, "-o", tmp_path / "both", "--force")
     assert (errors, "2 saved models" in output) == ("", True)
-
-
-def test_a_doubt_is_one_line_and_the_models_are_merged(succeed, models, tmp_path, monkeypatch):
-    monkeypatch.setattr("catstream.jobs.saved_model._UNLIKE", 0.0)
-    door, _, lake = models
-    output, errors = succeed("merge", door, lake, "-o", tmp_path / "both")
-    assert errors.count("\n") == 1
-    assert "catstream: warning: saved models 1 and 2 look like different objects (similarity 0." in errors
-    assert "2 saved models" in output

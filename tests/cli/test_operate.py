@@ -8,9 +8,10 @@ from threading import Event
 
 import pytest
 
+from catstream.base.box import Box
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
-from catstream.video.source import open_source
+from tests.learning import learned_from
 
 NEED_A_PIPELINE = [["set-box", "1,2,3,4"], ["search", "one"], ["save", "one"], ["watch", "tracks"]]
 NEED_A_PIPELINE += [[name] for name in ("forget", "pause", "resume", "stop", "status")]
@@ -99,35 +100,14 @@ def test_objects_begin_and_are_forgotten_by_name_in_a_paused_run(video, follow, 
     assert (code, answer.endswith("ambiguous object: this run tracks anna, ben; pass a name")) == (1, True)
     assert "dora, emil begin in frame" in steer("set-box", "dora=20,150,70,60", "emil=20,20,60,60")[1]
     assert [steer("forget", name)[0] for name in ("dora", "emil")] == [0, 0]
+    learned_from(source, Box.parse(box), slice(12)).save(tmp_path / "one")
+    assert steer("search", f"fay={tmp_path / 'one'}")[1].startswith("fay is searched for from frame")
+    assert steer("forget", "fay")[0] == 0
     assert steer("forget", "anna")[1].startswith("anna is no longer tracked after frame")
     assert steer("forget")[1].endswith("no object is left, so the run waits for a box")
     assert status()["state"] == "waiting"
     assert steer("stop")[0] == 0
     assert {track.object for track in run.result(120)} == {"anna", "ben", "dora", "emil"}
-
-
-def test_saved_model_finds_the_object_in_another_run(video, follow, succeed, steer, camera, until, tmp_path):
-    source, box = video
-    with open_source(source) as film:
-        image = next(film).image
-    run = follow(camera(lambda _: image).url, box)
-
-    def saved():
-        code, answer = steer("save", tmp_path / "one", "--overwrite")
-        return code == 0 and int(answer.removeprefix("model ").removesuffix(f" is in {tmp_path / 'one'}"))
-
-    until(lambda: saved() >= 3)
-    code, answer = steer("stop")
-    assert (code, answer.startswith("the stream ends after frame")) == (0, True)
-    assert run.result(120)
-    succeed("track", source, "--model", tmp_path / "one", "--output", tmp_path / "out")
-    found = rows(tmp_path / "out")
-    assert [row["state"] for row in found[3:]] == ["present"] * 29  # each frame is searched for one of three sizes
-    assert int(found[0]["model_version"]) >= 1
-    run = follow(source)
-    code, answer = steer("search", f"anna={tmp_path / 'one'}")
-    assert (code, answer.startswith("anna is searched for from frame 0 on, by model ")) == (0, True)
-    assert [track.state for track in run.result(120)] == [row["state"] for row in found]
 
 
 @pytest.mark.parametrize("words", NEED_A_PIPELINE, ids=" ".join)

@@ -10,8 +10,6 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
-import numpy as np
 import psutil
 import pytest
 
@@ -54,22 +52,20 @@ def test_it_writes_a_log_in_two_forms_and_a_video(whole_run):
 def test_a_part_has_a_row_for_each_frame_that_was_followed(video, succeed, tmp_path):
     source, box = video
     part, out = ["--start", "4", "--end", "32", "--stride", "4"], tmp_path / "[red]a[b]"
-    _, errors = succeed("track", source, "--box", box, *part, "--output", out, "--video")
+    _, errors = succeed("track", source, "--box", box, *part, "--output", out)
     assert str(out.name) in errors, "brackets in a path are printed as they are"
-    rows = table(out / "demo.csv")
-    assert [int(row["frame"]) for row in rows] == list(range(7))
-    assert [float(row["seconds"]) for row in rows] == pytest.approx([k / 30 for k in range(4, 32, 4)], abs=1e-3)
-    assert [int(row["source_frame"]) for row in rows] == list(range(4, 32, 4))
+    assert [int(row["source_frame"]) for row in table(out / "demo.csv")] == list(range(4, 32, 4))
     head = Log(out / "demo.ndjson").head()
     stated = (head.source, head.size, head.rate, head.frames, head.start, head.stride)
     assert stated == (source, (320, 240), 30, 7, 4, 4)
     assert head.boxes == {"": Box.parse(box)}
-    for layout in ("coco", "cvat", "yolo"):  # they need the size
-        succeed("export", out / "demo.ndjson", tmp_path / layout, "--format", layout)
-    with open_source(out / "demo.mp4") as film, open_source(source, part=slice(4, 32, 4)) as story:
-        for drawn, frame in zip(film, story, strict=True):
-            difference = cv2.absdiff(drawn.image[: len(frame.image)], frame.image)  # above the line of text
-            assert np.median(difference) < 8
+
+
+def test_the_object_of_a_saved_model_is_found(whole_run, video, succeed, tmp_path):
+    succeed("track", video[0], "--model", whole_run / "model", "--output", tmp_path)
+    rows = table(tmp_path / "demo.csv")
+    assert [row["state"] for row in rows[3:]] == ["present"] * 29  # each frame is searched for one of three sizes
+    assert int(rows[0]["model_version"]) >= 1
 
 
 def test_two_lockstep_runs_write_the_same_bytes(video, whole_run, succeed, tmp_path):
@@ -127,23 +123,6 @@ def running():
         with suppress(psutil.NoSuchProcess):  # it ends meanwhile
             found += [each] * (each.status() != psutil.STATUS_ZOMBIE)
     return found
-
-
-def test_an_image_of_another_size_ends_the_run_at_that_frame(video, fail, succeed, tmp_path):
-    source, box = video
-    images = tmp_path / "walk"
-    images.mkdir()
-    with open_source(source) as film:
-        for frame, _ in zip(film, range(12), strict=False):
-            cv2.imwrite(str(images / f"{frame.number}.png"), frame.image[: -8 if frame.number == 10 else None])
-    error = fail("track", images, "--box", box, "--output", tmp_path / "out")
-    assert all(word in error for word in ("one size", "10.png", "--set run.resize=true"))
-    assert len(frames_of(tmp_path / "out", "walk")) == 10
-    files = ["--output", tmp_path / "all", "--video"]
-    succeed("track", images, "--box", box, *files, "--set", "run.resize=true")
-    assert len(frames_of(tmp_path / "all", "walk")) == 12
-    with open_source(tmp_path / "all" / "walk.mp4") as film:
-        assert sum(1 for _ in film) == 12
 
 
 REJECTED = {
@@ -233,22 +212,6 @@ def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(
     assert "c" in last
     _, errors = succeed("track", source, "--box", f"a={box}", "--save-model", tmp_path / "only", "--end", 12)
     assert "there is no object" not in errors, "without a name, the only one is meant"
-
-
-def test_a_run_that_starts_paused_says_how_to_resume_it(video, succeed, monkeypatch):
-    by_frame = Pipeline.by_frame
-
-    def until_it_reports(run, seconds):
-        for tracks in by_frame(run, seconds):
-            yield tracks
-            if "detector" in run.health:
-                break
-
-    monkeypatch.setattr(Pipeline, "by_frame", until_it_reports)
-    source, box = video
-    _, errors = succeed("track", source, "--box", box, "--paused")
-    assert errors.startswith("paused: to continue, catstream resume --endpoint")
-    assert errors.count("\n") == 1, "no frame was tracked"
 
 
 def test_time_in_which_a_run_waits_counts_neither_for_its_first_track_nor_its_rate(monkeypatch):

@@ -98,15 +98,6 @@ def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(kill
     succeed("save", tmp_path / "one", "--state", kept, "--overwrite")
 
 
-def test_a_run_that_cannot_continue_is_not_said_to_continue(killed, video, fail):
-    kept, (source, box) = killed / "kept", video
-    command = ["track", source, "--box", box, "--state", kept, "--continue"]
-    with Pipeline(resume=kept):
-        assert "continues" not in fail(*command)
-    (kept / "job.safetensors").write_bytes(b"damaged")
-    assert "continues" not in fail(*command)
-
-
 def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, fail, tmp_path):
     kept, (source, box) = killed / "kept", video
     refusals = {
@@ -118,14 +109,8 @@ def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed,
         "keeps its objects": ["track", "--resume", kept, "--box", "b=1,2,30,40"],
         "missing SOURCE": ["track", "--box", box, "--state", tmp_path / "new"],
         "missing --state DIR": ["track", source, "--continue"],
-        "--continue and --overwrite are": [
-            "track",
-            source,
-            "--state",
-            kept,
-            "--continue",
-            "--overwrite",
-        ],
+        "--continue and --overwrite are": ["track", source, "--state", kept, "--continue", "--overwrite"],
+        f"{Path(source).name}' is a file": ["save", tmp_path / "one", "--state", source],
     }
     for word, command in refusals.items():
         assert word in fail(*command)
@@ -213,9 +198,3 @@ def test_a_resumed_run_drops_a_video_and_files_if_it_is_told_so(killed, succeed)
     results = Job.load(kept).results
     assert (results.output, results.video, results.write) == (killed / "out", False, (second,))
     assert (first.exists(), second.exists()) == (False, True)
-
-
-@pytest.mark.parametrize("words", [["track", "--resume"], ["save", "one", "--state"]], ids=" ".join)
-def test_a_file_is_not_the_folder_of_a_run(fail, tmp_path, words):
-    (tmp_path / "walk.mp4").write_bytes(b"a video")
-    assert "walk.mp4' is a file" in fail(*words, tmp_path / "walk.mp4", cwd=tmp_path)

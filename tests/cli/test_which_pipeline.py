@@ -7,7 +7,6 @@ import pytest
 from click.testing import CliRunner
 
 from catstream.cli import group
-from catstream.messages.kinds import FleetStatus, StreamStatus
 from catstream.wire.discovery import private_folder, reserve_endpoint
 
 
@@ -58,18 +57,3 @@ def test_empty_endpoint_selects_no_pipeline(pipeline):
     result = said("stop", "--endpoint", "")
     assert (result.exit_code, heard) == (2, [])
     assert "is empty" in result.stderr
-
-
-def test_stream_of_a_fleet_is_selected_by_its_address(pipeline, managing):
-    place, heard = pipeline("/films/walk.mp4")
-    pipeline("/films/other.mp4")
-    stream = StreamStatus("cam-7", "running", source="/films/walk.mp4", endpoint=str(place), token=1)
-    failed = StreamStatus("a", "failed", trouble="there is no video")
-    with managing(lambda: FleetStatus("site", 0.0, {"cam-7": stream, "a": failed})):
-        result = said("pause", "--endpoint", "fleet://cam-7")
-        assert (result.exit_code, result.stderr) == (0, f"pipeline: /films/walk.mp4 at {place}\n")
-        assert said("resume", "--endpoint", "fleet://site/cam-7").exit_code == 0
-        assert heard == ["pause", "resume"]
-        assert "no stream 'cam-8'" in str(said("stop", "--endpoint", "fleet://cam-8").exception)
-        why = "not running (state: failed, there is no video)"
-        assert why in str(said("status", "--endpoint", "fleet://a", "--wait", 0.1).exception)
