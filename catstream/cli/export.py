@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from catstream.sinks.destinations import Head
 from catstream.sinks.exports import EXPORTS
 from catstream.sinks.track_log import Log, logs_of
 from catstream.video.source import VIDEOS, open_source
-from catstream.video.writer import is_annotated
 
 
 def _printable(_: click.Context, __: click.Parameter, text: str) -> str:
@@ -42,11 +40,7 @@ def _classes(context: click.Context, parameter: click.Parameter, text: str) -> l
 @click.argument("log", type=PATH)
 @click.argument("dest", type=PATH)
 @click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="Format of DEST; required for a folder.")
-@click.option(
-    "--size",
-    metavar="WIDTHxHEIGHT|SOURCE",
-    help="Frame size, or the video or folder that was tracked, if LOG does not state it (CSV) or it was moved.",
-)
+@click.option("--source", help="Tracked video or folder, if LOG does not state it (CSV) or it was moved.")
 @click.option(
     "--label",
     default="",
@@ -68,7 +62,7 @@ def export(
     log: Path,
     dest: Path,
     name: str | None,
-    size: str | None,
+    source: str | None,
     label: str,
     classes: list[str],
     images: bool,
@@ -110,45 +104,33 @@ def export(
     for content in logs:
         path = content.path
         about = About(path.stem, content.head() or Head(), label=label, classes=classes, is_first=content is logs[0])
-        about = _with_source(about, path, size, required=images, useful=form.images)
-        last = max(frame.tracks[0].source_frame for frame in content)
-        if about.frames is not None and last >= about.frames:  # of a long video, the number is an estimate
-            has = f"but {size or about.head.source} has {counted(about.frames, 'frame')}"
-            click.echo(f"warning: {path} has frame {last}, {has}: pass --size SOURCE if it is another one", err=True)
+        about = _with_source(about, path, source, required=images, useful=form.images)
         if note := exports.export(content, dest, form, about):
             click.echo(note, err=True)
         if content.damaged:
             click.echo(f"{counted(content.damaged, 'damaged line')} of {path} skipped", err=True)
 
 
-def _with_source(about: About, log: Path, size: str | None, *, required: bool, useful: bool) -> About:
+def _with_source(about: About, log: Path, given: str | None, *, required: bool, useful: bool) -> About:
     """Add what the source tells: the size of the frames, their number, and its images.
 
+    given     path of the source; None for the source that the log states
     required  whether the images are written
     useful    whether the format refers to them
     """
-    source, frame_size = about.head.source, about.head.size
-    if stated := re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", size or ""):
-        frame_size = (int(stated[1]), int(stated[2]))
-    elif size is not None:
-        source = size
-        if is_annotated(source):
-            raise VideoError(
-                f"{size} is an annotated video, which is higher than its frames: pass the source of the run"
-            )
+    source, size = given or about.head.source, about.head.size
     if required and (not source or is_live(source)):
-        raise VideoError(f"{log} names no source with images: pass --size SOURCE, or omit --images")
-    if source == size or (useful and source and not is_live(source)):
+        raise VideoError(f"{log} names no source with images: pass --source, or omit --images")
+    if given or (useful and source and not is_live(source)):
         try:
             with open_source(source) as opened:
-                frame_size = opened.size if source == size else frame_size
+                if given and size not in (None, opened.size):
+                    raise VideoError(f"{log} has frames of {size}, not {opened.size} as {given}: pass another --source")
+                size = size or opened.size
                 about = replace(about, frames=opened.frames, images=opened.images, source=source if required else "")
         except VideoError as error:
-            if source == size:
+            if given:
                 raise
             if required or Path(source).suffix.lower() not in VIDEOS:  # the images of a folder have names
-                raise VideoError(f"{error} (if it was moved, pass --size SOURCE)") from None
-    if about.head.size is not None and frame_size != about.head.size:
-        width, height = about.head.size
-        raise VideoError(f"--size {size} contradicts {log}, whose frames are {width}x{height}: omit --size")
-    return replace(about, size=frame_size)
+                raise VideoError(f"{error} (if it was moved, pass --source)") from None
+    return replace(about, size=size)

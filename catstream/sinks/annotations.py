@@ -256,5 +256,5 @@ def _image(about: About, frame: int) -> str:
         return f"{about.name}_{frame:06d}.jpg"
     if frame >= len(about.images):
         count = counted(len(about.images), "image")
-        raise VideoError(f"the log has frame {frame}, but its folder has {count}: pass --size SOURCE with another one")
+        raise VideoError(f"the log has frame {frame}, but its folder has {count}: pass another one (--source)")
     return about.images[frame].name

@@ -106,8 +106,7 @@ def export(frames: Iterable[TrackedFrame], path: Path, form: Format, about: Abou
     """
     if form.sized and about.size is None:
         raise VideoError(
-            f"unknown size of the frames, required for {path}: pass --size WIDTHxHEIGHT, or --size SOURCE with the "
-            "video or folder that was tracked"
+            f"unknown size of the frames, required for {path}: pass the video or folder that was tracked (--source)"
         )
     with writing(path, VideoError):
         if not form.suffix:

@@ -11,7 +11,7 @@ from catstream.sinks.destinations import Head, Origin, Sink, TrackedFrame
 from catstream.video.drawing import Colours, draw, drawn_size, preview_image
 from catstream.video.frames import RATE
 from catstream.video.source import open_source
-from catstream.video.writer import ANNOTATED, VideoWriter
+from catstream.video.writer import VideoWriter
 
 _BACKLOG = 256  # frames whose tracks wait for their picture
 
@@ -32,7 +32,7 @@ class SourceVideo:
         try:
             aspect = self._frames.pixel_aspect
             size, rate = drawn_size(self._frames.size), self._frames.rate
-            self._video = VideoWriter(place, rate, size, pixel_aspect=aspect, comment=ANNOTATED)
+            self._video = VideoWriter(place, rate, size, pixel_aspect=aspect)
         except VideoError:
             self._frames.close()
             raise
@@ -75,7 +75,7 @@ class PictureVideo:
         if image is not None:
             self._colours.keep(track.object for track in tracks)
             size = (image.shape[1], image.shape[0])
-            self._video = self._video or VideoWriter(self._place, RATE, size, comment=ANNOTATED)
+            self._video = self._video or VideoWriter(self._place, RATE, size)
             self._video.write(image, tracks[0].time)
 
     def close(self) -> None:

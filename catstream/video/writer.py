@@ -26,18 +26,6 @@ _LARGE_PIXELS = 1920 * 1200
 #: Fragments of a second, which `close` turns into a regular MP4 with one index.
 _OPTIONS = {"movflags": "hybrid_fragmented", "frag_duration": "1000000", "flush_packets": "1"}
 
-#: Comment in a video of drawn tracks, which has a line of text below each frame.
-ANNOTATED = "annotated by catstream"
-
-
-def is_annotated(path: str) -> bool:
-    """Return True if a file is a video of drawn tracks."""
-    import av
-
-    with contextlib.suppress(av.FFmpegError, OSError), av.open(path) as video:
-        return video.metadata.get("comment") == ANNOTATED
-    return False
-
 
 class Encoder:
     """Encodes images as H.264 without delay: each image results in one packet, which refers to the one before it.
@@ -110,7 +98,6 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
     path : file, which is replaced
     rate : average of frames per second
     size : width and height of the images in pixels
-    comment : stored in the file
 
     VideoError, also from the constructor, if the file cannot be written.
     """
@@ -122,7 +109,6 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         size: tuple[int, int],
         *,
         pixel_aspect: Fraction = Fraction(1),
-        comment: str = "",
     ) -> None:
         import av
 
@@ -130,7 +116,6 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         with self._reporting_errors():
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._container: Any = av.open(str(self._path), "w", format="mp4", container_options=_OPTIONS)
-            self._container.metadata["comment"] = comment
             self._encoder = Encoder(size, rate, self._container, pixel_aspect=pixel_aspect)
             # FFmpeg opens the file once more, for the first image.
             self._lock = open_locked(self._path, VideoError, mode="ab")

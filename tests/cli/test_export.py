@@ -13,13 +13,12 @@ def test_other_formats_are_made_from_the_log_of_a_run(whole_run, video, succeed,
     succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.sqlite")
     with closing(sqlite3.connect(tmp_path / "t.sqlite")) as database:
         assert [frame for (frame,) in database.execute("SELECT frame FROM tracks")] == list(range(32))
-    for size in ("320x240", video[0]):
-        succeed("export", log, tmp_path / "t.json", "--size", size, "--label", "person", "--overwrite")
-        coco = json.loads((tmp_path / "t.json").read_text())
-        assert [each["name"] for each in coco["categories"]] == ["person"]
-        assert (len(coco["images"]), coco["images"][0]["width"]) == (32, 320)
-    assert "pass --size" in fail("export", log, tmp_path / "t.xml")
-    assert "there is no video or folder" in fail("export", log, tmp_path / "t.xml", "--size", tmp_path / "none.mp4")
+    succeed("export", log, tmp_path / "t.json", "--source", video[0], "--label", "person")
+    coco = json.loads((tmp_path / "t.json").read_text())
+    assert [each["name"] for each in coco["categories"]] == ["person"]
+    assert (len(coco["images"]), coco["images"][0]["width"]) == (32, 320)
+    assert "(--source)" in fail("export", log, tmp_path / "t.xml")
+    assert "there is no video or folder" in fail("export", log, tmp_path / "t.xml", "--source", tmp_path / "none.mp4")
     assert "t.sqlite exists already: replace it with --overwrite" in fail("export", log, tmp_path / "t.sqlite")
 
 
@@ -55,7 +54,6 @@ def test_the_labels_of_a_data_set_are_replaced_only_on_request(whole_run, succee
         (["--label", "a\x01b"], "expected printable characters"),
         (["--format", "mot", "--classes", "a"], "--classes requires a format with classes"),
         (["--images"], "--images requires --format yolo"),
-        (["--size", "320x200"], "whose frames are 320x240: omit --size"),
     ],
 )
 def test_options_of_an_export_that_contradict_each_other_are_an_error(whole_run, fail, tmp_path, options, words):
@@ -70,13 +68,6 @@ def test_the_images_of_a_data_set_are_those_of_the_tracked_frames(whole_run, suc
     assert (len(images), cv2.imread(str(images[0])).shape) == (32, (240, 320, 3))
 
 
-def test_an_annotated_video_is_refused_as_the_source_of_the_size(whole_run, fail, tmp_path):
-    log = whole_run / "out" / "demo.csv"
-    error = fail("export", log, tmp_path / "t.json", "--size", whole_run / "out" / "demo.mp4")
-    assert "is an annotated video, which is higher than its frames: pass the source" in error
-
-
-def test_a_log_that_is_longer_than_its_video_gives_a_warning(whole_run, demo_video, succeed, tmp_path):
-    video, _ = demo_video(12)
-    _, errors = succeed("export", whole_run / "out" / "demo.ndjson", tmp_path / "t.xml", "--size", video)
-    assert f"demo.ndjson has frame 31, but {video} has 12 frames" in errors
+def test_a_source_with_frames_of_another_size_is_an_error(whole_run, fail, tmp_path):
+    log, annotated = whole_run / "out" / "demo.ndjson", whole_run / "out" / "demo.mp4"
+    assert "has frames of (320, 240), not" in fail("export", log, tmp_path / "t.json", "--source", annotated)

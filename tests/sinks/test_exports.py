@@ -131,7 +131,7 @@ def test_via_has_a_row_for_each_box_as_movement_reads_it(tmp_path):
 
 @pytest.mark.parametrize(("name", "kind"), [("t.json", None), ("t.xml", None), ("folder", "yolo")])
 def test_a_format_that_needs_the_size_of_a_frame_asks_for_it(tmp_path, name, kind):
-    with pytest.raises(VideoError, match="pass --size WIDTHxHEIGHT"):
+    with pytest.raises(VideoError, match="pass the video or folder"):
         made(tmp_path / name, kind)
     assert not [*tmp_path.iterdir()]
 
