@@ -143,7 +143,7 @@ def _watch(console: Console, fleet: Fleet) -> None:
                 time.sleep(_SHOW_SECONDS)
                 status = fleet.status()
     except FleetError:
-        if fleet.is_running:
+        if not fleet.is_owner or fleet.is_running:
             raise
         click.echo(f"the fleet {fleet.name} was ended from elsewhere")
     finally:

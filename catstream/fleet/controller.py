@@ -10,6 +10,7 @@ change that waits for it. What is answered as done is stored.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from catstream.base.addresses import is_live, without_password
+from catstream.base.workers import die_with
 from catstream.errors import CatstreamError
 from catstream.fleet.actor import Stream
 from catstream.fleet.registry import RegistryServer
@@ -51,6 +53,7 @@ class StreamActor(Stream):
     def __init__(self, spec: StreamSpec, clients: dict[str, Client] | None, store: str, every: float) -> None:
         import ray
 
+        die_with(os.getppid())  # Ray's raylet, without which nothing watches the stream
         node = ray.get_runtime_context().get_node_id()
         address = "" if clients is None else ray.util.get_node_ip_address()
         super().__init__(spec, node, address, clients or {}, store, every)
@@ -92,6 +95,7 @@ class Controller:
     """
 
     def __init__(self, name: str, store: str, listen: str, keys: str) -> None:
+        die_with(os.getppid())  # Ray's raylet: an orphan would keep the address of the registry
         self._name, self._listen, self._store = name, listen, Store(store)
         self._keys = Path(keys).expanduser() if keys else None
         self._spec = FleetSpec(name, store)

@@ -16,6 +16,7 @@ A fleet on this machine has a folder, `~/.local/state/catstream/fleets/NAME`:
     address   of that node, once it has started
     token     of Ray, so that no other user of this machine can run code there
     store/    states of the streams, if the file of the fleet names no other store
+    logs/     of Ray and the streams, once the fleet has ended
     keys/     keys of the clients of a fleet on a cluster, on the machine of the registry
 """
 
@@ -24,6 +25,7 @@ from __future__ import annotations
 import logging
 import os
 import secrets
+import shutil
 import signal
 import socket
 import sys
@@ -35,6 +37,8 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from catstream.base.files import is_locked, lock, state_home, write_atomically
 from catstream.client.registry import REGISTRY_PORT
@@ -54,11 +58,13 @@ _LOOK_SECONDS = 0.2  # between two looks at any of these
 _STORE_BYTES = 80 << 20  # of Ray's object store: only saved models go through it
 
 #: Of a node that `up` starts. Ray listens on 127.0.0.1 alone only if it takes the machine for one without a cluster,
-#: and lowers the priority of its workers by default, so that streams starve beside other work.
+#: and lowers the priority of its workers by default, so that streams starve beside other work. It records the tasks for
+#: `ray list`, and at the end waits seconds for a dead head to take the last of these records.
 _VARIABLES = {
     "RAY_AUTH_MODE": "token",
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_task_events_report_interval_ms": "0",
     "RAY_worker_niceness": "0",
 }
 
@@ -97,6 +103,7 @@ class Fleet(AbstractContextManager["Fleet"]):
             folders = sorted((state_home() / "fleets").glob("*"))
             self.name = _only([folder.name for folder in folders if _is_up(folder)], "this machine")
         self._owned: ExitStack | None = None  # the node of Ray that `up` has started
+        self._node: dict[str, psutil.Process] = {}  # its processes: without one of them, nothing watches the streams
         self._controller: Any = None
 
     @property
@@ -205,6 +212,7 @@ class Fleet(AbstractContextManager["Fleet"]):
             if not (self._folder / "token").exists():
                 write_atomically(self._folder / "token", secrets.token_hex(32).encode(), mode=0o600)
             files = stack.enter_context(private_folder())
+            stack.callback(self._keep_logs, files)
             stack.callback(_disconnect)
             self._init(
                 _node_ip_address="127.0.0.1",
@@ -214,11 +222,33 @@ class Fleet(AbstractContextManager["Fleet"]):
             )
             stack.callback((self._folder / "address").unlink, missing_ok=True)
             write_atomically(self._folder / "address", _gcs_address().encode(), mode=0o600)
+            children = {child.name(): child for child in psutil.Process().children()}
+            self._node = {name: children[name] for name in ("gcs_server", "raylet")}
             self._owned = stack.pop_all()
+
+    def _check_node(self) -> None:
+        """End the node of Ray that `up` has started, and raise FleetError, if one of its processes has died."""
+        for name, process in self._node.items():
+            with suppress(psutil.TimeoutExpired):
+                status = process.wait(0)
+                for each in self._node.values():  # a raylet without its head would run on for a minute
+                    _kill(each)
+                self._end_ray()
+                raise FleetError(
+                    f"the fleet {self.name} has ended, because Ray's {name} has died (exit status {status}): start it "
+                    f"again; its logs are in {self._folder / 'logs'}"
+                )
+
+    def _keep_logs(self, files: Path) -> None:
+        """Move the logs of Ray and the streams out of the temporary folder of a node."""
+        shutil.rmtree(self._folder / "logs", ignore_errors=True)
+        with suppress(OSError):
+            shutil.move(files / "session_latest" / "logs", self._folder / "logs")
 
     def _connect(self) -> None:
         """Connect this process to the cluster, if it is not connected yet."""
         if self._owned is not None:
+            self._check_node()
             return
         address = self._address
         if not address:
@@ -272,7 +302,7 @@ class Fleet(AbstractContextManager["Fleet"]):
 
     def _end_ray(self) -> None:
         """Disconnect, and end the node that this object has started."""
-        self._controller, owned, self._owned = None, self._owned, None
+        self._controller, self._node, owned, self._owned = None, {}, self._owned, None
         if owned is not None:
             owned.close()
         else:
@@ -322,7 +352,11 @@ class Fleet(AbstractContextManager["Fleet"]):
                     f"there is no fleet {self.name!r} on this cluster: start it with catstream fleet up"
                 ) from None
         try:
-            return ray.get(getattr(self._controller, method).remote(*arguments), timeout=ANSWER_SECONDS)
+            answer = getattr(self._controller, method).remote(*arguments)
+            deadline = time.monotonic() + ANSWER_SECONDS
+            while not ray.wait([answer], timeout=_LOOK_SECONDS)[0] and time.monotonic() < deadline:
+                self._check_node()
+            return ray.get(answer, timeout=0)
         except RayTaskError as error:
             if isinstance(error.cause, CatstreamError):
                 raise error.cause from None
@@ -330,7 +364,8 @@ class Fleet(AbstractContextManager["Fleet"]):
         except (RayError, GetTimeoutError) as error:
             self._controller = None
             what = str(error).partition("\n")[0] or type(error).__name__
-        raise FleetError(f"the controller of fleet {self.name} failed ({what}): see its log in Ray's log folder")
+        logs = "Ray's log folder" if self._address else f"{self._folder / 'logs'} once the fleet has ended"
+        raise FleetError(f"the controller of fleet {self.name} failed ({what}): see its log in {logs}")
 
 
 def _gcs_address() -> str:
@@ -338,6 +373,14 @@ def _gcs_address() -> str:
     import ray
 
     return str(ray.get_runtime_context().gcs_address)
+
+
+def _kill(process: psutil.Process) -> None:
+    """Kill a process and all that it has started."""
+    with suppress(psutil.NoSuchProcess):
+        for each in (process, *process.children(recursive=True)):
+            with suppress(psutil.NoSuchProcess):
+                each.kill()
 
 
 def _disconnect() -> None:

@@ -111,6 +111,7 @@ def ray(monkeypatch):
     fake.nodes = [facts | {"NodeName": f"n{number}", "NodeID": str(number)} for number in (1, 2)]
     monkeypatch.setattr(module, "nodes", lambda: list(fake.nodes))
     monkeypatch.setattr(module, "_TURN_SECONDS", 1e6)  # a test calls each turn
+    monkeypatch.setattr(module, "die_with", lambda _: None)
     return fake
 
 

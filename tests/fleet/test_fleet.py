@@ -46,6 +46,13 @@ def listening(process):
     return set()
 
 
+def has_ended(process):
+    """Whether a process has ended; an orphan remains a zombie if the first process of a container does not reap it."""
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
+
+
 # On this machine alone, in processes of their own: a process uses one cluster.
 
 
@@ -59,7 +66,8 @@ def file(tmp_path):
 def local(file, until, *options):
     """`catstream fleet up` in the foreground, once the stream runs."""
     words, name = command("fleet", "up", file, *options), options[-1] if options else "local"
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as up:
+    both = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(words, **both, text=True, start_new_session=True) as up:
         try:
             until(lambda: up.poll() is not None or name in fleets())
             with Registry(name, timeout=150) as registry:
@@ -108,6 +116,19 @@ def test_sigterm_ends_a_local_fleet_as_ctrl_c_does(file, home, until):
         processes = psutil.Process(up.pid).children(recursive=True)
         up.terminate()  # as systemd does; Ray has a handler of its own
         check_ended(up, processes, home)
+
+
+@pytest.mark.usefixtures("home")
+@pytest.mark.parametrize("victim", ["raylet", "gcs_server"])
+def test_a_local_fleet_ends_with_its_streams_and_keeps_its_logs_if_ray_dies(file, home, until, victim):
+    with local(file, until) as up:
+        processes = psutil.Process(up.pid).children(recursive=True)
+        next(each for each in processes if each.name() == victim).kill()
+        said = up.communicate(timeout=120)[1]
+        assert up.returncode == 1
+        assert f"the fleet local has ended, because Ray's {victim} has died (exit status -9): start it again" in said
+        until(lambda: all(map(has_ended, processes)))  # no orphan writes beside the next start
+        assert (home / "local" / "logs" / f"{victim}.out").exists()
 
 
 @pytest.mark.usefixtures("home")
