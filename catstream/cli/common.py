@@ -148,7 +148,7 @@ def _with_file(name: str, suffix: str, help: str) -> Callable[[Callable[..., Any
 
 
 with_json_file = _with_file("json", ".json", "File for all figures.")
-with_report_file = _with_file("report", ".html", "HTML file for a table with plots.")
+with_report_file = _with_file("report", ".html", "HTML file for a report.")
 
 
 def write_json(file: Path | None, figures: dict[str, object]) -> None:

@@ -10,10 +10,20 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.progress import BarColumn
 
-from catstream.base.files import writing
 from catstream.base.text import counted
-from catstream.cli.common import complain, line_of, messages, screen, stopped, table, text, with_json_file, write_json
-from catstream.cli.options import FOLDER, NumberRange, with_settings
+from catstream.cli.common import (
+    complain,
+    line_of,
+    messages,
+    screen,
+    stopped,
+    table,
+    text,
+    with_json_file,
+    with_report_file,
+    write_json,
+)
+from catstream.cli.options import NumberRange, with_settings
 
 if TYPE_CHECKING:
     from catstream.loadtest.result import Limit, Result
@@ -50,13 +60,13 @@ def _size(_: click.Context, __: click.Parameter, text: str) -> tuple[int, int]:
 @click.option("--find-streams", is_flag=True, help="Search for the highest number of streams that meets the limits.")
 @click.option("--limit", "limits", multiple=True, metavar="NAME=VALUE", help="Limit to meet, see above; repeatable.")
 @with_json_file
-@click.option("--output", type=FOLDER, help="Output folder for report.html.")
+@with_report_file
 @with_settings
 def loadtest(
     find_streams: bool,
     limits: tuple[str, ...],
     json_file: Path | None,
-    output: Path | None,
+    report_file: Path | None,
     **plan: Any,
 ) -> None:
     """Measure latency and dropped frames of pipelines under load.
@@ -84,7 +94,7 @@ def loadtest(
     EXAMPLES
       catstream loadtest --rate 30 --limit p99=0.1
       catstream loadtest --objects 8 --limit skipped=0.01
-      catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --output load
+      catstream loadtest --streams 4 --subscribers 50 --slow-subscribers 5 --report load.html
       catstream loadtest --find-streams --rate 25 --size 1920x1080
     """
     from catstream.loadtest.load_report import answer, milliseconds, to_json, write_report
@@ -93,9 +103,6 @@ def loadtest(
 
     parsed = [Limit.parse(text) for text in limits or (_SEARCH_LIMITS if find_streams else ())]
     parameters = Plan(**plan)
-    if output is not None:
-        with writing(output):
-            output.mkdir(parents=True, exist_ok=True)
     with line_of(
         messages(), text("{task.description}"), BarColumn(24), text("{task.fields[figures]}", last=True)
     ) as progress:
@@ -121,8 +128,8 @@ def loadtest(
             click.echo(f"{answer(load_test)}.")
         _print_run(load_test.result, parsed)
         write_json(json_file, to_json(load_test))
-        if output is not None:
-            click.echo(f"report: {write_report(output / 'report.html', load_test)}")
+        if report_file is not None:
+            click.echo(f"report: {write_report(report_file, load_test)}")
     if load_test.interrupted:
         stopped("these are the results so far" if load_test.results else "there are no measurements yet")
     for line in load_test.violations:

@@ -9,7 +9,9 @@ import pytest
 def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     arguments = ["--rate", 20, "--duration", 3, "--size", "320x240", "--subscribers", 3, "--slow-subscribers", 2]
     limits = ["--limit", "max=0", "--limit", "missed=1"]
-    code, output, errors = said("loadtest", *arguments, *limits, "--output", "load", "--json", "x.json", cwd=tmp_path)
+    code, output, errors = said(
+        "loadtest", *arguments, *limits, "--report", "load.html", "--json", "x.json", cwd=tmp_path
+    )
     assert code == 1
     broken = r"catstream: limit exceeded: max is .*, limit at most 0 ms \(from a frame to its track\)"
     assert re.fullmatch(broken, errors.splitlines()[-1])
@@ -28,7 +30,7 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     assert {"detector 0", "compressor 0", "trainer 0", "camera", "subscribers"} <= set(figures["processes"])
     assert figures["processes"]["detector 0"]["cores"] > 0
 
-    page = (tmp_path / "load" / "report.html").read_text()
+    page = (tmp_path / "load.html").read_text()
     assert "<h2>Streams</h2>" in page
     assert not re.search(r"(src|href)=|<script|@import|url\(|nan", page)
 
@@ -38,7 +40,7 @@ def test_run_counts_every_frame_and_prints_the_violated_limit(said, tmp_path):
     [
         (["--size", "640"], "a size is WIDTHxHEIGHT"),
         (["--limit", "p98=1"], "a limit is NAME=VALUE with one of p50"),
-        (["--output", "/dev/null/load"], "use another folder"),
+        (["--report", "/dev/null/load.html"], "cannot write"),
         (["--set", "run.lockstep=true"], "omit run.lockstep"),
     ],
 )
