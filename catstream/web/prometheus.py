@@ -53,6 +53,7 @@ _HELP = {
     "reconnects": "Reconnections to a live source.",
     "damaged": "Frames of a file that could not be decoded.",
     "scaled": "Frames with another size than the first one.",
+    "truncated": "Seconds that are missing at the end of the file.",
     "rejected": "Invalid messages that were dropped.",
     "model_version": "Version of the newest model; the trainer numbers models from 1.",
     "objects": "Number of objects.",
