@@ -443,7 +443,7 @@ class End(_Numbered):
     reason  why the stream ended
     failed  whether it ended with an error
     totals  final counters: `sent` and `stored` features messages, `damaged`, `scaled` and `skipped` frames,
-            `reconnects` of a live source
+            `truncated` seconds of a file, `reconnects` of a live source
     """
 
     frame: Integer
