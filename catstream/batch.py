@@ -166,18 +166,22 @@ class Batch:
 
         If a process is killed, for example because memory is exhausted, the remaining videos are tracked one by one.
         """
-        tasks = [(number, self.videos[number], self._output, settings) for number in self.missing]
         try:
-            for number, row in run_tasks(_numbered, tasks, jobs):
-                yield self._add(number, row)
-        except ServiceError as error:
+            yield from self._track(self.missing, settings, jobs)
+        except ServiceError:
             for number in self.missing:
                 video = self.videos[number]
                 try:
-                    ((_, row),) = run_tasks(_numbered, [(number, video, self._output, settings)], 1)
-                except ServiceError:
-                    row = Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
-                yield self._add(number, row)
+                    yield from self._track([number], settings, 1)
+                except ServiceError as error:
+                    yield self._add(
+                        number, Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
+                    )
+
+    def _track(self, numbers: Iterable[int], settings: Settings, jobs: int) -> Iterator[Video]:
+        tasks = [(number, self.videos[number], self._output, settings) for number in numbers]
+        for number, row in run_tasks(_track_numbered, tasks, jobs):
+            yield self._add(number, row)
 
     def _add(self, number: int, row: Summary) -> Video:
         self.rows[number] = row
@@ -189,7 +193,7 @@ class Batch:
         write_csv(self._table, names, (astuple(row) for row in self.rows if row is not None), VideoError)
 
 
-def _numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
+def _track_numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
     return number, track_video(video, output, settings)
 
 

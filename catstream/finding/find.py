@@ -10,7 +10,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from catstream.base.box import Box
 from catstream.base.threads import cores
@@ -19,8 +18,6 @@ from catstream.finding.files import File, NamedFrame, find_files
 from catstream.finding.scan import THRESHOLD, Match, Scan
 from catstream.jobs.saved_model import SavedModel
 from catstream.video.frames import Frame
-
-_One = TypeVar("_One", bound=str | os.PathLike[str] | SavedModel)
 
 #: Seconds of a video between two frames that are searched.
 EVERY = 0.2
@@ -124,8 +121,9 @@ def find(
     >>> for detection in find("dahlia.safetensors", "holiday/"):  # doctest: +SKIP
     ...     print(detection.file, detection.time, detection.box, detection.score)
     """
-    search = Search(load_models(_several(models)), threshold, every)
-    return _detections(search, find_files(_several(paths)))
+    models = [models] if isinstance(models, str | os.PathLike | SavedModel) else models
+    paths = [paths] if isinstance(paths, str | os.PathLike) else paths
+    return _detections(Search(load_models(models), threshold, every), find_files(paths))
 
 
 def load_models(models: Iterable[str | os.PathLike[str] | SavedModel]) -> dict[str, SavedModel]:
@@ -152,11 +150,6 @@ def _detections(search: Search, files: list[File]) -> Iterator[Detection]:
             problems.append(str(error))
     if problems:
         raise VideoError(problems[0])
-
-
-def _several(values: _One | Iterable[_One]) -> Iterable[_One]:
-    """One value or several, as several."""
-    return [values] if isinstance(values, str | os.PathLike | SavedModel) else values
 
 
 def _scanned(scan: Scan, frames: Iterator[NamedFrame]) -> Generator[tuple[NamedFrame, list[list[Match]]]]:

@@ -10,7 +10,6 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -59,10 +58,6 @@ class _Template:
     window: Window
     settings: Settings
 
-    @classmethod
-    def of(cls, saved: SavedModel) -> Self:
-        return cls(saved.model, saved.similarity(), Window.around(saved.box), saved.settings)
-
     def match(self, scores: ScoreMap, row: int, column: int, window: Window) -> Match:
         """The match of a window whose features are at (row, column) of a map of appearance scores."""
         score = min(1.0, float(scores.scores[row, column])) * self.similarity(scores.cells.row(row, column))
@@ -80,7 +75,9 @@ class Scan:
 
     def __init__(self, models: Iterable[SavedModel], threshold: float = THRESHOLD) -> None:
         self._threshold = threshold
-        self._templates = [_Template.of(saved) for saved in models]
+        self._templates = [
+            _Template(saved.model, saved.similarity(), Window.around(saved.box), saved.settings) for saved in models
+        ]
         self._grid: dict[tuple[int, int], list[int]] = defaultdict(list)  # entry -> numbers of the models
         for number, template in enumerate(self._templates):
             for entry in _entries(template.window):
