@@ -18,7 +18,7 @@ from catstream.cli import progress as progress_module
 from catstream.cli.progress import RunProgress
 from catstream.jobs.saved_model import SavedModel
 from catstream.pipeline import Pipeline
-from catstream.sinks.track_log import LineSink, Log
+from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
 FILES = ["demo.csv", "demo.mp4", "demo.ndjson"]
@@ -183,20 +183,6 @@ def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video,
     assert "saved model:" not in errors
     assert "nothing was learned" in errors
     assert errors.endswith(f"stopped: the results so far are kept; not saved: {tmp_path / 'model'}\n")
-
-
-def test_the_files_of_an_interrupted_run_are_closed_after_its_processes(video, said, monkeypatch, tmp_path):
-    tracking, close = [], LineSink.close
-
-    def closed(sink):
-        tracking.extend(running())
-        close(sink)
-
-    monkeypatch.setattr(RunProgress, "count", lambda *_: signal.raise_signal(signal.SIGINT))
-    monkeypatch.setattr(LineSink, "close", closed)
-    source, box = video
-    code, _, errors = said("track", source, "--box", box, "--write", tmp_path / "t.ndjson")
-    assert (code, tracking) == (130, []), errors
 
 
 def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(video, said, succeed, tmp_path):
