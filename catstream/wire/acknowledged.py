@@ -93,8 +93,6 @@ class Sender(ChannelSocket[Message]):
             position = self._decode(self._socket.recv(), Position)
             if position is not None and self.window.receive(position, monotonic()):
                 self._replied(self.window.processed, dict(position.versions))
-            elif position is not None:
-                self._reject("acknowledgement", "an acknowledgement was dropped: it is older than the last one")
             seconds = 0.0
         if self.window.must_ask(monotonic()):
             self._ask(b"")
@@ -163,9 +161,7 @@ class Receiver(ChannelSocket[Message]):
         delivered, reply = self.window.receive(peer, message.seq, monotonic(), last=last, size=len(data))
         if reply is not None:
             self._reply(peer, reply)
-        if (
-            not delivered and message.seq > self.window.processed + self._size + 1
-        ):  # more than a sender may have in flight
+        if message.seq > self.window.processed + self._size + 1:  # more than a sender may have in flight
             self._reject("sequence", f"message {message.seq} came after {self.window.processed}")
         return message if delivered else None
 

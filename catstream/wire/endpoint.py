@@ -21,8 +21,8 @@ from catstream.wire.keys import Keys
 
 _MAX_PATH_BYTES = 107  # of the name of a Unix socket, as the kernel limits it
 _TCP = re.compile(r"tcp://(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,252}|\[[^\[\]]+\]):([0-9]{1,5})")
-#: HOST:PORT, perhaps with a part of the prefix, which is no folder unless there is one.
-_NO_FOLDER = re.compile(r"(?:tcp:/*|//)?(?P<host>[A-Za-z0-9_.*-]*|\[[^\[\]/]+\]):(?P<port>[0-9]{1,5})/?")
+#: An address without its prefix, or another protocol: no folder, unless there is one of this name.
+_NO_FOLDER = re.compile(r".*://.*|.*:[0-9]{1,5}/?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +63,8 @@ class Endpoint:
         if text.startswith("tcp://"):
             return cls._tcp(text, loaded)
         folder = Path(text)
-        if (meant := _NO_FOLDER.fullmatch(text)) is not None and not folder.exists():
-            address = f"tcp://{meant['host'] or '127.0.0.1'}:{meant['port']}"
-            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT (got {text!r}): did you mean {address}?")
-        if "://" in text:
-            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT (got {text!r})")
+        if _NO_FOLDER.fullmatch(text) and not folder.exists():
+            raise ServiceError(f"an endpoint is a folder or tcp://HOST:PORT, got {text!r}")
         if folder.exists() and not folder.is_dir():
             raise ServiceError(f"an endpoint is a folder, and {text!r} is a file: pass a folder")
         if is_too_long(folder):

@@ -85,11 +85,9 @@ class Publisher(ChannelSocket[Message]):
             if not arrives(self._socket, 0):
                 break
             joined |= self._process(self._socket.recv())
-        if self._last and (joined or monotonic() >= self._repeat_at):
-            self._repeat()
-
-    def _repeat(self) -> None:
-        """Send as many of the last messages again as half the queue of a subscriber holds, and put them at the back."""
+        if not self._last or not (joined or monotonic() >= self._repeat_at):
+            return
+        # As many of the last messages as half the queue of a subscriber holds; they are put at the back.
         topics = list(self._last)[: max(1, self.channel.high_water_mark // 2)]
         for topic in topics:
             self._last[topic] = data = self._last.pop(topic)

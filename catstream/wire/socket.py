@@ -81,14 +81,12 @@ def _too_many(error: zmq.ZMQError) -> ServiceError:
     )
 
 
-def _remedy(error: zmq.ZMQError) -> str:
-    """The advice if a socket cannot listen."""
-    causes = {
-        errno.EADDRINUSE: "another pipeline may be running there: wait for it, or ",
-        errno.ENOENT: "the folder does not exist: create it, or ",
-        errno.EACCES: "this user may not write there: change the permissions, or ",
-    }
-    return f"{causes.get(error.errno or 0, '')}choose another endpoint (--set run.endpoint=...)"
+#: The advice if a socket cannot listen, by the error.
+_REMEDIES = {
+    errno.EADDRINUSE: "another pipeline may be running there: wait for it, or ",
+    errno.ENOENT: "the folder does not exist: create it, or ",
+    errno.EACCES: "this user may not write there: change the permissions, or ",
+}
 
 
 @atexit.register
@@ -183,7 +181,8 @@ class ChannelSocket(Generic[Message]):
         except zmq.ZMQError as error:
             self.close()
             why = zmq.strerror(error.errno or 0)  # `error.strerror` repeats the address
-            raise ServiceError(f"cannot listen on {address} ({why}): {_remedy(error)}") from None
+            remedy = f"{_REMEDIES.get(error.errno or 0, '')}choose another endpoint (--set run.endpoint=...)"
+            raise ServiceError(f"cannot listen on {address} ({why}): {remedy}") from None
         except ServiceError:
             self.close()
             raise
