@@ -136,6 +136,11 @@ def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Vide
     return videos
 
 
+def read_videos(table: Path) -> list[Video]:
+    """The videos of a table, with the errors of `read_boxes` and `videos_of`."""
+    return videos_of(table, read_boxes(table))
+
+
 def check_results(videos: Iterable[Video], output: Path) -> None:
     """Raise VideoError if a file of the results of a video exists in a folder without batch.csv."""
     if not (output / SUMMARIES).exists():  # otherwise, all files there are of this batch

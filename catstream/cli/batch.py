@@ -75,13 +75,13 @@ def batch(
       catstream export out dataset --format yolo
     """
     with INTERRUPTS.leaving():
-        from catstream.batch import Batch, check_results, read_boxes, videos_of
+        from catstream.batch import Batch, check_results, read_videos
 
     if not files or (len(files) > 1 and not ask):
         raise click.UsageError("expected one file BOXES, or videos after --ask")
     settings = Settings.from_values(overrides)
     boxes = _draw_boxes(files, output, settings, listen, token, overwrite=overwrite) if ask else files[0]
-    videos = videos_of(boxes, read_boxes(boxes))
+    videos = read_videos(boxes)
     if not videos:
         raise VideoError(f"{boxes} has no box: add a row for each object")
     if not overwrite:
