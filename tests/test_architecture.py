@@ -32,7 +32,7 @@ IMPORTERS = {
     "msgpack": "wire/codec.py",
     "msgspec": "",
     "threadpoolctl": "base/threads.py",
-    "psutil": "loadtest/latency.py",
+    "psutil": "fleet/fleet.py loadtest/latency.py",
     "jinja2": "reports/report.py",
     "click": "cli",
     "starlette": "web",

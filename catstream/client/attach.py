@@ -17,7 +17,7 @@ from typing import Any
 
 from catstream.client.address import Address
 from catstream.client.control import ANSWER_SECONDS, Control
-from catstream.client.following import StreamControl, StreamSubscription
+from catstream.client.following import StreamSubscription
 from catstream.client.subscription import Subscription
 from catstream.errors import ServiceError
 from catstream.wire.endpoint import Endpoint
@@ -84,8 +84,8 @@ def control(
     Parameters
     ----------
     address : str, path or Address
-        Endpoint of the pipeline, or address of a stream of a fleet, as for `catstream.subscribe`: each command goes
-        where the stream runs then.
+        Endpoint of the pipeline, or address of a stream of a fleet, as for `catstream.subscribe`. Connect again if the
+        stream has moved.
     timeout : float
         Seconds to wait for the answer to a command.
     keys : str
@@ -97,10 +97,7 @@ def control(
         If `endpoint` is empty and not exactly one pipeline runs, if the fleet has no such stream or it runs nowhere, or
         if the keys cannot be read.
     """
-    address = Address.parse(address, keys)
-    if address.stream:
-        return StreamControl(address.registry, address.stream, timeout=timeout)
-    return Control(address.resolve(), timeout=timeout)
+    return Control(Address.parse(address, keys).resolve(), timeout=timeout)
 
 
 def wait_until_running(address: Address, seconds: float = REPORT_SECONDS) -> Endpoint:

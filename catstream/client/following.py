@@ -1,20 +1,16 @@
-"""Follow a stream of a fleet: its messages and its commands, wherever it runs."""
+"""Subscribe to a stream of a fleet, wherever it runs."""
 
 from __future__ import annotations
 
-from contextlib import suppress
 from time import monotonic
 from typing import Any, TypeVar
 
 from catstream.base.names import UNNAMED
-from catstream.client.control import ANSWER_SECONDS, Control
 from catstream.client.registry import Registry, described
 from catstream.client.subscription import DRAIN_SECONDS, Subscription
-from catstream.errors import SilenceError
-from catstream.messages.kinds import Answer, End, Features, StreamStatus, Track, Verb
+from catstream.messages.kinds import End, Features, StreamStatus, Track
 
 _QUIET_SECONDS = 1.0  # without a message of a stream, after which the registry is asked where it runs; then repeated
-_ANSWER_SECONDS = 1.0  # for the registry before each command; without an answer, the stream has not moved
 
 Message = TypeVar("Message")
 
@@ -89,27 +85,3 @@ class StreamSubscription(Subscription[Message]):
 
     def _silence(self) -> str:
         return f"the state of the stream is: {described(self._status)}"
-
-
-class StreamControl(Control):
-    """Sends each command to the pipeline that a stream of a fleet has at that moment."""
-
-    def __init__(self, registry: Registry, stream: str, *, timeout: float = ANSWER_SECONDS) -> None:
-        self._registry, self._stream = registry, stream
-        try:
-            super().__init__(registry.running(stream), timeout=timeout)
-        except BaseException:
-            registry.close()
-            raise
-        registry.timeout = _ANSWER_SECONDS
-
-    def execute(self, verb: Verb, object: str = UNNAMED, **fields: Any) -> Answer:
-        with suppress(SilenceError):
-            if (endpoint := self._registry.running(self._stream)) != self.endpoint:
-                super().close()
-                self._connect(endpoint)
-        return super().execute(verb, object, **fields)
-
-    def close(self) -> None:
-        super().close()
-        self._registry.close()

@@ -43,8 +43,6 @@ FIRST_PAUSE_SECONDS = 1.0  # before a stream that failed starts again; doubled e
 LONGEST_PAUSE_SECONDS = 60.0  # the most of these
 _FORGOTTEN_SECONDS = 60.0  # of running, after which earlier failures do not count
 _TRACKS_SECONDS = 0.1  # longest wait for a frame
-_STORING_SHARE = 0.1  # of the time, at most, in which states are stored
-_LATE = 3.0  # a state that is older than so many intervals is a trouble
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +66,6 @@ class Stream:
         self._status = StreamStatus(spec.name, "starting", node, source, live=is_live(spec.source))
         self._stop, self._lock = threading.Event(), threading.Lock()
         self._stored_at = 0.0  # seconds since 1970 at which the state was that in the store
-        self._began_at = 0.0  # the same, of the start of the pipeline
         self._failure = self._store_trouble = self._pipeline_trouble = ""
         self._superseded = self._has_tracked = False
         self._files: set[tuple[str, int]] = set()  # of the state that was stored last, with their times
@@ -88,11 +85,8 @@ class Stream:
                 self._clients = clients
                 if self._address and self._keys.exists():
                     synchronise(self._keys, clients)
-            age = time.time() - self._stored_at if self._stored_at else 0.0
-            is_late = min(age, time.time() - self._began_at) > _LATE * self._every and not self._store_trouble
-            late = f"its state was stored {age:.0f} s ago" if is_late and self._status.state == "running" else ""
-            troubles = filter(None, (self._failure, self._store_trouble, late, self._pipeline_trouble))
-            stored = age if self._stored_at else None
+            troubles = filter(None, (self._failure, self._store_trouble, self._pipeline_trouble))
+            stored = time.time() - self._stored_at if self._stored_at else None
             return replace(self._status, stored_seconds=stored, trouble="; ".join(troubles)), self._superseded
 
     def stop(self) -> str:
@@ -139,14 +133,20 @@ class Stream:
                 return
             claim.state, facts = None, {}  # it was changed since: it begins again
         with ExitStack() as stack:
-            pipeline = self._open_pipeline(claim, stack)
+            source, state = self._spec.source, self._folder / "state"
+            settings = self._spec.settings | self._sockets(stack)
+            if claim.state is None:
+                pipeline = Pipeline(source, self._spec.boxes or None, settings, state=state)
+            else:
+                restore(state, claim.state.files)
+                pipeline = Pipeline(source, settings=settings, resume=state)
             outputs, resume = None, claim.state is not None
             files = self._destinations(pipeline, resume=resume)
             closed_last = stack.enter_context(ExitStack())  # after the processes
             stack.enter_context(pipeline)
             with self._lock:
                 self._failure = ""
-                self._began_at, self._stored_at = time.time(), float(facts.get("time", 0.0))
+                self._stored_at = float(facts.get("time", 0.0))
                 server = public_key(self._keys) if self._address else ""
                 self._status = replace(
                     self._status, state="starting", endpoint=pipeline.endpoint, server=server, token=claim.token
@@ -184,15 +184,6 @@ class Stream:
                 return
             if not ended or self._stop.wait(self._every):
                 return
-
-    def _open_pipeline(self, claim: Claim, stack: ExitStack) -> Pipeline:
-        """The pipeline, which continues from the state of the claim if there is one."""
-        settings = self._spec.settings | self._sockets(stack)
-        state = self._folder / "state"
-        if claim.state is None:
-            return Pipeline(self._spec.source, self._spec.boxes or None, settings, state=state)
-        restore(state, claim.state.files)
-        return Pipeline(self._spec.source, settings=settings, resume=state)
 
     def _destinations(self, pipeline: Pipeline, *, resume: bool) -> RunFiles:
         """The destinations of the tracks. If this node has a log, the run continues its frame numbers."""
@@ -258,11 +249,8 @@ class Stream:
 
     def _keep_storing(self, claim: Claim, over: threading.Event) -> None:
         """Store the state every few seconds until the pipeline is over, or another process has claimed the stream."""
-        pause = self._every
-        while not over.wait(pause) and not self._superseded:
-            began = time.monotonic()
+        while not over.wait(self._every) and not self._superseded:
             self._write(claim)
-            pause = max(self._every, (time.monotonic() - began) / _STORING_SHARE)
 
     def _write(self, claim: Claim, *, is_last: bool = False, ended: bool = False) -> None:
         """Store the newest checkpoint, if it has changed. A failure is a trouble; a newer claim ends the stream."""

@@ -315,7 +315,7 @@ class Fleet(AbstractContextManager["Fleet"]):
         options: dict[str, Any] = {}
         if self._address:
             registry = spec.registry or f"{_gcs_address().rpartition(':')[0]}:{REGISTRY_PORT}"
-            listen, keys = f"tcp://{registry}", spec.keys or str(state_home() / "fleets" / spec.name / "keys")
+            listen, keys = f"tcp://{registry}", str(self._folder / "keys")
             options["resources"] = {f"node:{registry.rpartition(':')[0]}": 0.001}
         else:
             listen, keys = str(self._folder / "registry"), ""  # it stays if Ray starts the controller again

@@ -40,13 +40,12 @@ _FLEET: dict[str, tuple[Any, str]] = {
     "store": (str, "a text"),
     "every": (Annotated[float, Meta(gt=0, le=3600)], "a number of seconds above 0 and at most 3600"),
     "registry": (_HOST_AND_PORT, "HOST:PORT of a node, as in 10.0.0.1:5690"),
-    "keys": (str, "a text"),
     "defaults": (dict[str, Any], "a table [defaults]"),
     "streams": (dict[str, Any], "tables [streams.NAME]"),
 }
 
 #: Those that count from the start of the fleet.
-_AT_START = ("name", "store", "every", "registry", "keys")
+_AT_START = ("name", "store", "every", "registry")
 
 #: The same of a stream.
 _STREAM: dict[str, tuple[Any, str]] = {
@@ -60,9 +59,6 @@ _STREAM: dict[str, tuple[Any, str]] = {
     "labels": (dict[str, str], 'a table of texts, for example { site = "north" }'),
 } | KEYS
 
-#: Settings that the fleet sets for each stream.
-_OWN_SETTINGS = ("run.endpoint", "run.keys")
-
 
 @dataclass(frozen=True)
 class StreamSpec:
@@ -72,7 +68,7 @@ class StreamSpec:
     source    the text that `catstream track` takes
     boxes     the objects in the first frame, by name
     models    file of each object that is searched for, by name
-    settings  values of settings by full name
+    settings  values of settings by full name; the fleet sets run.endpoint and run.keys
     cores     cores that Ray reserves for it
     labels    labels that its node must have
     write     destinations of its tracks
@@ -101,9 +97,6 @@ class StreamSpec:
             for name, box in self.boxes.items():
                 with _errors_in(f"the box of {listed([name])}"):
                     box.checked()
-            for name in _OWN_SETTINGS:
-                if name in self.settings:
-                    raise FleetError(f"the fleet sets {name} itself: remove it from the settings")
             Job(self.source, self.boxes, self.models, settings=Settings.from_values(self.settings))
             _checked({"cores": self.cores}, _STREAM)
 
@@ -160,7 +153,6 @@ class FleetSpec:
     store    folder or URL of the states; "" for a folder that belongs to the fleet
     every    seconds between two states of a stream in the store
     registry HOST:PORT where clients ask for the streams; "" for the head of the cluster, and the default port
-    keys     folder of the clients' keys on that machine; "" for the one of the fleet's name
     streams  the streams by name
     """
 
@@ -168,7 +160,6 @@ class FleetSpec:
     store: str = ""
     every: float = 5.0
     registry: str = ""
-    keys: str = ""
     streams: dict[str, StreamSpec] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -193,8 +184,6 @@ class FleetSpec:
                 )
             if (store := values.get("store")) and "://" not in store:
                 values["store"] = str(folder / store)
-            if keys := values.get("keys"):
-                values["keys"] = str(folder / keys)
             with _errors_in("the defaults"):
                 defaults = _checked(values.pop("defaults", {}), _STREAM)
             tables = values.pop("streams")

@@ -66,7 +66,7 @@ _ROLE = "/latest/"  # in the address at which a machine asks for the credentials
 class Store:
     """The store of a fleet: objects below a folder or a prefix of a bucket, created exclusively and never changed.
 
-    The URL is a folder, file:///folder or s3://bucket/prefix; FleetError if it is not valid, or contains credentials.
+    The URL is a folder or s3://bucket/prefix; FleetError if it is not valid, or contains credentials.
     Every method raises StoreError if the store cannot be reached or is full; a call that creates an object may
     nevertheless have created it. No message contains a credential.
     """
@@ -74,9 +74,6 @@ class Store:
     def __init__(self, url: str) -> None:
         self._url, self._folder = _parse(url)
         require_extra("fleet")
-
-    def __repr__(self) -> str:
-        return f"Store({self._url!r})"
 
     @property
     def fleet(self) -> StateStore:
@@ -182,30 +179,23 @@ def _parse(url: str) -> tuple[str, Path | None]:
             "the URL of the store contains a user, a password or a query: pass s3://bucket/prefix, and credentials in "
             "the environment"
         )
-    if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
-        return _parse(parts.path)
     if parts.scheme == "s3" and _BUCKET.fullmatch(parts.netloc):
         return f"s3://{parts.netloc}/{parts.path.strip('/')}".rstrip("/"), None
-    raise FleetError("the URL of the store is not valid: expected a folder, file:///folder or s3://bucket/prefix")
+    raise FleetError("the URL of the store is not valid: expected a folder or s3://bucket/prefix")
 
 
 def _trouble(error: Exception) -> str:
     """Describe an error and its remedy without the text of the error, which may contain a credential."""
     text = str(error)
-    code = match[1] if (match := _CODE.search(text)) else ""
-    if code == "NoSuchBucket":
-        return "there is no such bucket: create it"
-    if code in ("PermanentRedirect", "AuthorizationHeaderMalformed") or "incorrectly configured region" in text:
-        return "the bucket is in another region: set AWS_REGION"
-    if code:
-        return f"the server answered {code}: check the bucket and its permissions"
+    if code := _CODE.search(text):
+        return f"the server answered {code[1]}: check the bucket, its region (AWS_REGION) and its permissions"
     if _ROLE in text:
         return "no credentials were found: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
     if "kind: Timeout" in text:
         return f"no answer within {STORE_SECONDS:g} s: check the network and the server"
     number = error.errno if isinstance(error, OSError) else int(match[1]) if (match := _NUMBER.search(text)) else None
     if number is None:
-        return f"{type(error).__name__}: check the network and the server"
+        return f"{type(error).__name__}: check the network, the server and AWS_REGION"
     is_full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     return f"{os.strerror(number)}: {'free some space there' if is_full else 'check the folder, or the server'}"
 

@@ -133,14 +133,3 @@ def test_a_stream_that_does_not_exist_or_has_ended_is_not_waited_for(stream, man
         with catstream.subscribe("fleet://cam-7", "tracks", timeout=150) as tracks:
             assert list(tracks) == []
             assert tracks.end.reason == "the stream cam-7 has ended"
-
-
-def test_each_command_goes_where_the_stream_runs(stream, managing, commanded):
-    with managing(stream.status):
-        place = stream.runs()._endpoint
-        with catstream.control("fleet://cam-7", timeout=150) as control:
-            with commanded(place) as first:
-                control.pause()
-            with commanded(stream.runs()._endpoint) as second:
-                control.resume()
-        assert (first, second, control.source) == (["pause"], ["resume"], "walk.mp4")

@@ -189,17 +189,6 @@ def test_a_controller_that_starts_again_keeps_the_keys_of_the_clients(ray, spec,
             site.end()
 
 
-def test_a_stream_whose_node_died_is_left_to_ray(site, ray):
-    running(site, ray, "gate")
-    ray.nodes[0]["Alive"] = False
-    actor = ray.of("gate")
-    site._actors["gate"].call = Call(error=RayError("unavailable"))
-    site._turn()
-    assert states(site)["gate"] == "starting"
-    running(site, ray, "gate", "2")
-    assert (ray.of("gate"), site.status().streams["gate"].node) == (actor, "n2")
-
-
 def test_a_stream_that_has_ended_is_stopped_and_runs_again_only_if_it_is_changed(site, ray):
     began = time.monotonic()
     running(site, ray, "gate", state="ended", frame=31, stored_seconds=2.0)
@@ -342,17 +331,6 @@ def test_one_that_hangs_is_started_again_and_one_that_does_not_stop_is_killed(si
     for _ in range(3):
         site._turn()
     assert "gate" not in site._actors
-
-
-def test_one_that_is_gone_at_once_is_started_again_after_a_pause(site, ray, monkeypatch):
-    monkeypatch.setattr(module, "_PAUSE_SECONDS", 5.0)
-    ray.kill(ray.of("gate"))
-    site._turn()
-    assert ray.started.count("gate") == 1
-    later = time.monotonic() + 6.0
-    monkeypatch.setattr(time, "monotonic", lambda: later)
-    site._turn()
-    assert ray.started.count("gate") == 2
 
 
 def test_all_streams_are_stopped_before_a_fleet_ends(site, ray):

@@ -2,7 +2,9 @@
 
 import json
 import os
+import secrets
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -16,17 +18,33 @@ import pytest
 
 import catstream
 from catstream.client.registry import Registry
-from catstream.errors import FleetError, StoreError
+from catstream.errors import StoreError
 from catstream.fleet import fleet as module
 from catstream.fleet.controller import nodes
-from catstream.fleet.fleet import Fleet
+from catstream.fleet.fleet import _VARIABLES, Fleet
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
+from catstream.video.live_demo import first_box
 from catstream.wire.discovery import fleets
 from catstream.wire.keys import allow
-from tests.fleet.conftest import LIVE, SOUTH
 
 pytestmark = pytest.mark.system
+
+FRAMES = 32
+LIVE = "demo:1"
+NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
+SOUTH = NODE | {"node_name": "south", "labels": {"site": "south"}}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """The folder of the fleets of these tests."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(home))
+        patch.setenv("XDG_RUNTIME_DIR", "")
+        patch.delenv("RAY_ADDRESS", raising=False)
+        yield home / "catstream" / "fleets"
 
 
 def command(*words):
@@ -89,7 +107,7 @@ def test_a_local_fleet_is_closed_to_other_machines_and_users_until_ctrl_c(file, 
         assert (folder / "token").stat().st_mode & 0o077 == 0
         (file.parent / "token").write_text("0" * 64)
         other = {"RAY_AUTH_TOKEN_PATH": str(file.parent / "token"), "RAY_NUM_REDIS_GET_RETRIES": "2"}
-        stranger = os.environ | module._VARIABLES | other
+        stranger = os.environ | _VARIABLES | other
         program = f"import ray; ray.init({(folder / 'address').read_text()!r}); print('let in')"
         words = [sys.executable, "-P", "-c", program]
         done = subprocess.run(words, env=stranger, capture_output=True, text=True, timeout=120, check=False)
@@ -143,13 +161,6 @@ def test_a_second_up_changes_a_fleet_that_runs_and_down_ends_it_from_elsewhere(f
     assert "no fleet 'other' of yours runs" in run("fleet", "down", "--name", "other").stderr
 
 
-@pytest.mark.usefixtures("home")
-def test_a_fleet_whose_node_starts_is_said_to_start(monkeypatch):
-    monkeypatch.setattr(module, "_is_up", lambda _: True)
-    with pytest.raises(FleetError, match="the fleet early is starting"):
-        Fleet(name="early").down()
-
-
 def test_a_store_that_cannot_be_used_is_said_before_anything_starts(home, tmp_path):
     (tmp_path / "file").write_text("")
     spec = FleetSpec("nowhere", str(tmp_path / "file" / "store"), streams={"a": StreamSpec("a", LIVE)})
@@ -159,6 +170,44 @@ def test_a_store_that_cannot_be_used_is_said_before_anything_starts(home, tmp_pa
 
 
 # On a cluster.
+
+
+@pytest.fixture(scope="module")
+def streams(demo_video):
+    path, truth = demo_video(FRAMES)
+    film = StreamSpec("film", str(path), {"": truth[0]}, settings={"run.lockstep": True}, cores=0.3)
+    return {"film": film, "gate": StreamSpec("gate", LIVE, {"anna": first_box(LIVE)}, cores=0.3)}
+
+
+@pytest.fixture(scope="module")
+def cluster(home):
+    """A cluster of the nodes north and south, as `ray start` would start them, but on the loopback interface."""
+    home.mkdir(parents=True, exist_ok=True)
+    (home / "cluster-token").touch(mode=0o600)
+    (home / "cluster-token").write_text(secrets.token_hex(32))
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in _VARIABLES.items():
+            patch.setenv(name, value)
+        patch.setenv("RAY_AUTH_TOKEN_PATH", str(home / "cluster-token"))
+        from ray.cluster_utils import Cluster
+
+        cluster = Cluster(True, head_node_args=NODE | {"node_name": "north", "include_dashboard": False})
+        cluster.south = cluster.add_node(**SOUTH)
+        yield cluster
+        cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def site(cluster, streams, tmp_path_factory):
+    """A fleet of two streams on two nodes, and its spec."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        registry = f"127.0.0.1:{probe.getsockname()[1]}"
+    store = str(tmp_path_factory.mktemp("store") / "new")
+    spec = FleetSpec("site", store, every=0.5, registry=registry, streams=streams)
+    with Fleet(spec, address=cluster.address) as site:
+        site.up()
+        yield site, spec
+        assert site.down() == []
 
 
 def state_of(fleet, name, until, *states):
@@ -222,12 +271,3 @@ def test_a_controller_that_dies_is_started_again_and_streams_run_on(site, until)
     after = state_of(fleet, "gate", until, "running")
     assert after.token == before.token
     assert fleet.is_running
-
-
-def test_a_fleet_whose_streams_do_not_stop_is_not_said_to_be_down(site, monkeypatch):
-    fleet, _ = site
-    ask = fleet._ask
-    monkeypatch.setattr(module, "DOWN_SECONDS", 0.0)
-    monkeypatch.setattr(fleet, "_ask", lambda method, *given: ["gate"] if method == "close" else ask(method, *given))
-    with pytest.raises(FleetError, match=r"the fleet site is not down yet.*\ngate: it did not stop within 0 s"):
-        fleet.down()

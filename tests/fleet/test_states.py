@@ -268,19 +268,6 @@ def test_after_a_claim_no_older_holder_adds_a_state_and_nothing_acknowledged_is_
     run_state_machine_as_test(Fencing, settings=settings(max_examples=200, stateful_step_count=20, deadline=None))
 
 
-def test_a_fenced_holder_does_not_remove_the_state_that_a_newer_one_continues_from():
-    """It was paused between the check of its claim and the removal of old states."""
-    history = Fencing()
-    history.there_is_a_holder()
-    history.write(0, 2)
-    history.pause(0, "write", "remove", 0)
-    history.act(1, "claim", "done")
-    history.resume(0, "done")
-    history.write(1, 1)
-    assert history.processes[1].result is None
-    history.the_newest_state_has_all_durable_writes_and_continues_the_last_of_them()
-
-
 def test_a_late_write_does_not_bring_a_removed_stream_back():
     memory = Memory()
     states = StateStore(memory, FOLDER)

@@ -6,9 +6,7 @@ import resource
 import secrets
 import socket
 import stat
-import threading
 import traceback
-from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 import obstore
@@ -48,7 +46,7 @@ def s3_server():
 @pytest.fixture(params=["file", "s3"])
 def url(request, tmp_path):
     if request.param == "file":
-        return tmp_path.as_uri()
+        return str(tmp_path)
     request.getfixturevalue("s3_server")
     return f"s3://fleet/{secrets.token_hex(4)}"
 
@@ -61,18 +59,6 @@ def store(url):
 def listed(store, stream="cam-7"):
     found = Contents.of(store.names(f"streams/{stream}"))
     return sorted(found.claims), sorted(map(tuple, found.states))
-
-
-def test_a_fenced_holder_writes_no_more(store):
-    paused = store.stream("cam-7").claim()
-    paused.write(STATE, {"frame": 1})
-    store.stream("cam-7").claim().write(STATE, {"frame": 2})
-    for _ in range(2):
-        with pytest.raises(
-            FencedError, match=r"streams/cam-7 was claimed by another process \(token 2\) after this one \(token 1\)"
-        ):
-            paused.write(STATE, {"frame": 3})
-    assert store.stream("cam-7").newest().facts == {"frame": 2}
 
 
 def test_two_states_stay_and_a_later_holder_removes_those_of_earlier_ones(store):
@@ -93,39 +79,11 @@ def test_a_removed_stream_begins_anew_and_its_old_holder_is_fenced(store):
     store.stream("cam-7").clear()
     store.stream("never-seen").clear()
     assert store.stream("cam-7").newest() is None
-    with pytest.raises(FencedError):
-        old.write(STATE, {"frame": 2})
+    for _ in range(2):
+        with pytest.raises(FencedError, match=r"cam-7 was claimed by another process \(token 2\) after this one"):
+            old.write(STATE, {"frame": 2})
     new = store.stream("cam-7").claim()
     assert (new.state, new.token > old.token) == (None, True)
-
-
-def test_the_newest_spec_and_model_are_returned(store):
-    assert (store.fleet.newest(), store.model("cam-7", "anna").newest()) == (None, None)
-    for version in (1, 2):
-        store.fleet.put({"fleet": b"spec %d" % version}, {})
-        store.model("cam-7", "anna").put({"model": b"model %d" % version}, {"version": version})
-    found = store.model("cam-7", "anna").newest()
-    assert store.fleet.newest().files == {"fleet": b"spec 2"}
-    assert (found.files, found.facts) == ({"model": b"model 2"}, {"version": 2})
-
-
-def test_of_many_claimants_at_once_only_the_last_one_writes(tmp_path):
-    """Real processes' races: in a folder, by several threads with a store each."""
-    barrier = threading.Barrier(8)
-
-    def claimed(_):
-        store = Store(str(tmp_path))
-        barrier.wait()
-        return store.stream("cam-7").claim()
-
-    with ThreadPoolExecutor(8) as pool:
-        claims = list(pool.map(claimed, range(8)))
-    *fenced, last = sorted(claims, key=lambda claim: claim.token)
-    for claim in fenced:
-        with pytest.raises(FencedError):
-            claim.write(STATE, {})
-    last.write(STATE, {"frame": 1})
-    assert len({claim.token for claim in claims}) == 8
 
 
 def test_a_folder_that_is_not_there_is_not_created_by_a_claim(tmp_path):
@@ -169,18 +127,6 @@ def test_what_a_killed_writer_left_is_removed_by_the_next_holder(tmp_path):
     assert not part.parent.exists()
 
 
-def test_a_stopped_server_is_a_store_error_and_the_next_write_succeeds(s3_server):
-    claim = Store("s3://fleet/stopped").stream("cam-7").claim()
-    claim.write(STATE, {"frame": 1})
-    s3_server.stop()
-    with pytest.raises(StoreError, match=r"streams/cam-7/.* cannot be written: .*check the network and the server"):
-        claim.write(STATE, {"frame": 2})
-    s3_server.__init__(*s3_server.get_host_and_port(), verbose=False)  # with the objects that it had
-    s3_server.start()
-    claim.write(STATE, {"frame": 3})
-    assert Store("s3://fleet/stopped").stream("cam-7").newest().facts == {"frame": 3}
-
-
 def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         monkeypatch.setattr(module, "STORE_SECONDS", 0.2)
@@ -199,7 +145,6 @@ def test_a_server_that_never_answers_is_a_store_error_after_the_time_limit(monke
         "https://AKIA-not-to-be-seen@host/fleet",
         "gs://not-to-be-seen",
         "s3://Not-To-Be-Seen",
-        "file://not-to-be-seen/folder",
     ],
 )
 def test_a_url_with_credentials_or_of_another_kind_is_refused_and_not_repeated(url):
@@ -210,23 +155,21 @@ def test_a_url_with_credentials_or_of_another_kind_is_refused_and_not_repeated(u
 
 @pytest.mark.usefixtures("s3_server")
 @pytest.mark.parametrize("url", ["s3://fleet/p", "s3://no-such-bucket/p", "s3://unreachable/p"])
-def test_no_credential_is_in_a_message_a_repr_a_traceback_or_a_log(url, caplog, monkeypatch):
+def test_no_credential_is_in_a_message_a_traceback_or_a_log(url, caplog, monkeypatch):
     caplog.set_level(logging.DEBUG)
     if "unreachable" in url:
         monkeypatch.setenv("AWS_ENDPOINT_URL", "http://user:password-not-to-be-seen@127.0.0.1:9")
-    store, shown = Store(url), []
+    shown = []
     try:
-        claim = store.stream("cam-7").claim()
-        claim.write(STATE, {})
-        shown.append(repr(claim))
+        Store(url).stream("cam-7").claim().write(STATE, {})
     except StoreError as error:
-        shown += [*traceback.format_exception(error), repr(error)]
-    assert "not-to-be-seen" not in "".join([*shown, repr(store), *(record.getMessage() for record in caplog.records)])
+        shown += traceback.format_exception(error)
+    assert "not-to-be-seen" not in "".join([*shown, *(record.getMessage() for record in caplog.records)])
 
 
 @pytest.mark.usefixtures("s3_server")
 def test_a_missing_bucket_and_missing_credentials_are_named(monkeypatch):
-    with pytest.raises(StoreError, match="there is no such bucket: create it"):
+    with pytest.raises(StoreError, match=r"answered NoSuchBucket: check the bucket, its region \(AWS_REGION\)"):
         Store("s3://no-such-bucket").stream("cam-7").claim()
     for name in SECRETS:
         monkeypatch.delenv(name)
@@ -241,16 +184,3 @@ def test_a_server_that_ignores_if_none_match_is_refused(monkeypatch):
     monkeypatch.setattr(S3Store, "put", lambda *given, **_: obstore.put(*given))
     with pytest.raises(StoreError, match="ignores If-None-Match"):
         store.check()
-
-
-@pytest.mark.parametrize(
-    ("answer", "said"),
-    [
-        ("<Code>AccessDenied</Code>", "answered AccessDenied: check the bucket and its permissions"),
-        ("<Code>AuthorizationHeaderMalformed</Code>", "the bucket is in another region: set AWS_REGION"),
-        ("<Code>SlowDown</Code>", "answered SlowDown"),
-        ("(os error 28)", "No space left on device: free some space there"),
-    ],
-)
-def test_an_error_of_the_server_is_named_with_its_remedy(answer, said):
-    assert said in module._trouble(Exception(answer))
