@@ -109,6 +109,8 @@ def export(
             click.echo(note, err=True)
         if content.damaged:
             click.echo(f"{counted(content.damaged, 'damaged line')} of {path} skipped", err=True)
+        if content.gap:
+            click.echo(f"{path} lacks {counted(content.gap, 'frame')}, as the disk was full", err=True)
 
 
 def _with_source(about: About, log: Path, given: str | None, *, required: bool, useful: bool) -> About:

@@ -40,7 +40,7 @@ class RunProgress:
         self._held, self._looked = 0.0, time.perf_counter()  # seconds while the run was held, and until when
         self._started = self._now()
         self._first = self._refreshed = 0.0
-        self.frames = 0
+        self.frames = self.not_written = 0
         self._objects: dict[str, _ObjectCounts] = {}
         self._tracks: Mapping[str, Track] = {}  # of the newest frame
 
@@ -81,6 +81,7 @@ class RunProgress:
         figures = [count, f"{self._rate():.0f} frames/s"]
         if pipeline.live:
             figures.append(f"{self._counters.get('skipped', 0):.0f} skipped")
+            figures += [f"{self.not_written} not written"] * bool(self.not_written)
         if len(tracks) == 1:
             (track,) = tracks.values()
             state = str(track.state)
@@ -116,6 +117,8 @@ class RunProgress:
             lines.append(f"features: {sent} sent, {totals['stored']} stored in the coreset trees")
         if self._pipeline.restarts:
             lines.append(f"processes restarted: {self._pipeline.restarts}")
+        if self.not_written:
+            lines.append(f"not written: {counted(self.not_written, 'frame')}")
         if results:
             here = f"{Path.cwd()}/"
             lines.append(f"results: {', '.join(place.removeprefix(here) for place in results)}")

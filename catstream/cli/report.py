@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from catstream.base.text import counted
 from catstream.cli.common import INTERRUPTS, complain, line_of, messages
 from catstream.cli.options import PATH, with_overwrite
 from catstream.errors import VideoError
@@ -49,6 +50,8 @@ def report(log: Path, page: Path | None, skip_damaged: bool, overwrite: bool) ->
             progress.advance(task)
     write_report(page, sections)
     for section in sections:
+        if section.gap:
+            complain(f"{section.name}: the log lacks {counted(section.gap, 'frame')}, as the disk was full")
         if section.problem:
             complain(f"{section.name}: no pictures ({section.problem})")
     click.echo(f"report: {page}")

@@ -314,6 +314,7 @@ class _Run:
                 with INTERRUPTS.deferred():  # so that a frame is in all results or in none
                     outputs.write(TrackedFrame([*tracks.values()], moment - before))
                     progress.count(tracks)
+                    progress.not_written = outputs.missed
                     progress.show(status, console)
 
     def _say_what_holds(self, console: Console) -> None:

@@ -119,7 +119,7 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
         raise click.UsageError(str(error)) from None
     files = RunFiles(Origin(options=options), None, [*dict.fromkeys(places)])
     files.check(overwrite=overwrite, earlier=[])
-    written, reason, run = 0, "", ""
+    written, not_written, reason, run = 0, 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     address = address.with_endpoint()
     with subscribe(address, "tracks") as tracks:
@@ -139,9 +139,11 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
                     continue
                 with INTERRUPTS.deferred():  # a track is written everywhere or nowhere
                     outputs.write(TrackedFrame([track]))
-                    written, newest[track.object] = written + 1, track.frame
+                    not_written, newest[track.object] = outputs.missed, track.frame
+                    written += not outputs.trouble
                 status.update(f"frame {track.frame}, {tracks.missed} missed")
         if tracks.end is not None:
             reason = f": {tracks.end.reason}"
         of = f" of {listed(newest)}" if any(newest) else ""
-        click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{reason}", err=True)
+        lacking = f", {not_written} not written" if not_written else ""
+        click.echo(f"{counted(written, 'track')}{of}, {tracks.losses()}{lacking}{reason}", err=True)

@@ -159,7 +159,7 @@ class Stream:
             stack.callback(storing.join)
             stack.callback(over.set)
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
-                self._take(pipeline, tracks)
+                self._take(pipeline, tracks, "" if outputs is None else outputs.trouble)
                 if tracks and files.places:
                     if outputs is None:
                         outputs = files.continued(pipeline.endpoint, resume=resume)
@@ -229,9 +229,10 @@ class Stream:
                     SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store"), name
                 )
 
-    def _take(self, pipeline: Pipeline, tracks: dict[str, Track]) -> None:
-        """Take the tracks of a frame; an empty mapping means that none has arrived for a while."""
+    def _take(self, pipeline: Pipeline, tracks: dict[str, Track], problem: str) -> None:
+        """Take the tracks of a frame, none if none has arrived for a while, and a problem of the destinations."""
         troubles = [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
+        troubles += [problem] * bool(problem)
         if pipeline.lost_seconds:
             troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
         with self._lock:

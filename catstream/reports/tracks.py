@@ -129,6 +129,7 @@ class Section:
                 tracks.setdefault(track.object, []).append(track)
         if not tracks:
             raise VideoError(f"{path} contains no track: pass the log of a run")
+        self.gap = self._log.gap
         self._objects = {name: _Object.of(rows) for name, rows in tracks.items()}
         self._palette = Colours()
         self.colours = {name: self._palette.of(name) for name in tracks}

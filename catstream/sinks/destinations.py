@@ -65,6 +65,7 @@ class Head:
     version    version of the program
     settings   NAME=VALUE of each setting that differs from its default
     boxes      initial box of each object that the run started with, by name
+    gap        0; in a further head, the number of frames before it that could not be written, as the disk was full
     """
 
     catstream: int = FORMAT
@@ -78,6 +79,7 @@ class Head:
     version: str = field(default_factory=partial(version, "catstream"))
     settings: tuple[str, ...] = ()
     boxes: dict[str, Box] = field(default_factory=dict)
+    gap: int = 0
 
     def to_json(self) -> str:
         return msgspec.json.encode(self).decode()

@@ -24,6 +24,7 @@ from math import isfinite, isnan
 from pathlib import Path
 from typing import IO, Any, get_args
 
+from catstream.base.addresses import is_live
 from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
@@ -62,12 +63,14 @@ class LineSink(ABC):
     """A file with a line for each track. Written lines remain if this process crashes.
 
     An existing file is replaced, or continued after its first `origin.size` bytes. If it is removed, renamed or
-    truncated meanwhile, that is logged, and a file with a first line of its own continues.
+    truncated meanwhile, that is logged, and a file with a first line of its own continues. After an error, `write` may
+    be called again with the next frame: the file has no part of the frame before, and states the gap if it has a head.
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
         self.path, self._origin = Path(place), origin
         self._before = _FIRST if origin.last is None else _objects(origin.last)
+        self._gap = 0  # frames since the last one that was written
         self._open(origin.size)
 
     @abstractmethod
@@ -79,26 +82,47 @@ class LineSink(ABC):
         """Return the line of a track, without its line end."""
 
     def write(self, frame: TrackedFrame) -> None:
-        """Add the lines of a frame, in one write."""
-        self._follow()
+        """Add the lines of a frame."""
         tracks = sorted(frame.tracks, key=lambda track: track.object in self._before)
-        self._before = _objects(frame)
-        with writing(self.path, VideoError):
-            self._file.write("".join(f"{self.line(track, frame.seconds)}\n" for track in tracks))
+        lines = [self.line(track, frame.seconds) for track in tracks]
+        try:
+            self._follow()
+            with writing(self.path, VideoError):
+                self._write([*self.gap_lines(self._gap), *lines] if self._gap else lines)
+        except VideoError:
+            self._gap += 1
+            self._remove_part()
+            raise
+        self._gap, self._before = 0, _objects(frame)
         self._status = os.fstat(self._file.fileno())
 
     def close(self) -> None:
-        """Close the file; a line for which the disk had no room is tried again."""
+        """Close the file."""
         with writing(self.path, VideoError):
             self._file.close()
 
+    def gap_lines(self, frames: int) -> list[str]:  # noqa: ARG002
+        """Return lines that state how many frames before the next one could not be written."""
+        return []
+
+    def _write(self, lines: list[str]) -> None:
+        """Write without a buffer, which would keep what the disk did not take."""
+        data = "".join(f"{line}\n" for line in lines).encode()
+        while data:
+            data = data[os.write(self._file.fileno(), data) :]
+
+    def _remove_part(self) -> None:
+        """Remove the part of a frame that was written before an error."""
+        with suppress(OSError, ValueError):  # it may be closed
+            os.ftruncate(self._file.fileno(), self._status.st_size)
+
     def _open(self, size: int) -> None:
-        self._file: IO[str] = open_locked(self.path, VideoError, size, encoding="utf-8", buffering=1)
+        self._file: IO[bytes] = open_locked(self.path, VideoError, size, mode="ab", buffering=0)
         with writing(self.path, VideoError), ExitStack() as stack:
             if (first := self.first_line(self._origin)) and not size:  # a file with no room for it is removed
                 stack.callback(self.path.unlink)
                 stack.enter_context(self._file)
-                self._file.write(f"{first}\n")
+                self._write([first])
                 stack.pop_all()
         self._status = os.fstat(self._file.fileno())
 
@@ -111,7 +135,8 @@ class LineSink(ABC):
                 if status.st_size >= self._status.st_size:
                     return
                 rest, problem = self.path.read_bytes().rfind(b"\n") + 1, "truncated"
-        Warnings(str(self.path)).log(f"{problem} by another program; the log goes on there without the rows before")
+        if not self._gap:
+            Warnings(str(self.path)).log(f"{problem} by another program; the log goes on there without the rows before")
         self._file.close()
         with writing(self.path, VideoError):
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,6 +148,9 @@ class NdjsonSink(LineSink):
 
     def first_line(self, origin: Origin) -> str:
         return origin.head.to_json()
+
+    def gap_lines(self, frames: int) -> list[str]:
+        return [replace(self._origin.head, gap=frames).to_json()]
 
     def line(self, track: Track, _: float) -> str:
         return json.dumps(track.to_dict())
@@ -138,10 +166,16 @@ class StdoutSink(NdjsonSink):
         return ""
 
     def _open(self, _: int) -> None:
-        self._file = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", buffering=1)
+        self._file = os.fdopen(os.dup(sys.stdout.fileno()), "wb", buffering=0)
 
     def _follow(self) -> None:
         pass
+
+    def _remove_part(self) -> None:
+        pass
+
+    def gap_lines(self, _: int) -> list[str]:
+        return []
 
 
 class CsvSink(LineSink):
@@ -191,10 +225,11 @@ class Log:
     with its number; if `skip_damaged`, such lines are skipped.
 
     damaged  number of lines that were skipped
+    gap      number of frames that the log states as missing
     """
 
     def __init__(self, path: Path, *, skip_damaged: bool = False) -> None:
-        self.path, self.damaged, self._skip = path, 0, skip_damaged
+        self.path, self.damaged, self.gap, self._skip = path, 0, 0, skip_damaged
 
     def head(self) -> Head | None:
         """Read the head; None if there is none, as in a CSV file. VideoError if another version has written it."""
@@ -243,7 +278,7 @@ class Log:
 
     def _rows(self) -> Iterator[tuple[Track, int]]:
         """Yield each track, and the byte at which its line ends; 0 without an end."""
-        self.damaged = 0
+        self.damaged = self.gap = 0
         if not self.path.exists():
             return
         parse, end, problem, is_cut = self._parser(), 0, "", False
@@ -258,7 +293,8 @@ class Log:
                 try:
                     track = parse(line.decode("utf-8-sig"))
                 except (KeyError, TypeError, ValueError, ProtocolError) as error:
-                    if Head.from_json(line) is not None:  # the first line of a log, or of a log that was appended
+                    if (head := Head.from_json(line)) is not None:  # the first line of a log, a gap, an appended log
+                        self.gap += head.gap
                         continue
                     problem = f"{self.path}, line {number} is no track ({error})"
                     is_cut = not line.endswith(b"\n") or not line.strip()
@@ -412,7 +448,7 @@ class RunFiles:
             for frame in log.frames() if log is not None and last is not None and followers else ():
                 for sink in followers:
                     sink.write(frame)
-            return OpenFiles(sinks, stack.pop_all())
+            return OpenFiles(sinks, stack.pop_all(), continues=is_live(origin.head.source))
 
     def continued(self, endpoint: str, *, resume: bool) -> OpenFiles:
         """The same for an unattended run: a file that is not continued is renamed, and folders are created.
@@ -435,15 +471,34 @@ class RunFiles:
 
 
 class OpenFiles(AbstractContextManager["OpenFiles"]):
-    """All destinations of a run while it goes on. VideoError if one cannot be written any more, or completed."""
+    """All destinations of a run while it goes on. VideoError if one cannot be written any more, or completed.
 
-    def __init__(self, sinks: Sequence[Sink], stack: ExitStack) -> None:
-        self._sinks, self._stack = sinks, stack
+    If the run `continues`, as a live source does, a frame that cannot be written is counted, and the next one is tried.
+
+    missed   frames that at least one destination lacks
+    trouble  why the newest frame could not be written; empty if it was
+    """
+
+    def __init__(self, sinks: Sequence[Sink], stack: ExitStack, *, continues: bool) -> None:
+        self._sinks, self._stack, self._continues = sinks, stack, continues
+        self._warnings = Warnings("results")
+        self.missed, self.trouble = 0, ""
 
     def write(self, frame: TrackedFrame) -> None:
         """Write a frame everywhere."""
+        problem = ""
         for sink in self._sinks:
-            sink.write(frame)
+            try:
+                sink.write(frame)
+            except VideoError as error:
+                if not self._continues:
+                    raise
+                problem = str(error)
+                self._warnings.failed(f"{problem}; tracking continues, and missing frames are counted")
+        self.missed += bool(problem)
+        self.trouble = problem
+        if not problem:
+            self._warnings.working()
 
     def idle(self) -> None:
         """Tell the destinations that no frame has arrived for a while."""

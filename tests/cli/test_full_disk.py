@@ -1,9 +1,13 @@
 """A disk that is full before the run has ended: what is lost is said on the terminal, and what was written is kept."""
 
+import signal
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+
+from catstream.sinks.track_log import Log
 
 #: Bytes of a disk for some of the messages of a short video, and of one for its rows but not for all.
 SMALL, TINY = 1 << 20, 1 << 16
@@ -41,6 +45,25 @@ def test_checkpoints_for_which_the_disk_has_no_room_are_said_and_the_run_goes_on
     assert "No space left on device" in errors
     assert len((tmp_path / "demo.ndjson").read_text().splitlines()) == 1 + 32
     assert code == 0
+
+
+@pytest.mark.parametrize("disk", [SMALL], indirect=True)
+def test_a_camera_is_tracked_while_the_disk_is_full_and_rows_are_written_again_after_it(catstream, disk, until):
+    log, ballast = disk / "out" / "demo-1.ndjson", disk / "ballast"
+    run = catstream("track", "demo:1", "--box", "184,88,57,58", "--output", disk / "out")
+    until(lambda: log.exists() and log.read_bytes().count(b"\n") > 10)
+    with ballast.open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    lines = iter(run.stderr.readline, "")
+    assert any("No space left on device" in line for line in lines)
+    ballast.unlink()
+    until(lambda: b'"gap":' in log.read_bytes().partition(b"\n")[2])
+    run.send_signal(signal.SIGINT)
+    assert any(line.startswith("not written: ") for line in lines)
+    tracks = Log(log)
+    numbers = [frame.number for frame in tracks]
+    assert 0 < tracks.gap == numbers[-1] + 1 - len(numbers)
 
 
 @pytest.mark.parametrize("words", [["settings"], ["settings", "--json"], ["track", "--help"]], ids=" ".join)

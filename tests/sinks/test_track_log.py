@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -76,10 +76,44 @@ def test_a_full_disk_is_reported_in_one_line_and_written_rows_are_kept(tmp_path,
     sink = open_sink(str(tmp_path / name), Origin())
     sink.write(TrackedFrame(TRACKS[:1]))
     full(tmp_path / name)
-    for last in (lambda: sink.write(TrackedFrame(TRACKS[1:2])), sink.close):  # which tries it once more
-        with pytest.raises(VideoError, match=rf"cannot write '.*/{name}' \(No space left on device\)"):
-            last()
+    with pytest.raises(VideoError, match=rf"cannot write '.*/{name}' \(No space left on device\)"):
+        sink.write(TrackedFrame(TRACKS[1:2]))
+    sink.close()
     assert len(list(Log(tmp_path / name).frames())) == 1
+
+
+@pytest.mark.parametrize("disk", [1 << 20], indirect=True)
+@pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
+@pytest.mark.parametrize("names", [["t.ndjson"], ["t.csv"], ["t.sqlite"], ["t.ndjson", "t.csv"]], ids=" ".join)
+def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_file(disk, names, source, caplog):
+    run = RunFiles(Origin(Head(source=source)), None, [str(disk / name) for name in names])
+    frames = iter([TrackedFrame([track(number, "anna"), track(number, "ben")]) for number in range(10_000)])
+    with run.opened("run") as outputs, ExitStack() as stack:
+        for _ in range(20):
+            outputs.write(next(frames))
+        with (disk / "ballast").open("wb", buffering=0) as ballast, suppress(OSError):
+            while True:
+                ballast.write(bytes(4096))
+        if source == "walk.mp4":
+            stack.enter_context(
+                pytest.raises(VideoError, match=r"cannot write .*(No space left on device|disk is full)")
+            )
+        while outputs.missed < 50:
+            outputs.write(next(frames))
+        assert outputs.trouble
+        (disk / "ballast").unlink()
+        for _ in range(20):
+            outputs.write(next(frames))
+        assert not outputs.trouble
+    for log in (Log(disk / name) for name in names):
+        numbers = [frame.number for frame in log if len(frame.tracks) == 2]
+        lacking = numbers[-1] + 1 - len(numbers)
+        assert numbers == sorted(numbers)
+        assert (lacking > 0) == (source == "rtsp://cam")
+        assert log.gap == (lacking if log.path.suffix == ".ndjson" else 0)
+        if source == "rtsp://cam":
+            assert numbers[-20:] == [*range(numbers[-1] - 19, numbers[-1] + 1)]
+            assert caplog.text.count(f"{log.path.name}' (No space") <= 1, "it is said once"
 
 
 @pytest.mark.parametrize("disk", [4096], indirect=True)
