@@ -59,6 +59,8 @@ class File:
                 _log.warning("%s: %s of another size, scaled to the first", self.path, counted(scaled, "frame"))
             if skipped := source.counters.get("damaged"):
                 problems.append(f"{str(self.path)!r} is damaged: {skipped:.0f} of its frames were skipped")
+            if missing := source.counters.get("truncated"):
+                problems.append(f"{str(self.path)!r} is truncated: it lacks {missing:.0f} s at the end")
 
     def _of_images(self, problems: list[str]) -> Generator[NamedFrame]:
         read_image = ImageReader([*self.pages])
