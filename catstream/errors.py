@@ -78,12 +78,6 @@ class StoreError(FleetError):
     """The store of a fleet is unreachable, full or damaged. The call may be repeated later."""
 
 
-#: Extra -> the feature that needs it, and the modules that the feature imports.
-EXTRAS = {
-    "fleet": ("a fleet", ("ray", "obstore")),
-}
-
-
 def require_linux() -> None:
     """Raise ServiceError on another system, which lacks what the processes of a pipeline need."""
     if sys.platform != "linux":
@@ -93,16 +87,11 @@ def require_linux() -> None:
         )
 
 
-def require_extra(extra: str) -> None:
-    """Check that the modules of an extra are installed, without importing them.
-
-    Otherwise raise MissingExtraError, whose message has the command that installs the extra.
-    """
-    feature, modules = EXTRAS[extra]
-    missing = [module for module in modules if find_spec(module) is None]
-    if missing:
+def require_fleet() -> None:
+    """Raise MissingExtraError if a package of the extra `fleet` is not installed; none is imported."""
+    if missing := [module for module in ("ray", "obstore") if find_spec(module) is None]:
         raise MissingExtraError(
-            f"{feature} needs packages that are not installed ({', '.join(missing)}): {install_command(extra)}"
+            f"a fleet needs packages that are not installed ({', '.join(missing)}): {install_command('fleet')}"
         )
 
 

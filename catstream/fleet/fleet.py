@@ -42,7 +42,7 @@ import psutil
 
 from catstream.base.files import is_locked, lock, state_home, write_atomically
 from catstream.client.registry import REGISTRY_PORT
-from catstream.errors import CatstreamError, FleetError, require_extra
+from catstream.errors import CatstreamError, FleetError, require_fleet
 from catstream.fleet.controller import NAMESPACE, Controller, actor_name, named_actors
 from catstream.fleet.spec import FleetSpec, StreamSpec
 from catstream.fleet.store import Store
@@ -94,7 +94,7 @@ class Fleet(AbstractContextManager["Fleet"]):
     def __init__(
         self, spec: str | os.PathLike[str] | FleetSpec | None = None, *, name: str = "", address: str = ""
     ) -> None:
-        require_extra("fleet")
+        require_fleet()
         read = spec if isinstance(spec, FleetSpec) or spec is None else FleetSpec.load(Path(spec))
         self._spec = replace(read, name=name) if read is not None and name else read
         self._address = address or os.environ.get("RAY_ADDRESS", "")

@@ -43,7 +43,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from catstream.base.names import UNNAMED, check_name
-from catstream.errors import FencedError, FleetError, ProtocolError, StoreError, require_extra
+from catstream.errors import FencedError, FleetError, ProtocolError, StoreError, require_fleet
 from catstream.fleet.spec import check_fleet_name
 from catstream.messages import storage
 
@@ -73,7 +73,7 @@ class Store:
 
     def __init__(self, url: str) -> None:
         self._url, self._folder = _parse(url)
-        require_extra("fleet")
+        require_fleet()
 
     @property
     def fleet(self) -> StateStore:
