@@ -3,8 +3,8 @@
 numba's cache is invalidated by changes of this file only. So all kernels are here, with the functions that they call
 and the constants that they read; `catstream.features.layout` repeats some of these constants, and a test compares them.
 
-A kernel writes into an output array of its caller. Arithmetic may be reordered, and neither bounds nor divisions by 0
-are checked. A call releases the GIL. An array of another type than in the signature, or a read-only
+A kernel writes into an output array of its caller. Arithmetic may be reordered, except in `average`, and neither bounds
+nor divisions by 0 are checked. A call releases the GIL. An array of another type than in the signature, or a read-only
 one, is a TypeError.
 """
 
@@ -18,7 +18,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy import float32
 
-from catstream.base.arrays import Float32, Float64, Int64, UInt8, UInt16
+from catstream.base.arrays import Float32, Float64, Int64, UInt8, UInt16, UInt32
 from catstream.errors import ServiceError
 
 try:
@@ -41,21 +41,23 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
 _options: dict[str, Any] = {"nogil": True, "fastmath": True, "error_model": "numpy"}
 _part: Callable[[_Function], _Function] = numba.njit(**_options)  # a function that kernels call
+_ordered: Callable[[_Function], _Function] = numba.njit(**_options | {"fastmath": False})
 
 
-def _kernel(signature: str) -> Callable[[_Function], _Function]:
+def _kernel(signature: str, **changes: bool) -> Callable[[_Function], _Function]:
     """Compile a function for these types, or load its machine code from the cache.
 
     The cache is the folder NUMBA_CACHE_DIR, or else `__pycache__` beside this file, or else the user's cache folder. If
-    none of them can be written, or a file in it is damaged, every start compiles.
+    none of them can be written, or a file in it is damaged, every start compiles. `changes` are changed options.
     """
+    options = _options | changes
 
     def compiled(function: _Function) -> _Function:
         with event.install_listener("numba:compile", _Announcement()):
             try:
-                kernel = numba.njit(signature, cache=True, **_options)(function)
+                kernel = numba.njit(signature, cache=True, **options)(function)
             except Exception:  # of the cache: there is no folder, its disk is full, a file is damaged
-                kernel = numba.njit(signature, **_options)(function)
+                kernel = numba.njit(signature, **options)(function)
         return cast(_Function, kernel)
 
     return compiled
@@ -460,6 +462,73 @@ def sample(image: UInt8, left: float, top: float, across: float, down: float, ou
             for i in range(columns):
                 value = values[first[i]]
                 output_line[i] = np.uint8(value + share[i] * (values[second[i]] - value))
+
+
+@_ordered
+def _taps(scale: float, size: int, pixels: UInt32, shares: Float32) -> None:
+    """The pixels of an axis of `size` pixels that each output pixel covers, `scale` of them; and their shares of it."""
+    for i in range(pixels.shape[1]):
+        begin, count = i * scale, 0
+        end = begin + scale
+        covered = min(scale, size - begin)
+        last = min(int(np.floor(end)), size - 1)
+        first = min(int(np.ceil(begin)), last)
+        if first - begin > 1e-3:
+            pixels[count, i], shares[count, i] = first - 1, (first - begin) / covered
+            count += 1
+        for pixel in range(first, last):
+            pixels[count, i], shares[count, i] = pixel, 1 / covered
+            count += 1
+        if end - last > 1e-3:
+            pixels[count, i], shares[count, i] = last, min(end - last, 1.0, covered) / covered
+
+
+@_kernel("void(uint8[:,:,::1], float64, float64, uint8[:,:,::1])", fastmath=False)
+def average(image: UInt8, across: float, down: float, output: UInt8) -> None:
+    """Reduce an image of three channels: the mean of the `across` x `down` pixels that an output pixel covers.
+
+    The pixels are those of `cv2.INTER_AREA`, which takes twice as long.
+    """
+    rows, columns = output.shape[:2]
+    below, right = max(3, int(np.ceil(down)) + 1), max(3, int(np.ceil(across)) + 1)
+    lines, parts = np.zeros((below, rows), np.uint32), np.zeros((below, rows), np.float32)
+    places, shares = np.zeros((right, columns), np.uint32), np.zeros((right, columns), np.float32)
+    _taps(down, image.shape[0], lines, parts)
+    _taps(across, image.shape[1], places, shares)
+    places *= np.uint32(3)
+    line = np.empty(3 * image.shape[1], np.float32)
+    reduced, total = np.empty(3 * columns, np.float32), np.empty(3 * columns, np.float32)
+    ready = -1
+    for row in range(rows):
+        for tap in range(below):
+            part = parts[tap, row]
+            if part == 0:
+                break
+            if lines[tap, row] != ready:  # two output rows may cover the same one
+                ready = lines[tap, row]
+                values = image[ready].reshape(-1)
+                for i in range(len(line)):
+                    line[i] = values[i]
+                for i in range(columns):
+                    blue, green, red = float32(0), float32(0), float32(0)
+                    for k in range(3):  # unrolled: mostly there are no more
+                        place, share = places[k, i], shares[k, i]
+                        blue += line[place] * share
+                        green += line[place + 1] * share
+                        red += line[place + 2] * share
+                    for k in range(3, right):
+                        place, share = places[k, i], shares[k, i]
+                        blue += line[place] * share
+                        green += line[place + 1] * share
+                        red += line[place + 2] * share
+                    reduced[3 * i], reduced[3 * i + 1], reduced[3 * i + 2] = blue, green, red
+            if tap == 0:
+                total[:] = 0
+            for i in range(len(total)):
+                total[i] += part * reduced[i]
+        pixels = output[row].reshape(-1)
+        for i in range(len(total)):
+            pixels[i] = np.uint8(np.rint(total[i]))
 
 
 @_kernel("void(float64[:,::1], float64[:,::1], float32[:,::1])")

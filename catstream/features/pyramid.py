@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from catstream.base.box import Window
-from catstream.features.kernels import sample
+from catstream.features.kernels import average, sample
 from catstream.features.layout import CELL, MARGIN, WINDOW
 
 _MAX_CELLS = 62_500  # of the region around a tiny window: bounds the cost of a large frame
@@ -128,8 +128,7 @@ class Pyramid:
         size = (columns * CELL, rows * CELL)
         scale = min(width / size[0], height / size[1])
         image, wide = self.near(scale)
-        interpolation = cv2.INTER_AREA if averaged and scale > 1 else cv2.INTER_LINEAR
-        resized = cv2.resize(image, size, interpolation=interpolation)
+        resized = reduced(image, size) if averaged and scale > 1 else cv2.resize(image, size)
         return resized, (image.shape[1] * wide / columns, image.shape[0] * wide / rows)
 
     def cut(self, x: float, y: float, across: float, down: float, size: int, turn: float = 0.0) -> np.ndarray:
@@ -161,3 +160,13 @@ def planes_of(image: np.ndarray) -> np.ndarray:
     planes = np.empty((3, *image.shape[:2]), np.uint8)
     cv2.split(image, list(planes))
     return planes
+
+
+def reduced(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """An image reduced to (width, height): the mean of the pixels that a pixel covers, as by `cv2.INTER_AREA`."""
+    across, down = 1 / (size[0] / image.shape[1]), 1 / (size[1] / image.shape[0])
+    if image.ndim == 2 or min(across, down) < 1 or (across.is_integer() and down.is_integer()):
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    output = np.empty((size[1], size[0], 3), np.uint8)
+    average(image, across, down, output)
+    return output

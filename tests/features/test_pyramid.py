@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from catstream.base.box import Window
 from catstream.features.layout import WINDOW
-from catstream.features.pyramid import Pyramid, Region, planes_of
+from catstream.features.pyramid import Pyramid, Region, planes_of, reduced
 
 
 @pytest.mark.parametrize(("scale", "wide"), [(0.3, 1), (1.99, 1), (2.0, 2), (3.9, 2), (4.0, 4), (9.0, 8)])
@@ -99,3 +99,9 @@ def test_around_a_tiny_window_in_a_large_frame_lies_a_part_of_constant_size():
     assert 62_000 < region.cells(window) <= 62_500
     assert 2 * region.left + region.width == pytest.approx(800, abs=2)
     assert frame.region_around(window.scaled(WINDOW)) == frame.region
+
+
+@pytest.mark.parametrize("size", [(400, 300), (638, 479), (333, 96), (120, 241), (320, 240), (64, 64)])
+def test_a_reduced_image_is_that_of_opencv(rng, size):
+    image = rng.integers(0, 256, (481, 640, 3), np.uint8)
+    np.testing.assert_array_equal(reduced(image, size), cv2.resize(image, size, interpolation=cv2.INTER_AREA))
