@@ -15,7 +15,7 @@ from catstream.base.text import counted
 from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
-from catstream.cli.view import HostPort, with_listen, with_token
+from catstream.cli.view import HostPort, server_of, with_listen
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
 
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 @click.option("--output", type=FOLDER, help="Folder for the results; by default, NAME-annotation.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Number of processes; by default, one for each core.")
 @with_listen
-@with_token()
 @with_overwrite
 @with_overrides
 @with_reading
@@ -50,15 +49,14 @@ def annotate(
     output: Path | None,
     jobs: int | None,
     listen: HostPort,
-    token: str | None,
     overwrite: bool,
 ) -> None:
     """Track objects between boxes at keyframes, and say which frames are right.
 
     VIDEO is a file or a folder of images. Without boxes, the command serves a
-    page on which they are drawn, see --listen and --token of catstream view;
-    each box is saved at once, and the same command continues. Ctrl-C or the
-    button Done ends it.
+    page on which they are drawn, for users with the token in its link, as
+    catstream view does; each box is saved at once, and the same command
+    continues. Ctrl-C or the button Done ends it.
 
     With boxes, it tracks and ends. Frames count from 0. A box is absent where
     the object is not in the frame: anna@412=absent. An object without a name is
@@ -105,7 +103,7 @@ def annotate(
             results.check(overwrite=overwrite or continues)
             if continues:
                 annotation.set_boxes(by_object(read_keyframes(results.keyframes)))
-            interrupted = _serve(annotation, jobs, results, listen, token)
+            interrupted = _serve(annotation, jobs, results, listen)
     _report(annotation)
     click.echo(f"results: {results.folder}")
     if interrupted:
@@ -128,13 +126,13 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
     return interrupted
 
 
-def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: HostPort, token: str | None) -> bool:
+def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: HostPort) -> bool:
     """Serve the page until it is done or interrupted, and write the results; return whether it was interrupted."""
     from catstream.annotation.session import Session
 
     with Session(annotation, jobs, results.save, results.write) as session:
         results.begin()
-        interrupted = serve(session, listen, token)
+        interrupted = serve(session, listen)
     if interrupted and session.decoded:
         with INTERRUPTS.deferred():
             results.write()
@@ -143,12 +141,11 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
     return interrupted
 
 
-def serve(session: Session, listen: HostPort, token: str | None) -> bool:
+def serve(session: Session, listen: HostPort) -> bool:
     """Serve the page of a session until it is done or interrupted; return whether it was interrupted."""
     from catstream.web.annotator import AnnotationSite
-    from catstream.web.server import Server
 
-    server = Server(AnnotationSite(session), host=listen.host, port=listen.port, token=token)
+    server = server_of(AnnotationSite(session), listen)
     with server.in_background():
         for url in server.urls:
             click.echo(url)

@@ -17,7 +17,7 @@ from catstream.base.threads import cores
 from catstream.cli.annotate import serve, show_progress
 from catstream.cli.common import INTERRUPTS, line_of, messages, screen, stopped, table
 from catstream.cli.options import FOLDER, PATH, with_overrides, with_overwrite, with_reading
-from catstream.cli.view import HostPort, with_listen, with_token
+from catstream.cli.view import HostPort, with_listen
 from catstream.errors import BoxError, CatstreamError, VideoError
 
 _NUMBERS = ("objects", "frames", "present", "doubtful", "checked")
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 @click.option("--output", type=FOLDER, required=True, help="Folder for the results.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Videos at a time; by default, the number of cores.")
 @with_listen
-@with_token()
 @with_overwrite
 @with_overrides
 @with_reading
@@ -43,7 +42,6 @@ def batch(
     output: Path,
     jobs: int | None,
     listen: HostPort,
-    token: str | None,
     overwrite: bool,
 ) -> None:
     """Track objects in many videos.
@@ -54,7 +52,7 @@ def batch(
     frames, it is tracked between them and checked, as by catstream annotate.
 
     With --ask, the command first serves a page on which boxes are drawn in the
-    first frame of each VIDEO, see --listen and --token of catstream view. Each box
+    first frame of each VIDEO, with a token as for catstream view. Each box
     is saved at once in boxes.csv, and the button Done begins to track.
 
     A video that fails does not stop the others; the exit status is then 1. The
@@ -80,7 +78,7 @@ def batch(
     if not files or (len(files) > 1 and not ask):
         raise click.UsageError("expected one file BOXES, or videos after --ask")
     settings = Settings.from_values(overrides)
-    boxes = _draw_boxes(files, output, settings, listen, token, overwrite=overwrite) if ask else files[0]
+    boxes = _draw_boxes(files, output, settings, listen, overwrite=overwrite) if ask else files[0]
     videos = read_videos(boxes)
     if not videos:
         raise VideoError(f"{boxes} has no box: add a row for each object")
@@ -104,7 +102,7 @@ def batch(
 
 
 def _draw_boxes(
-    videos: tuple[Path, ...], output: Path, settings: Settings, listen: HostPort, token: str | None, *, overwrite: bool
+    videos: tuple[Path, ...], output: Path, settings: Settings, listen: HostPort, *, overwrite: bool
 ) -> Path:
     """Serve the page on which boxes are drawn in first frames until it is done; return the table of boxes."""
     from catstream.annotation.first_frames import FirstFrames
@@ -136,7 +134,7 @@ def _draw_boxes(
                 raise BoxError("no box is drawn: draw one, or press Ctrl-C where the command runs")
 
         session = stack.enter_context(Session(frames, 1, lambda: write_boxes(table, frames.boxes), check))
-        if serve(session, listen, token):
+        if serve(session, listen):
             stopped(f"the boxes so far are saved in {table}; the same command continues")
     return table
 

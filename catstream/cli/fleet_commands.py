@@ -22,7 +22,7 @@ from catstream.base.names import split_name
 from catstream.cli.attach import with_fleet_address
 from catstream.cli.common import screen, table
 from catstream.cli.options import PATH, with_json
-from catstream.cli.view import HostPort, fleet_view, token_of_page, with_view
+from catstream.cli.view import HostPort, fleet_view, server_of, with_view
 from catstream.client.address import Address
 from catstream.errors import FleetError
 from catstream.messages.kinds import FleetStatus, StreamStatus
@@ -107,14 +107,11 @@ def up(running: Fleet, view: HostPort | None) -> None:
 
 def _serve(fleet: Fleet, view: HostPort, stack: ExitStack) -> None:
     """Serve the page of a fleet that ends with this command until the stack is left."""
-    from catstream.web.server import Server
     from catstream.web.wall import Wall
 
     if not fleet.is_owner:
         raise click.UsageError("--view needs a fleet that ends with this command: use catstream fleet view")
-    server = Server(
-        Wall(Address(fleet=fleet.name)), host=view.host, port=view.port, token=token_of_page(), attempts=view.attempts
-    )
+    server = server_of(Wall(Address(fleet=fleet.name)), view)
     stack.enter_context(server.in_background())
     for url in server.urls:
         click.echo(f"page: {url}")

@@ -29,7 +29,7 @@ from catstream.cli.options import (
     with_reading,
 )
 from catstream.cli.progress import REFRESH_SECONDS, RunProgress
-from catstream.cli.view import HostPort, token_of_page, with_view
+from catstream.cli.view import HostPort, server_of, with_view
 from catstream.client.address import Address
 from catstream.jobs.job import Results
 from catstream.jobs.state import contains_run, files_of_state
@@ -278,10 +278,9 @@ class _Run:
         """Serve the web page of the pipeline until the stack is left."""
         from catstream.web.app import Site
         from catstream.web.feed import PipelineFeed
-        from catstream.web.server import Server
 
         feed = PipelineFeed(Address(self.pipeline.endpoint, keys=self.pipeline.settings.run.keys))
-        server = Server(Site(feed), host=view.host, port=view.port, token=token_of_page(), attempts=view.attempts)
+        server = server_of(Site(feed), view)
         stack.enter_context(server.in_background())
         stack.callback(feed.wait_for_end)
         for url in server.urls:

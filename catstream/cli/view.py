@@ -10,12 +10,13 @@ import click
 
 from catstream.base.files import state_home, write_atomically
 from catstream.cli.attach import with_address, with_fleet_address
-from catstream.cli.options import Decorator, combined
 from catstream.client.address import Address
 from catstream.errors import ServiceError
 
 if TYPE_CHECKING:
+    from catstream.web.annotator import AnnotationSite
     from catstream.web.app import Site
+    from catstream.web.server import Server
     from catstream.web.wall import Wall
 
 #: The port of the page if none is given.
@@ -52,7 +53,7 @@ class HostPortType(click.ParamType):  # type: ignore[type-arg]  # generic since 
         return HostPort(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port), attempts)
 
 
-#: In the place of a token: everybody on this machine may use the page.
+#: In the place of a token: every user of this machine may use the page.
 _OPEN = "none"
 
 
@@ -71,26 +72,16 @@ def _token_of_user() -> str:
     return token
 
 
-def token_of_page(token: str | None = None) -> str | None:
-    """Return a token, or else the variable VIEW_TOKEN, or the token of the user; None for "none"."""
-    token = token or os.environ.get("VIEW_TOKEN")
-    return None if token == _OPEN else token or _token_of_user()
+def token_of_page() -> str | None:
+    """Return the variable VIEW_TOKEN, or else the token of the user; None for "none"."""
+    token = os.environ.get("VIEW_TOKEN") or _token_of_user()
+    return None if token == _OPEN else token
 
 
-def with_token() -> Decorator:
-    """Add --token, as the argument `token` of `token_of_page`."""
-    return combined(
-        "token",
-        token_of_page,
-        click.option(
-            "--token",
-            envvar="VIEW_TOKEN",
-            show_envvar=True,
-            metavar="TOKEN",
-            help="Token for access to the page, at least 16 characters; by default a random one for each user. "
-            '"none" lets every user of this machine watch and control.',
-        ),
-    )
+def server_of(site: Site | Wall | AnnotationSite, listen: HostPort) -> Server:
+    from catstream.web.server import Server
+
+    return Server(site, host=listen.host, port=listen.port, attempts=listen.attempts, token=token_of_page())
 
 
 #: Adds `--view`, which serves a page during a command.
@@ -116,8 +107,7 @@ with_listen = click.option(
 @click.command()
 @with_address
 @with_listen
-@with_token()
-def view(address: Address, listen: HostPort, token: str | None) -> None:
+def view(address: Address, listen: HostPort) -> None:
     """Watch and control a running pipeline in a browser.
 
     The page shows the picture with the box of each object, the score, frames
@@ -128,8 +118,9 @@ def view(address: Address, listen: HostPort, token: str | None) -> None:
     Only users with the token can watch and control: open the printed link,
     which ends with it. The token is generated once and stored in
     ~/.local/state/catstream/view-token; delete the file to generate a new one. The
-    connection is not encrypted: from other machines, use an ssh tunnel, or a
-    proxy with TLS.
+    variable VIEW_TOKEN sets another one of at least 16 characters; "none" lets every
+    user of this machine watch and control. The connection is not encrypted: from
+    other machines, use an ssh tunnel, or a proxy with TLS.
 
     \b
     EXAMPLES
@@ -142,14 +133,13 @@ def view(address: Address, listen: HostPort, token: str | None) -> None:
 
     if address.endpoint:
         address.resolve()  # raises errors that waiting does not solve
-    _serve(Site(PipelineFeed(address)), listen, token)
+    _serve(Site(PipelineFeed(address)), listen)
 
 
 @click.command("view")
 @with_fleet_address
 @with_listen
-@with_token()
-def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
+def fleet_view(address: Address, listen: HostPort) -> None:
     """Watch all streams of a fleet in a browser.
 
     The page is a wall of pictures, those in trouble first, and a table of the
@@ -165,14 +155,12 @@ def fleet_view(address: Address, listen: HostPort, token: str | None) -> None:
     """
     from catstream.web.wall import Wall
 
-    _serve(Wall(address), listen, token)
+    _serve(Wall(address), listen)
 
 
-def _serve(site: Site | Wall, listen: HostPort, token: str | None) -> None:
+def _serve(site: Site | Wall, listen: HostPort) -> None:
     """Print the links of a site, and serve it until Ctrl-C or SIGTERM."""
-    from catstream.web.server import Server
-
-    server = Server(site, host=listen.host, port=listen.port, token=token)
+    server = server_of(site, listen)
     for url in server.urls:
         click.echo(url)
     server.run()

@@ -73,7 +73,7 @@ class Server:
         if token is None and host not in _LOOPBACK:
             raise ServiceError(
                 f"{host} can be reached from other machines, and anyone who opens the page may control the pipeline: "
-                "serve it with a token (without --token none), or listen on 127.0.0.1"
+                "serve it with a token (without VIEW_TOKEN=none), or listen on 127.0.0.1"
             )
         app = Guard(site.app, token)
         self._socket = _listen(host, port, attempts)

@@ -275,7 +275,7 @@ def test_browser_may_open_two_pages_at_two_ports(serve):
 
 
 def test_public_address_requires_a_long_token():
-    for token, why in ((None, "without --token none"), ("secret", "the token is too short")):
+    for token, why in ((None, "without VIEW_TOKEN=none"), ("secret", "the token is too short")):
         with pytest.raises(ServiceError, match=why):
             Server(Site(PipelineFeed(Address())), host="0.0.0.0", port=0, token=token)
 

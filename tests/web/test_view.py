@@ -10,9 +10,8 @@ from pathlib import Path
 import click
 import httpx
 import pytest
-from click.testing import CliRunner
 
-from catstream.cli.view import HostPortType, with_token
+from catstream.cli.view import HostPortType, token_of_page
 
 PATHS = ["/", "/events", "/live.mjpeg", "/pictures/1.jpg", "/metrics", "/streams/roof/", "/streams/roof/events"]
 OTHER_USER = 65534
@@ -22,8 +21,8 @@ OTHER_USER = 65534
 def started(catstream):
     """Starts a command, which prints the link of its page: the process, and the link."""
 
-    def start(*words):
-        process = catstream(*words, env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    def start(*words, **variables):
+        process = catstream(*words, env=os.environ | {"PYTHONUNBUFFERED": "1"} | variables)
         return process, process.stdout.readline().strip()
 
     return start
@@ -60,7 +59,7 @@ def test_another_user_of_the_machine_can_neither_watch_nor_steer(started, words)
 
 
 def test_with_no_token_the_page_is_open_to_every_user_of_the_machine_until_sigterm(started):
-    process, link = started("view", "--listen", "127.0.0.1:0", "--token", "none")
+    process, link = started("view", "--listen", "127.0.0.1:0", VIEW_TOKEN="none")
     with another_user(), httpx.Client(base_url=link, verify=False) as stranger:
         assert [stranger.get(path).status_code for path in ("/", "/metrics")] == [200, 200]
     process.terminate()
@@ -73,28 +72,23 @@ def test_a_malformed_address_is_an_error(text):
         HostPortType().convert(text, None, None)
 
 
-def test_the_token_of_a_page_is_from_an_option_or_a_variable_or_that_of_the_user(tmp_path, monkeypatch):
-    @click.command()
-    @with_token()
-    def command(token):
-        click.echo(str(token))
-
-    def says(*words, **variables):
-        return CliRunner().invoke(command, list(words), env=variables, standalone_mode=False).output
+def test_the_token_of_a_page_is_from_a_variable_or_that_of_the_user(tmp_path, monkeypatch):
+    def token(variable=""):
+        monkeypatch.setenv("VIEW_TOKEN", variable)
+        return token_of_page()
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     file = tmp_path / "catstream" / "view-token"
-    made = [says(), says(VIEW_TOKEN="")]
-    assert re.fullmatch(r"[0-9a-f]{32}\n", made[0])
-    assert made == [made[0], file.read_text()]
+    made = [token(), token()]
+    assert re.fullmatch(r"[0-9a-f]{32}", made[0])
+    assert made == [made[0], file.read_text().strip()]
     assert file.stat().st_mode & 0o777 == 0o600
     file.chmod(0o644)
-    assert says() != made[0], "others may have read it"
+    assert token() != made[0], "others may have read it"
     monkeypatch.setenv("XDG_STATE_HOME", "/dev/null")
-    assert says() != says(), "it cannot be kept"
-    assert says("--token", "none") == "None\n"
-    assert says("--token", "given-on-the-line", VIEW_TOKEN="from-a-variable-1") == "given-on-the-line\n"
-    assert says(VIEW_TOKEN="from-a-variable-1") == "from-a-variable-1\n"
+    assert token() != token(), "it cannot be kept"
+    assert token("none") is None
+    assert token("from-a-variable-1") == "from-a-variable-1"
 
 
 BOARD = Path(__file__).parents[2] / "docs" / "grafana.json"
