@@ -52,8 +52,7 @@ export class Charts {
     const now = this.rows.at(-1)?.[0];
     right.textContent = points.at(-1)?.[0] === now && now !== undefined ? `${show(values.at(-1))}${unit && ` ${unit}`}` : "–";
     drawing.replaceChildren();
-    drawing.setAttribute("aria-label", values.length ? `${title}: ${right.textContent}, from ${show(Math.min(...values))} to `
-      + `${show(Math.max(...values))} in the last two minutes; shaded: the object was absent` : `${title}: nothing yet`);
+    drawing.setAttribute("aria-label", `${title}: ${right.textContent}`);
     if (!all.length) return;
     const [wide, tall] = [drawing.clientWidth, drawing.clientHeight];
     const seconds = Math.min(SECONDS, Math.max(FEWEST, now - all[0][0]));

@@ -16,7 +16,6 @@ export class StreamPage {
     this.server = server;
     this.name = decodeURIComponent(location.pathname).match(/\/streams\/([^/]+)\/$/)?.[1] ?? ""; // empty if there is one stream
     this.status = { phase: "waiting", state: "none", paused: false };
-    this.frame = null; // number and time of the newest frame
     this.charts = new Charts($(".charts"));
     this.trees = new Trees($(".trees"), $("#tree-summary"));
     this.objects = new Objects($(".objects"), { choose: (name) => this.showChosen(name), forget: (name) => this.forget(name) });
@@ -48,10 +47,9 @@ export class StreamPage {
       this.showState();
     }
     if (tracks) {
-      this.frame = tracks.frame === null ? null : { number: tracks.frame, time: tracks.time };
+      write($("#frame"), tracks.frame === null ? "" : `frame ${tracks.frame}, ${tracks.time.toFixed(1)} s`);
       this.objects.show(tracks.objects);
       this.showObjects();
-      this.showFrame();
       this.showState();
     }
     if (picture) this.stage.show(picture).then(() => this.showState());
@@ -148,7 +146,6 @@ export class StreamPage {
     this.charts.choose(name);
     this.trees.choose(name);
     if (this.stage.drawing) this.form.offer();
-    this.showFrame();
     this.showObjects();
   }
 
@@ -159,12 +156,6 @@ export class StreamPage {
     $("#stream").classList.toggle("several", !single);
     for (const target of document.querySelectorAll(".of")) write(target, single ? "" : ` of ${chosen || "the object without a name"}`);
     this.stage.draw();
-  }
-
-  showFrame() {
-    const model = this.objects.get(this.objects.chosen)?.version;
-    const { number, time } = this.frame ?? {};
-    write($("#frame"), this.frame ? `frame ${number}, ${time.toFixed(1)} s${model === undefined ? "" : `, model ${model}`}` : "");
   }
 
   showState() {

@@ -1,5 +1,5 @@
 // The coreset trees. Of a tree its leaves are known: the levels of its nodes are the binary digits of their number,
-// since two nodes of a level are always merged. Each node is drawn at the height of its level, above the bar of its leaves.
+// since two nodes of a level are always merged. Each node is drawn at the height of its level, above its leaves.
 
 import { add, figure, make, many } from "./dom.js";
 
@@ -51,7 +51,7 @@ export class Trees {
     const drawn = kept.flatMap(({ level, from }) => {
       const width = apart * 2 ** level, x = EDGE + apart * from, y = HEIGHT - 16 - rise * level;
       const node = make("circle", { cx: x + width / 2, cy: y, r: Math.max(2.5, Math.min(6, width / 2)) });
-      const span = make("rect", { x: x + 0.5, y: HEIGHT - 10, width: Math.max(1, width - 1), height: 4 });
+      const span = make("polygon", { points: `${x + width / 2},${y} ${x},${HEIGHT - 8} ${x + width},${HEIGHT - 8}` });
       return width > 9 ? [span, node, make("text", { x: x + width / 2, y: y - 9 }, String(level))] : [span, node];
     });
     tree.drawing.replaceChildren(...drawn);
