@@ -18,7 +18,7 @@ from catstream.sinks import exports
 from catstream.sinks.annotations import About, classes_of
 from catstream.sinks.destinations import Head
 from catstream.sinks.exports import EXPORTS
-from catstream.sinks.track_log import Log, logs_of
+from catstream.sinks.track_log import JoinedLog, Log, logs_of
 from catstream.video.source import VIDEOS, open_source
 
 
@@ -37,7 +37,7 @@ def _classes(context: click.Context, parameter: click.Parameter, text: str) -> l
 
 
 @click.command()
-@click.argument("log", type=PATH)
+@click.argument("files", type=PATH, nargs=-1, required=True, metavar="LOG...")
 @click.argument("dest", type=PATH)
 @click.option("--format", "name", type=click.Choice(list(EXPORTS)), help="Format of DEST; required for a folder.")
 @click.option("--source", help="Tracked video or folder, if LOG does not state it (CSV) or it was moved.")
@@ -59,7 +59,7 @@ def _classes(context: click.Context, parameter: click.Parameter, text: str) -> l
 @with_overwrite
 @with_table(EXPORTS)
 def export(
-    log: Path,
+    files: tuple[Path, ...],
     dest: Path,
     name: str | None,
     source: str | None,
@@ -72,8 +72,8 @@ def export(
     """Convert the log of a run to another format.
 
     LOG is an .ndjson, .sqlite or .csv file of `catstream track` or `catstream
-    sink`. For yolo, it may be the folder of `catstream batch`, whose logs
-    become one data set. The extension of DEST or --format selects the format.
+    sink`, all rotated files of one run, or their folder. For yolo, it may be the
+    folder of `catstream batch`, whose logs become one data set. The extension of DEST or --format selects the format.
     Frames have their numbers in the source. CSV lacks the `doubtful` flag and
     the frame in which a reused name began.
 
@@ -83,6 +83,7 @@ def export(
     EXAMPLES
       catstream export out/walk.ndjson walk.sqlite
       catstream export out/walk.ndjson walk.xml --label person
+      catstream export out/gate*.ndjson gate.csv
       catstream export out/walk.ndjson dataset --format yolo --images --classes dog,cat
     """
     form = exports.export_of(dest, name)
@@ -90,17 +91,18 @@ def export(
         raise click.UsageError("--classes requires a format with classes: coco, cvat or yolo")
     if images and form is not EXPORTS["yolo"]:
         raise click.UsageError("--images requires --format yolo")
-    if log.is_dir() and form.suffix:
-        raise VideoError(f"{log} is a folder, and this format holds one video: pass one of its logs, or --format yolo")
-    logs = [Log(path, skip_damaged=skip_damaged) for path in logs_of(log)]
+    logs: list[Log] = [Log(path, skip_damaged=skip_damaged) for file in files for path in logs_of(file)]
     for content in logs:
         if next(content.frames(), None) is None:
             raise VideoError(f"{content.path} contains no tracks")
+    if form.suffix and len(logs) > 1:
+        logs = [JoinedLog(logs)]
     if not form.suffix:
         classes = classes or [*dict.fromkeys(name for content in logs for name in classes_of(content, label))]
         if dest.absolute().parent.is_dir():  # another export into this folder waits
             click.get_current_context().with_resource(locked_folder(dest.absolute().parent, VideoError, math.inf))
-    exports.check_export(dest, form, overwrite=overwrite, log=log)
+    for file in files:
+        exports.check_export(dest, form, overwrite=overwrite, log=file)
     for content in logs:
         path = content.path
         about = About(path.stem, content.head() or Head(), label=label, classes=classes, is_first=content is logs[0])

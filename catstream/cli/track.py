@@ -31,10 +31,12 @@ from catstream.cli.options import (
 from catstream.cli.progress import REFRESH_SECONDS, RunProgress
 from catstream.cli.view import HostPort, server_of, with_view
 from catstream.client.address import Address
+from catstream.errors import SettingsError
 from catstream.jobs.job import Results
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import STDOUT, Origin, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.destinations import STDOUT, Origin, SinkOptions, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.options import parse_rotation
 from catstream.sinks.track_log import OpenFiles, RunFiles, places_of
 
 _SAME = 0.95  # overlap of boxes that were meant to be one
@@ -55,6 +57,8 @@ def _files_only(_: click.Context, __: click.Parameter, places: tuple[str, ...]) 
 @click.option("--output", type=PATH, metavar="DIR", help="Folder for the results.")
 @click.option("--video/--no-video", default=None, help="Also write the annotated video.")
 @click.option("--write", multiple=True, metavar="FILE", callback=_files_only, help="Write tracks to FILE; repeatable.")
+@click.option("--rotate", metavar="1d|500MB", help="Rotate the files of a live source.")
+@click.option("--keep", type=click.IntRange(min=1), metavar="N", help="Rotated files to keep.")
 @with_overwrite
 @with_files("--save-model", "saved", "Save the model of an object at the end.")
 @with_view
@@ -73,6 +77,8 @@ def track(
     output: Path | None,
     video: bool | None,
     write: tuple[str, ...],
+    rotate: str | None,
+    keep: int | None,
     overwrite: bool,
     saved: dict[str, Path],
     view: HostPort | None,
@@ -117,6 +123,10 @@ def track(
         raise click.UsageError(
             f"{option} and --overwrite are mutually exclusive (continue / replace the existing results)"
         )
+    try:
+        options = SinkOptions(rotate=parse_rotation(rotate) if rotate else None, keep=keep or 0)
+    except SettingsError as error:
+        raise click.UsageError(f"--rotate: {error}") from None
     if UNNAMED in saved and len(boxes) + len(models) > 1:
         raise click.UsageError("--save-model FILE is for a single object: pass NAME=FILE for each of several")
     console, notice = messages(), ""
@@ -139,7 +149,7 @@ def track(
             models={name: file.absolute() for name, file in saved.items()},
         ),
     )
-    run = _Run(pipeline, resume or state, resume is not None, STDOUT in write, overwrite, view)
+    run = _Run(pipeline, resume or state, resume is not None, STDOUT in write, overwrite, view, options)
     run.check()
     doubts = _doubtful(boxes, *pipeline.size)
     objects = {*boxes, *models}
@@ -215,6 +225,7 @@ class _Run:
     stdout      whether tracks are also written to standard output
     overwrite   whether existing files are replaced
     view        address of the web page; None for none
+    options     when the logs are rotated
     """
 
     pipeline: Pipeline
@@ -223,13 +234,14 @@ class _Run:
     stdout: bool
     overwrite: bool
     view: HostPort | None
+    options: SinkOptions
 
     @property
     def files(self) -> RunFiles:
         """All files of tracks."""
         pipeline = self.pipeline
         places = [*places_of(pipeline.name, pipeline.results), *([STDOUT] if self.stdout else [])]
-        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys))
+        origin = Origin(pipeline.head, Address(keys=pipeline.settings.run.keys), self.options)
         return RunFiles(origin, pipeline.results.output, places)
 
     def check(self) -> None:

@@ -102,9 +102,16 @@ class Head:
             raise VideoError(f"the head of the log is invalid ({error})") from None
 
 
+class Rotation(NamedTuple):
+    """When a log is renamed and a new one begins: in a new period of these seconds in UTC, or above these bytes."""
+
+    seconds: float
+    bytes: float
+
+
 @dataclass(frozen=True, slots=True)
 class SinkOptions:
-    """Options of the destinations that receive events; `catstream.sinks.options` has their table.
+    """Options of the destinations; `catstream.sinks.options` has their table.
 
     zone         corners of each zone, a polygon in pixels of the frame, by name
     when         kinds of events that are sent, see `catstream.sinks.events.WHEN`
@@ -112,6 +119,8 @@ class SinkOptions:
     picture      whether each event has the newest picture of the pipeline
     secret_file  file of the key that signs events; None to sign nothing
     megabytes    limit of the size of a folder
+    rotate       when the logs of a live source are renamed; None for never
+    keep         number of renamed logs that remain, 0 for all
     """
 
     zone: dict[str, tuple[Point, ...]] = field(default_factory=dict)
@@ -120,6 +129,8 @@ class SinkOptions:
     picture: bool = False
     secret_file: Path | None = None
     megabytes: float = 1000.0
+    rotate: Rotation | None = None
+    keep: int = 0
 
 
 @dataclass(frozen=True, slots=True)

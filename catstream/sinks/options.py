@@ -1,10 +1,12 @@
-"""THE TABLE of options of the destinations that receive events: options of `catstream sink`, keys of a fleet's file."""
+"""THE TABLE of options of destinations: options of `catstream sink`, keys of a fleet's file."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,11 +15,13 @@ from msgspec import Meta
 
 from catstream.base.addresses import without_password
 from catstream.errors import CatstreamError, SettingsError
-from catstream.sinks.destinations import STDOUT, SinkOptions, check_sink, kind_of
+from catstream.sinks.destinations import STDOUT, Rotation, SinkOptions, check_sink, kind_of
 from catstream.sinks.events import KINDS, WHEN, Point, check_zones
 
 _LONGEST_SECONDS = 86400.0  # without a box, after which an object is lost
 
+_UNITS = {"h": 3600.0, "d": 86400.0, "MB": 1e6, "GB": 1e9}
+_LOGS = (".ndjson", ".csv")
 _MQTT, _HTTP, _FOLDER = ("mqtt://", "mqtts://"), ("http://", "https://"), ("/",)
 
 
@@ -53,6 +57,18 @@ def parse_when(text: str) -> dict[str, float]:
     if not 0 <= when.get("lost", 0.0) <= _LONGEST_SECONDS:
         raise SettingsError(f"expected 0 to {_LONGEST_SECONDS:g} seconds, as in lost=10, got {text!r}")
     return when
+
+
+def parse_rotation(text: str) -> Rotation:
+    """Return when a log is rotated; SettingsError if the text is invalid.
+
+    >>> parse_rotation("1d"), parse_rotation("500MB")
+    (Rotation(seconds=86400.0, bytes=inf), Rotation(seconds=inf, bytes=500000000.0))
+    """
+    if not (match := re.fullmatch(r"([1-9]\d*)(h|d|MB|GB)", text)):
+        raise SettingsError(f"expected a time or a size, as 12h, 1d, 500MB or 2GB, got {text!r}")
+    size = int(match[1]) * _UNITS[match[2]]
+    return Rotation(size, inf) if match[2] in "hd" else Rotation(inf, size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +125,21 @@ OPTIONS = {
         "N",
         "Size of a folder above which its oldest pictures are removed; default: 1000.",
         _FOLDER,
+    ),
+    "rotate": Option(
+        str,
+        'a text, for example "1d" or "500MB"',
+        "1d|500MB",
+        "Rotate the NDJSON and CSV files of a live source.",
+        _LOGS,
+        parse_rotation,
+    ),
+    "keep": Option(
+        Annotated[int, Meta(ge=1)],
+        "a whole number of at least 1",
+        "N",
+        "Rotated files that are kept of each; default: all.",
+        _LOGS,
     ),
 }
 

@@ -13,12 +13,14 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import sys
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from itertools import groupby, pairwise
 from math import isfinite, isnan
 from pathlib import Path
@@ -36,6 +38,7 @@ from catstream.sinks.database import read_database, read_database_head
 from catstream.sinks.destinations import (
     Head,
     Origin,
+    Rotation,
     Sink,
     TrackedFrame,
     check_result,
@@ -71,6 +74,7 @@ class LineSink(ABC):
         self.path, self._origin = Path(place), origin
         self._before = _FIRST if origin.last is None else _objects(origin.last)
         self._gap = 0  # frames since the last one that was written
+        self._is_rotated = False  # since the last one
         self._open(origin.size)
 
     @abstractmethod
@@ -93,8 +97,27 @@ class LineSink(ABC):
             self._gap += 1
             self._remove_part()
             raise
-        self._gap, self._before = 0, _objects(frame)
+        self._gap, self._is_rotated, self._before = 0, False, _objects(frame)
         self._status = os.fstat(self._file.fileno())
+
+    def must_rotate(self, rotation: Rotation, now: float) -> bool:
+        """Return whether the file is too large, or its last row is of an earlier period."""
+        is_old = self._status.st_mtime // rotation.seconds < now // rotation.seconds
+        return not self._file.closed and (is_old or self._status.st_size > rotation.bytes)
+
+    def rotate(self, now: float) -> None:
+        """Rename the file, and remove the oldest renamed ones; the next frame begins a new file."""
+        keep, target = self._origin.options.keep, _with_time(self.path, now)
+        if target.exists():  # from this second
+            return
+        with writing(self.path, VideoError):
+            self._file.close()
+            self._is_rotated = True
+            self.path.rename(target)
+            name = re.compile(rf"{re.escape(self.path.stem)}-\d{{8}}T\d{{6}}{self.path.suffix}")
+            renamed = sorted(file for file in self.path.parent.iterdir() if name.fullmatch(file.name))
+            for file in renamed[: len(renamed) - keep] if keep else ():
+                file.unlink()
 
     def close(self) -> None:
         """Close the file."""
@@ -135,7 +158,7 @@ class LineSink(ABC):
                 if status.st_size >= self._status.st_size:
                     return
                 rest, problem = self.path.read_bytes().rfind(b"\n") + 1, "truncated"
-        if not self._gap:
+        if not self._gap and not self._is_rotated:
             Warnings(str(self.path)).log(f"{problem} by another program; the log goes on there without the rows before")
         self._file.close()
         with writing(self.path, VideoError):
@@ -329,6 +352,33 @@ class Log:
         return parse
 
 
+def _with_time(path: Path, seconds: float) -> Path:
+    """Return the name of a file that is renamed: the names sort by the time, in UTC, and before the newest one."""
+    return path.with_stem(f"{path.stem}-{datetime.fromtimestamp(seconds, UTC):%Y%m%dT%H%M%S}")
+
+
+class JoinedLog(Log):
+    """The rotated files of one run, read as one log. VideoError if they are of several sources, or repeat a frame."""
+
+    def __init__(self, logs: Iterable[Log]) -> None:
+        self._logs = sorted(logs, key=lambda log: next(log.frames()).number)
+        if len({(log.head() or Head()).source for log in self._logs}) > 1:
+            raise VideoError("the logs are of several sources: pass the files of one run, or --format yolo")
+        super().__init__(self._logs[-1].path)
+
+    def frames(self) -> Iterator[TrackedFrame]:
+        last = -1
+        for log in self._logs:
+            for frame in log.frames():
+                if frame.number <= last:
+                    raise VideoError(f"{log.path} has frame {frame.number} again: pass the files of one run")
+                last = frame.number
+                yield frame
+        self.damaged, self.gap = (
+            sum(each) for each in zip(*((log.damaged, log.gap) for log in self._logs), strict=True)
+        )
+
+
 def _parse_row(row: Mapping[str, str]) -> Track:
     """The track of a row of a CSV file; raise ValueError or KeyError if it is none.
 
@@ -448,7 +498,8 @@ class RunFiles:
             for frame in log.frames() if log is not None and last is not None and followers else ():
                 for sink in followers:
                     sink.write(frame)
-            return OpenFiles(sinks, stack.pop_all(), continues=is_live(origin.head.source))
+            continues = is_live(origin.head.source)
+            return OpenFiles(sinks, stack.pop_all(), continues=continues, rotation=origin.options.rotate)
 
     def continued(self, endpoint: str, *, resume: bool) -> OpenFiles:
         """The same for an unattended run: a file that is not continued is renamed, and folders are created.
@@ -459,8 +510,7 @@ class RunFiles:
             with writing(place, VideoError):
                 place.parent.mkdir(parents=True, exist_ok=True)
                 if place.exists() and not (resume and self._log() is not None):
-                    changed = datetime.fromtimestamp(place.stat().st_mtime)
-                    place.rename(place.with_stem(f"{place.stem}-{changed:%Y%m%dT%H%M%S}"))
+                    place.rename(_with_time(place, place.stat().st_mtime))
         self.check(overwrite=True, earlier=[])
         return self.opened(endpoint, resume=resume)
 
@@ -479,13 +529,18 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
     trouble  why the newest frame could not be written; empty if it was
     """
 
-    def __init__(self, sinks: Sequence[Sink], stack: ExitStack, *, continues: bool) -> None:
+    def __init__(
+        self, sinks: Sequence[Sink], stack: ExitStack, *, continues: bool, rotation: Rotation | None = None
+    ) -> None:
         self._sinks, self._stack, self._continues = sinks, stack, continues
+        self._rotation = rotation if continues else None
         self._warnings = Warnings("results")
         self.missed, self.trouble = 0, ""
 
     def write(self, frame: TrackedFrame) -> None:
         """Write a frame everywhere."""
+        if self._rotation is not None:
+            self._rotate(self._rotation)
         problem = ""
         for sink in self._sinks:
             try:
@@ -499,6 +554,15 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
         self.trouble = problem
         if not problem:
             self._warnings.working()
+
+    def _rotate(self, rotation: Rotation) -> None:
+        """Rotate all logs at the same frame: a resumed run makes them again from the newest one."""
+        logs = [sink for sink in self._sinks if isinstance(sink, LineSink) and not isinstance(sink, StdoutSink)]
+        now = time.time()
+        if any(log.must_rotate(rotation, now) for log in logs):
+            for log in logs:
+                with suppress(VideoError):  # a file that another program removed
+                    log.rotate(now)
 
     def idle(self) -> None:
         """Tell the destinations that no frame has arrived for a while."""

@@ -130,7 +130,7 @@ def test_the_logs_of_a_batch_become_one_data_set(demo, succeed, fail, demo_video
     labels = sorted((tmp_path / "set" / "labels").iterdir())
     assert [file.stem.rpartition("_")[0] for file in labels] == ["cam"] * FRAMES + ["two_cam"] * FRAMES
     assert {file.read_text()[0] for file in labels[FRAMES:]} == {"1"}
-    assert "this format holds one video" in fail("export", tmp_path / "out", tmp_path / "all.xml")
+    assert "the logs are of several sources" in fail("export", tmp_path / "out", tmp_path / "all.xml")
     assert "contains no .ndjson file" in fail("export", tmp_path / "two", tmp_path / "set2", "--format", "yolo")
 
 

@@ -34,6 +34,7 @@ def test_values_of_a_file_and_of_the_command_line_give_the_same_options():
         ({"zone": {"door": "1,2 3,four 5,6"}}, "zone: expected the corners of door as X,Y X,Y X,Y ..., got"),
         ({"zone": {"door": ""}}, "zone: zone door: a polygon has at least 3 corners, got 0"),
         ({"zone": {"it's": "1,2 9,4 5,9"}}, "zone: zone: .* is not a name"),
+        ({"rotate": "1 week"}, "rotate: expected a time or a size, as 12h, 1d, 500MB or 2GB, got '1 week'"),
         ({"when": "gone"}, "when: expected some of found, lost, returned"),
         ({"when": "found=3"}, "when: expected some of found, lost, returned"),
         ({"when": ""}, "when: expected some of found, lost, returned"),
@@ -49,7 +50,7 @@ def test_values_of_a_file_and_of_the_command_line_give_the_same_options():
 )
 def test_an_invalid_value_is_an_error(values, error):
     with pytest.raises(SettingsError, match=f"^{error}"):
-        parse(values, [YARD, HOOK, "events/"])
+        parse(values, [YARD, HOOK, "events/", "t.csv"])
 
 
 @pytest.mark.parametrize(

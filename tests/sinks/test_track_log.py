@@ -8,8 +8,10 @@ import sys
 import tempfile
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
-from itertools import product
+from itertools import count, product
+from math import inf
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -19,8 +21,9 @@ from catstream.base.box import Box
 from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import Track
-from catstream.sinks.destinations import Head, Origin, TrackedFrame, open_sink
-from catstream.sinks.track_log import Log, RunFiles, places_of
+from catstream.sinks import track_log
+from catstream.sinks.destinations import Head, Origin, Rotation, SinkOptions, TrackedFrame, open_sink
+from catstream.sinks.track_log import JoinedLog, Log, RunFiles, places_of
 from catstream.video.rendered import write
 from catstream.video.source import open_source
 
@@ -114,6 +117,44 @@ def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_fil
         if source == "rtsp://cam":
             assert numbers[-20:] == [*range(numbers[-1] - 19, numbers[-1] + 1)]
             assert caplog.text.count(f"{log.path.name}' (No space") <= 1, "it is said once"
+
+
+@pytest.mark.parametrize("source", ["rtsp://cam", "walk.mp4"])
+def test_the_logs_of_a_live_source_rotate_together_and_are_read_as_one(tmp_path, source, monkeypatch, caplog):
+    clock = count(1_800_000_000)
+    monkeypatch.setattr(track_log, "time", SimpleNamespace(time=lambda: next(clock)))
+    options = SinkOptions(rotate=Rotation(inf, 1000), keep=2)
+    run = RunFiles(
+        Origin(Head(source=source), options=options), None, [str(tmp_path / "t.ndjson"), str(tmp_path / "t.csv")]
+    )
+    (tmp_path / "t-other.csv").touch()
+    with run.opened("run") as outputs:
+        for number in range(50):
+            outputs.write(TrackedFrame([track(number)]))
+    files = {suffix: sorted(tmp_path.glob(f"t*{suffix}")) for suffix in (".ndjson", ".csv")}
+    files[".csv"].remove(tmp_path / "t-other.csv")
+    assert [file.stem for file in files[".csv"]] == [file.stem for file in files[".ndjson"]]
+    assert len(files[".csv"]) == (3 if source == "rtsp://cam" else 1)
+    for paths in files.values():
+        assert paths[-1].stem == "t"
+        joined = JoinedLog(Log(path) for path in reversed(paths))
+        numbers = [frame.number for frame in joined]
+        assert numbers == [*range(numbers[0], 50)]
+        assert (numbers[0] > 0) == (source == "rtsp://cam")
+    assert not caplog.text
+    with run.opened("run", resume=True) as outputs:
+        outputs.write(TrackedFrame([track(50)]))
+    assert {[*Log(paths[-1])][-1].number for paths in files.values()} == {50}
+    with pytest.raises(VideoError, match=r"has frame \d+ again: pass the files of one run"):
+        list(JoinedLog([Log(tmp_path / "t.csv"), Log(tmp_path / "t.csv")]))
+
+
+def test_a_log_rotates_in_a_new_period_in_utc(tmp_path):
+    with closing(open_sink(str(tmp_path / "t.csv"), Origin())) as sink:
+        sink.write(TrackedFrame(TRACKS[:1]))
+        midnight = (tmp_path / "t.csv").stat().st_mtime // 86400 * 86400 + 86400
+        daily = Rotation(86400, inf)
+        assert [sink.must_rotate(daily, now) for now in (midnight - 1, midnight)] == [False, True]
 
 
 @pytest.mark.parametrize("disk", [4096], indirect=True)
