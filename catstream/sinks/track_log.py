@@ -116,7 +116,7 @@ class LineSink(ABC):
             self.path.rename(target)
             name = re.compile(rf"{re.escape(self.path.stem)}-\d{{8}}T\d{{6}}{self.path.suffix}")
             renamed = sorted(file for file in self.path.parent.iterdir() if name.fullmatch(file.name))
-            for file in renamed[: len(renamed) - keep] if keep else ():
+            for file in renamed[:-keep] if keep else ():
                 file.unlink()
 
     def close(self) -> None:

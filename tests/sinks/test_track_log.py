@@ -123,18 +123,22 @@ def test_a_full_disk_costs_a_live_source_rows_until_there_is_room_and_ends_a_fil
 def test_the_logs_of_a_live_source_rotate_together_and_are_read_as_one(tmp_path, source, monkeypatch, caplog):
     clock = count(1_800_000_000)
     monkeypatch.setattr(track_log, "time", SimpleNamespace(time=lambda: next(clock)))
-    options = SinkOptions(rotate=Rotation(inf, 1000), keep=2)
+    options = SinkOptions(rotate=Rotation(inf, 1000), keep=5)
     run = RunFiles(
         Origin(Head(source=source), options=options), None, [str(tmp_path / "t.ndjson"), str(tmp_path / "t.csv")]
     )
     (tmp_path / "t-other.csv").touch()
+    most = 0
     with run.opened("run") as outputs:
         for number in range(50):
             outputs.write(TrackedFrame([track(number)]))
+            renamed = len([*tmp_path.glob("t-2*.csv")])
+            assert renamed >= most, "none is removed below the limit"
+            most = renamed
     files = {suffix: sorted(tmp_path.glob(f"t*{suffix}")) for suffix in (".ndjson", ".csv")}
     files[".csv"].remove(tmp_path / "t-other.csv")
     assert [file.stem for file in files[".csv"]] == [file.stem for file in files[".ndjson"]]
-    assert len(files[".csv"]) == (3 if source == "rtsp://cam" else 1)
+    assert len(files[".csv"]) == (6 if source == "rtsp://cam" else 1)
     for paths in files.values():
         assert paths[-1].stem == "t"
         joined = JoinedLog(Log(path) for path in reversed(paths))
