@@ -25,6 +25,8 @@ class Counter:
 
     def take(self, event: Event) -> None:
         """Count an event, and print it if an object enters or leaves a zone."""
+        if event.track is None:  # an event of the source
+            return
         name, time, objects = event.track.object, event.track.time, self.inside[event.zone]
         if event.kind == "entered":
             objects[name] = time
