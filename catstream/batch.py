@@ -102,7 +102,8 @@ def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
         rows = list(csv.DictReader(table.read_text(encoding="utf-8-sig").splitlines(), restval=""))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise VideoError(
-            f"cannot read the boxes in {str(table)!r} ({error}): pass a CSV file file,object,x,y,w,h"
+            f"cannot read the boxes in {str(table)!r} ({getattr(error, 'strerror', None) or 'it is not a CSV file'}): "
+            "pass a table with the columns file, object, x, y, w, h, or --ask with videos"
         ) from None
     boxes: dict[str, list[Keyframe]] = {}
     for line, row in enumerate(rows, start=2):

@@ -123,7 +123,10 @@ class Workers:
         try:
             return future.result()
         except BrokenProcessPool:
-            raise ServiceError("a worker process was killed (out of memory?): try fewer --jobs") from None
+            raise ServiceError(
+                "a worker process has died: if memory was short, use fewer jobs; a Python program needs "
+                '`if __name__ == "__main__":` around its calls'
+            ) from None
 
     def run(self, work: Callable[..., _Result], tasks: Iterable[tuple[object, ...]]) -> Generator[_Result]:
         """Yield the result of `work(*task)` for each task, in order of completion.

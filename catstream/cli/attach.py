@@ -155,7 +155,7 @@ def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] 
                 continue
             before, reason = reason, re.sub(r"\d+", "", str(error))  # seconds that pass are no other reason
             if reason != before:
-                click.echo(f"waiting: {error}", err=True)
+                click.echo(f"waiting: {str(error).replace(f'{_IDLE_SECONDS:g} s', f'{silent:g} s', 1)}", err=True)
 
 
 def _described(value: bytes | np.ndarray) -> dict[str, object]:

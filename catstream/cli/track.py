@@ -35,7 +35,17 @@ from catstream.errors import SettingsError
 from catstream.jobs.job import Results
 from catstream.jobs.state import contains_run, files_of_state
 from catstream.pipeline import Pipeline
-from catstream.sinks.destinations import STDOUT, Origin, SinkOptions, TrackedFrame, check_result, is_file, redacted
+from catstream.sinks.destinations import (
+    SINKS,
+    STDOUT,
+    Origin,
+    SinkOptions,
+    TrackedFrame,
+    check_result,
+    is_file,
+    kind_of,
+    redacted,
+)
 from catstream.sinks.options import parse_rotation
 from catstream.sinks.track_log import OpenFiles, RunFiles, places_of
 
@@ -48,13 +58,17 @@ def _files_only(_: click.Context, __: click.Parameter, places: tuple[str, ...]) 
         if place != STDOUT and not is_file(place):
             where = redacted(place)
             raise click.UsageError(f"--write takes files, not {where}: attach it to the run, catstream sink {where}")
+        if kind_of(place) not in SINKS:
+            raise click.UsageError(
+                f"--write {place}: expected a name that ends with .ndjson, .csv, .sqlite or .mp4, or -"
+            )
     return places
 
 
 @click.command()
 @click.argument("source", required=False)
 @with_object
-@click.option("--output", type=PATH, metavar="DIR", help="Folder for the results.")
+@click.option("--output", type=FOLDER, metavar="DIR", help="Folder for the results.")
 @click.option("--video/--no-video", default=None, help="Also write the annotated video.")
 @click.option("--write", multiple=True, metavar="FILE", callback=_files_only, help="Write tracks to FILE; repeatable.")
 @click.option("--rotate", metavar="1d|500MB", help="Rotate the files of a live source.")

@@ -223,7 +223,7 @@ def _numbers(frames: Iterable[TrackedFrame], about: About, *, first: int = 0) ->
     """
     found = classes_of(frames, about.label)
     if about.classes and (lacking := [name for name in found if name not in about.classes]):
-        raise VideoError(f"--classes lacks {lacking[0]}: add it, or give all objects one class with --label")
+        raise VideoError(f"--classes lacks {lacking[0]!r}: add it, or give all objects one class with --label")
     return {name: number for number, name in enumerate(about.classes or found, first)}
 
 

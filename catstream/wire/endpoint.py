@@ -128,7 +128,9 @@ class Endpoint:
     def hint(self, what: str = "a pipeline") -> str:
         """What to check if nothing arrives from this endpoint."""
         if self.lacks_sockets():
-            return f"is {what} running there? It has no sockets: if it runs, they were removed; start it again"
+            if self.folder is not None and not self.folder.exists():
+                return f"is {what} running there? There is no folder {self.folder.absolute()}."
+            return f"is {what} running there? It has no sockets: if it runs, they were removed; start it again."
         return f"is {what} running there{f', with the keys in {self.keys.folder}' if self.keys is not None else ''}?"
 
     def check_access(self) -> None:

@@ -86,7 +86,7 @@ def test_ctrl_c_is_no_error(resting, catstream):
 def test_silent_endpoint_is_one_line_of_error(fail, tmp_path):
     error = fail("watch", "tracks", "--endpoint", tmp_path, "--wait", 0.2)
     assert error.startswith(f"catstream: no health arrived from {tmp_path} within 0.2 s: is a pipeline running there?")
-    assert error.endswith("It has no sockets: if it runs, they were removed; start it again")
+    assert error.endswith("It has no sockets: if it runs, they were removed; start it again.")
 
 
 def test_status_shows_all_processes(resting, said, until):

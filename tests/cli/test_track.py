@@ -155,7 +155,8 @@ def test_an_output_folder_that_cannot_be_written_is_rejected(video, fail, tmp_pa
     source, box = video
     folder = tmp_path / "file" if output == "a file" else Path(output)
     (tmp_path / "file").write_text("mine\n")
-    assert "an existing folder that you may write to" in fail("track", source, "--box", box, "--output", folder)
+    reason = "is a file" if output == "a file" else "an existing folder that you may write to"
+    assert reason in fail("track", source, "--box", box, "--output", folder)
     assert (tmp_path / "file").read_text() == "mine\n"
 
 

@@ -207,7 +207,7 @@ def test_classes_have_numbers_also_of_an_object_that_is_never_present(tmp_path, 
 def test_a_class_that_is_missing_is_an_error_before_anything_is_written(tmp_path):
     folder = made(tmp_path / "set", "yolo", LOG, size=(100, 80))
     before = {file: file.read_bytes() for file in folder.rglob("*.*")}
-    with pytest.raises(VideoError, match="--classes lacks object"):
+    with pytest.raises(VideoError, match="--classes lacks 'object'"):
         made(folder, "yolo", LOG, size=(100, 80), classes=("anna", "ben"))
     assert {file: file.read_bytes() for file in folder.rglob("*.*")} == before
 
