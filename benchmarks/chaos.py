@@ -111,6 +111,7 @@ class Arena:
     def __init__(self, source: str, boxes: dict[str, Box], settings: Settings, state: Path, scratch: Path) -> None:
         self.state, self.tracks, self.frames, self.deaths = state, list[dict[str, Track]](), list[int](), 0
         self.end: End | None = None
+        self.calm_from = math.inf  # frames with tracks after which no fault lasts
         self._settings, self._source, self._boxes, self._folder = settings, source, boxes, scratch
         self._children: dict[str, Child] = {}
         self._last_received = monotonic()
@@ -175,9 +176,9 @@ class Arena:
             self.turn()
 
     def run(self, seconds: float) -> None:
-        """Call `turn` for some seconds."""
+        """Call `turn` for some seconds, at most until the last frames, which have no faults."""
         over = monotonic() + seconds
-        self.until(lambda: monotonic() >= over)
+        self.until(lambda: monotonic() >= over or len(self.tracks) >= self.calm_from)
 
     def finish(self) -> None:
         """Call `turn` until the stream and all processes have ended."""
@@ -406,6 +407,7 @@ def endure(source: str, boxes: dict[str, Box], settings: Settings, faults: list[
         with open_source(source) as video:
             frames = video.frames or 0
         arena = stack.enter_context(Arena(source, boxes, settings, folder / "state", folder))
+        arena.calm_from = frames - LAST
         for number, name in enumerate(faults, start=1):
             further(arena, int(random.integers(*CALM)))
             if len(arena.tracks) > frames - LAST:
