@@ -12,6 +12,10 @@ await withBrowser(executablePath, profile, async (browser) => {
   await page.goto(url);
   const text = (selector) => page.locator(selector).innerText();
   const says = (selector, words) => page.waitForFunction(([each, wanted]) => document.querySelector(each).textContent.includes(wanted), [selector, words], patience);
+  const drawn = async (words) => { // the answer to a box may come after the news of it
+    await says("#check", words);
+    await page.waitForSelector("#stage .shade", { state: "detached", ...patience });
+  };
   const shows = (number) => page.waitForSelector(`#picture[src="frames/${number}.jpg"]`, patience);
   const name = async (words) => {
     await page.fill("#name", words);
@@ -24,20 +28,20 @@ await withBrowser(executablePath, profile, async (browser) => {
   await says("#message", "no box is drawn");
   await name("anna");
   await drawOn(page, sizes[0], box);
-  await says("#check", "anna: your box");
+  await drawn("anna: your box");
   await page.keyboard.press("o");
   await name("ben");
   await drawOn(page, sizes[0], [...box.map((side) => side / 2)]);
-  await says("#check", "ben: your box");
+  await drawn("ben: your box");
   await says("#timelines", "ben");
 
   await page.keyboard.press("n");
   await shows(1);
   await says("#check", "anna: no box");
   await drawOn(page, sizes[1], box);
-  await says("#check", "ben: no box"); // the next object
+  await drawn("ben: no box"); // the next object
   await drawOn(page, sizes[1], box);
-  await says("#check", "ben: your box");
+  await drawn("ben: your box");
   await page.keyboard.press("u");
   await says("#check", "ben: no box");
   console.log("second", await text("#source"), await text("#frame"), "|", await text("#next"));
