@@ -37,7 +37,7 @@ IMPORTERS = {
     "click": "cli",
     "starlette": "web",
     "uvicorn": "web/server.py",
-    "prometheus_client": "web/prometheus.py",
+    "prometheus_client": "web/prometheus.py web/latency.py",
     "rich": "cli",
 }
 

@@ -21,7 +21,7 @@ from catstream.client.subscription import Subscription
 from catstream.errors import CatstreamError, SilenceError
 from catstream.messages.kinds import Answer, End
 from catstream.web.dashboard import Dashboard
-from catstream.web.prometheus import Latency
+from catstream.web.latency import Latency
 from catstream.wire.channels import CHANNELS
 from catstream.wire.endpoint import Endpoint
 

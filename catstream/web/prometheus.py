@@ -11,16 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
 from time import monotonic, time
-from typing import TYPE_CHECKING
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, disable_created_metrics, generate_latest
 from starlette.responses import Response
 
 from catstream.messages.heads import TREES
-from catstream.messages.kinds import FleetStatus, Health, NodeStatus, StreamStatus, Track
-
-if TYPE_CHECKING:
-    from catstream.web.feed import PipelineFeed
+from catstream.messages.kinds import FleetStatus, NodeStatus, StreamStatus
+from catstream.web.feed import PipelineFeed
 
 # Each counter would have another metric with the time of its first sample.
 disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -28,7 +25,6 @@ disable_created_metrics()  # type: ignore[no-untyped-call]
 #: A sample: name, value and labels.
 Sample = tuple[str, float, dict[str, str]]
 
-_LATENCIES = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)  # bounds of the histogram, seconds
 
 #: Counters of the processes, streams and nodes that only count up.
 _COUNT_UP = {"sent", "processed", "stored", "skipped", "reconnects", "damaged", "scaled", "rejected", "frames", "rows"}
@@ -82,27 +78,6 @@ _HELP = {
     "node_streams": "Streams on the node.",
     **{f"{name}_leaves": f"Leaves that were inserted into this tree: {tree.meaning}." for name, tree in TREES.items()},
 }
-
-
-class Latency:
-    """Measures the seconds from the arrival of a frame of a live source to that of its track at this process."""
-
-    def __init__(self) -> None:
-        self._zero: tuple[str, float] | None = None  # of a run, Unix time at which the time of its source is 0
-        self.histogram = Histogram(
-            "catstream_track_latency_seconds",
-            "Seconds from the arrival of a frame of a live source at the pipeline, by the clock of its machine, to the "
-            "arrival of its track at this page, for each object.",
-            buckets=_LATENCIES,
-            registry=None,
-        )
-
-    def take(self, message: object, run: str) -> None:
-        """Process a message of the run with this id as soon as it has arrived."""
-        if isinstance(message, Health) and message.process == "detector":
-            self._zero = (run, zero) if (zero := message.counters.get("zero_time")) is not None else None
-        elif isinstance(message, Track) and self._zero is not None and self._zero[0] == run:
-            self.histogram.observe(max(0.0, time() - self._zero[1] - message.time))
 
 
 def response(samples: Iterable[Sample], *histograms: Histogram) -> Response:

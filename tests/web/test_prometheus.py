@@ -13,6 +13,7 @@ from catstream.compression.forest import Forest
 from catstream.messages.kinds import Health
 from catstream.web import prometheus
 from catstream.web.feed import PipelineFeed
+from catstream.web.latency import Latency
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def test_each_metric_has_a_type_and_help_of_its_own(feed, facts, fleet):
 
 
 def test_latency_counts_from_the_arrival_of_a_frame_as_the_health_report_of_its_run_states_it(facts):
-    latency = prometheus.Latency()
+    latency = Latency()
     latency.take(facts.track(5), "run")  # when its frame arrived is not known yet
     latency.take(Health("detector", 1.0, {"zero_time": time() - 2.0}), "run")
     latency.take(facts.track(19), "run")
