@@ -248,7 +248,7 @@ def test_a_broker_that_is_away_gets_the_events_when_it_is_back_and_misses_states
         broker.start()
         got = broker.subscriber()
         online(sink, until)
-    until(lambda: events(got)[-1] == ("ended", 0.0))
+    until(lambda: events(got)[-1:] == [("ended", 0.0)])
     assert ("lost", 9.0) in events(got)
     assert got["yard/cam/availability"] == ["online", "offline"]
     assert any(topic.startswith("homeassistant/") for topic in got)
