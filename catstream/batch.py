@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 
 from catstream.annotation.annotation import Annotation
-from catstream.annotation.keyframes import Keyframe, by_object, cells, format_keyframe, parse_row
+from catstream.annotation.keyframes import Keyframe, KeyframeBox, by_object, cells, format_keyframe, parse_row
 from catstream.base.box import Box
 from catstream.base.files import write_csv
 from catstream.base.settings import Settings
@@ -47,7 +47,7 @@ class Video(NamedTuple):
     file: str
     path: Path
     name: str
-    keyframes: Mapping[str, Mapping[int, Box | None]]
+    keyframes: Mapping[str, Mapping[int, KeyframeBox]]
 
     @property
     def boxes(self) -> str:
@@ -247,7 +247,7 @@ def _tracked(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, 
     begins: dict[int, dict[str, Box]] = {}
     for name, boxes in video.keyframes.items():
         for frame, box in boxes.items():
-            if box is None:
+            if not isinstance(box, Box):
                 raise BoxError(f"{name or 'the object'} has no box: pass its box in at least one frame")
             begins.setdefault(frame, {})[name] = box
     first = min(begins, default=0)

@@ -16,6 +16,7 @@ import numpy as np
 
 from catstream.annotation.decoded import DecodedFrames, decode
 from catstream.annotation.fusion import fuse
+from catstream.annotation.keyframes import HIDDEN, KeyframeBox, parse_box
 from catstream.annotation.passes import Pass, box_of, row_of, run_pass
 from catstream.base.addresses import is_live, without_password
 from catstream.base.arrays import Float64
@@ -33,7 +34,8 @@ from catstream.video.source import ALL_FRAMES, open_source
 #: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
 Progress = Callable[[str, int, int | None], object]
 
-#: The boxes of objects by frame, None where the object is absent: of one object without a name, or by name.
+#: The boxes of objects by frame, None where the object is absent, "hidden" where too much of it is covered to draw a
+#: box: of one object without a name, or by name.
 _BoxesByFrame = Mapping[int, str | Iterable[float] | None]
 KeyframeBoxes = _BoxesByFrame | Mapping[str, _BoxesByFrame]
 
@@ -80,13 +82,14 @@ class Annotation:
     Call `track` after the constructor, which decodes nothing yet; `annotate` does both. Each stretch between two
     keyframes is tracked from both ends. If that does not check all of its frames, it is tracked from both ends again,
     with the merged model of all other boxes of the object. `add` tracks only beside its box; earlier passes are still
-    used as far as they agree with the boxes. Close the annotation, or use it in a `with`: until then, its processes
-    run, and the decoded frames are in a temporary file.
+    used as far as they agree with the boxes. No pass begins or ends in a frame where the object is hidden. Close the
+    annotation, or use it in a `with`: until then, its processes run, and the decoded frames are in a temporary file.
 
     Parameters
     ----------
     video : path of a file or a folder of images
-    boxes : mapping of frame to box, or of object to such a mapping; frames count from 0, None where it is absent
+    boxes : mapping of frame to box, or of object to such a mapping
+        Frames count from 0; a box is None where the object is absent, "hidden" where it is covered.
     settings : Settings or mapping of str
         The settings that differ from the defaults.
     part : slice of the frames of the video, whose frames count from 0; by default all
@@ -159,7 +162,7 @@ class Annotation:
         self._folder.cleanup()
 
     def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
-        """Add or replace the box of an object at a frame, None if it is absent there, and track what depends on it.
+        """Add or replace the box of an object at a frame, and track what depends on it; None or "hidden" as of `boxes`.
 
         BoxError or ObjectError as of the constructor.
         """
@@ -173,7 +176,10 @@ class Annotation:
         parsed = _parsed(boxes)
         check_count(len(parsed), self.settings.run.max_objects)
         self._check(parsed)
-        self.keyframes: dict[str, dict[int, Box | None]] = parsed
+        self.keyframes: dict[str, dict[int, KeyframeBox]] = parsed
+        self._drawn = {
+            name: {frame: box for frame, box in boxes.items() if box != HIDDEN} for name, boxes in parsed.items()
+        }
 
     def decode(self) -> None:
         """Decode the frames, if they are not yet. VideoError if one cannot be decoded: those before it are there."""
@@ -206,7 +212,7 @@ class Annotation:
         tasks: list[Task] = []
         for stretch in self._stretches():
             plain = self._missing_of(stretch, use_memory=False)
-            several = len(self.keyframes[stretch.object]) > 1
+            several = len(self._drawn[stretch.object]) > 1
             again = several and not plain and not self._is_checked(stretch)
             tasks += self._missing_of(stretch, use_memory=True) if again else plain
         return sorted(tasks, key=lambda task: -task.frames)
@@ -233,18 +239,18 @@ class Annotation:
 
     @property
     def checked(self) -> dict[str, list[Check]]:
-        """The check of each frame (keyframe, checked or unchecked), by the name of the object."""
+        """The check of each frame (keyframe, hidden, checked or unchecked), by the name of the object."""
         return {name: [track.checked for track in tracks] for name, tracks in self.tracks.items()}
 
     @property
     def share_checked(self) -> float:
-        """Share of frames that are keyframes or checked, over all objects, from 0 to 1."""
+        """Share of frames that are not unchecked, over all objects, from 0 to 1."""
         checks = [*chain.from_iterable(self.checked.values())]
         return 1 - checks.count("unchecked") / len(checks) if checks else 0.0
 
     def passes(self, name: str = UNNAMED) -> list[Pass]:
         """The finished passes of an object, in the order of their keyframes: the proposals for its unchecked frames."""
-        drawn = self.keyframes.get(name, {}).items()
+        drawn = self._drawn.get(name, {}).items()
         passes = [one for task, one in self._passes.items() if one is not None and set(task.keyframes) <= drawn]
         return sorted(passes, key=lambda one: (one.start, one.stop, one.with_memory))
 
@@ -268,8 +274,8 @@ class Annotation:
     def next_frames(self) -> list[NextFrame]:
         """A frame to annotate in each stretch that is not checked, in the order of their expected errors.
 
-        It divides the expected errors of its stretch into halves; at an end of the video without a keyframe, it is the
-        first or the last frame.
+        It divides the expected errors of its stretch into halves, or those on the side of the hidden frames where most
+        are; at an end of the video without a keyframe, it is the first or the last frame.
         """
         unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
         return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
@@ -279,7 +285,7 @@ class Annotation:
         opened = open_source(video, part=part, settings=self.settings.run)
         return opened, DecodedFrames(Path(self._folder.name, "frames"), opened.size, [], opened.rate, opened.name)
 
-    def _check(self, keyframes: Mapping[str, Mapping[int, Box | None]]) -> None:
+    def _check(self, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
         """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as it is decoded."""
         for name, drawn in keyframes.items():
             for frame, box in drawn.items():
@@ -288,12 +294,12 @@ class Annotation:
                         raise BoxError(
                             f"frame {frame} is outside the video: pass a frame from 0 to {len(self.frames) - 1}"
                         )
-                    if box is not None:
+                    if isinstance(box, Box):
                         box.validated(*self.frames.size_of(frame))
 
     def _stretches(self) -> Iterator[_Stretch]:
         """Yield the stretches of all objects that have a frame."""
-        for name, drawn in self.keyframes.items():
+        for name, drawn in self._drawn.items():
             ends = [-1, *sorted(drawn), len(self.frames)]
             for before, after in pairwise(ends):
                 if after - before > 1:
@@ -301,12 +307,12 @@ class Annotation:
 
     def _ways(self, stretch: _Stretch) -> list[tuple[int, int]]:
         """Start and stop of the passes of a stretch: one from each of its ends that is a keyframe."""
-        drawn, before, after = self.keyframes[stretch.object], stretch.start - 1, stretch.stop
+        drawn, before, after = self._drawn[stretch.object], stretch.start - 1, stretch.stop
         ways = [(before, min(after, len(self.frames) - 1)), (after, max(before, 0))]
         return [way for way in ways if way[0] in drawn]
 
     def _missing_of(self, stretch: _Stretch, *, use_memory: bool) -> list[Task]:
-        name, drawn = stretch.object, self.keyframes[stretch.object]
+        name, drawn = stretch.object, self._drawn[stretch.object]
         tasks = []
         for start, stop in self._ways(stretch):
             boxes = tuple(sorted(drawn.items())) if use_memory else ((start, drawn[start]),)
@@ -318,7 +324,7 @@ class Annotation:
         return tasks
 
     def _tracks(self, name: str) -> Iterator[Track]:
-        drawn, count = self.keyframes[name], len(self.frames)
+        drawn, count = self._drawn[name], len(self.frames)
         boxes, probabilities, scores = np.full((count, 4), np.nan), np.ones(count), np.ones(count)
         for frame, box in drawn.items():
             boxes[frame] = row_of(box)
@@ -327,38 +333,51 @@ class Annotation:
                 part = slice(stretch.start, stretch.stop)
                 boxes[part], probabilities[part], scores[part] = self._fused(stretch)
         for frame, (row, probability, score) in enumerate(zip(boxes, probabilities, scores, strict=True)):
-            box = box_of(row)
-            check: Check = "checked" if probability >= _CHECKED else "unchecked"
+            box, doubtful = box_of(row), bool(probability < _CHECKED)
+            check: Check = "unchecked" if doubtful else "checked"
+            if frame in self.keyframes[name]:
+                check = "keyframe" if frame in drawn else HIDDEN
             yield Track(
                 *(frame, self.frames.times[frame], "absent" if box is None else "present", box, float(score)),
                 model_version=0,
                 object=name,
-                doubtful=check == "unchecked",
-                checked="keyframe" if frame in drawn else check,
+                doubtful=doubtful,
+                checked=check,
                 probability=float(probability),
             )
 
     def _parts(self, stretch: _Stretch) -> list[Pass]:
         """The parts of the finished passes that run over a stretch."""
-        drawn = self.keyframes[stretch.object]
+        drawn = self._drawn[stretch.object]
         parts = (one.part(*way, drawn) for way in self._ways(stretch) for one in self.passes(stretch.object))
         return [part for part in parts if part is not None]
 
     def _fused(self, stretch: _Stretch) -> tuple[Float64, Float64, Float64]:
-        return fuse(self._parts(stretch), stretch.start, stretch.stop, self.keyframes[stretch.object])
+        return fuse(self._parts(stretch), stretch.start, stretch.stop, self._drawn[stretch.object])
+
+    def _hidden(self, stretch: _Stretch) -> list[int]:
+        """The frames of a stretch in which the object is hidden, counted from its start."""
+        hidden = self.keyframes[stretch.object].keys() - self._drawn[stretch.object].keys()
+        return sorted(frame - stretch.start for frame in hidden if stretch.start <= frame < stretch.stop)
 
     def _is_checked(self, stretch: _Stretch) -> bool:
-        return bool((self._fused(stretch)[1] >= _CHECKED).all())
+        unchecked = self._fused(stretch)[1] < _CHECKED
+        unchecked[self._hidden(stretch)] = False
+        return not unchecked.any()
 
     def _next_in(self, stretch: _Stretch) -> NextFrame:
-        errors = 1 - self._fused(stretch)[1]
-        drawn = self.keyframes[stretch.object]
-        if stretch.start - 1 not in drawn:
+        errors, hidden = 1 - self._fused(stretch)[1], self._hidden(stretch)
+        errors[hidden] = 0.0
+        answers, last = self.keyframes[stretch.object], len(self.frames) - 1
+        if stretch.start == 0 and 0 not in answers:
             frame = 0
-        elif stretch.stop not in drawn:
-            frame = len(self.frames) - 1
+        elif stretch.stop == last + 1 and last not in answers:
+            frame = last
         else:
-            frame = stretch.start + int(np.searchsorted(errors.cumsum(), errors.sum() / 2))
+            parts = np.split(np.arange(len(errors)), hidden)
+            part = max(parts, key=lambda part: errors[part].sum())
+            middle = np.searchsorted(errors[part].cumsum(), errors[part].sum() / 2)
+            frame = stretch.start + int(part[middle])
         return NextFrame(frame, stretch.object, float(errors.sum()))
 
 
@@ -393,16 +412,16 @@ def _work(task: Task, frames: DecodedFrames, settings: Settings) -> tuple[Task, 
     return task, one
 
 
-def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, Box | None]]:
+def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, KeyframeBox]]:
     """The boxes by object and frame; ObjectError if an object has no box, or a name is not valid."""
     if all(isinstance(value, Mapping) for value in boxes.values()):
         by_name = cast(Mapping[str, _BoxesByFrame], boxes)
     else:
         by_name = {UNNAMED: cast(_BoxesByFrame, boxes)}
-    parsed: dict[str, dict[int, Box | None]] = {}
+    parsed: dict[str, dict[int, KeyframeBox]] = {}
     for name, drawn in by_name.items():
         with errors_about(check_name(name)):
-            parsed[name] = {int(frame): None if box is None else Box.parse(box) for frame, box in drawn.items()}
-        if all(box is None for box in parsed[name].values()):
+            parsed[name] = {int(frame): box if box is None else parse_box(box) for frame, box in drawn.items()}
+        if not any(isinstance(box, Box) for box in parsed[name].values()):
             raise ObjectError(f"{listed([name])} has no box: pass its box in at least one frame")
     return parsed

@@ -1,6 +1,7 @@
 """Boxes at keyframes as text: `NAME@FRAME=X,Y,W,H` on the command line, and files `frame,object,x,y,w,h`.
 
-`absent` stands in the place of a box where the object is not in the frame.
+`absent` stands in the place of a box where the object is not in the frame, `hidden` where it is, but too much of it is
+covered to draw a box.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import csv
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Final, Literal
 
 from catstream.base.box import Box
 from catstream.base.files import write_csv
@@ -17,9 +19,13 @@ from catstream.base.text import listed
 from catstream.errors import BoxError, VideoError
 
 ABSENT = "absent"
+HIDDEN: Final = "hidden"
 
-#: Name of an object, number of a frame, and the box of the object there; None if it is absent.
-Keyframe = tuple[str, int, Box | None]
+#: The box of an object at a keyframe; None if it is absent, "hidden" if too much of it is covered to draw a box.
+KeyframeBox = Box | Literal["hidden"] | None
+
+#: Name of an object, number of a frame, and the box of the object there.
+Keyframe = tuple[str, int, KeyframeBox]
 
 _HEADER = ("frame", "object", "x", "y", "w", "h")
 
@@ -31,18 +37,20 @@ def parse_keyframe(text: str) -> Keyframe:
     ('anna', 412, Box(x=120.0, y=80.0, w=64.0, h=48.0))
     >>> parse_keyframe("@30=absent")
     ('', 30, None)
+    >>> parse_keyframe("anna@99=hidden")
+    ('anna', 99, 'hidden')
     """
     parts = re.fullmatch(r"([^@=]*)@(\d+)=(.*)", text)
     if parts is None:
-        raise BoxError(f"expected NAME@FRAME=X,Y,W,H or NAME@FRAME={ABSENT}, got {text[:80]!r}")
+        raise BoxError(f"expected NAME@FRAME=X,Y,W,H, NAME@FRAME={ABSENT} or NAME@FRAME={HIDDEN}, got {text[:80]!r}")
     name, frame, box = parts.groups()
     with errors_about(check_name(name)):
-        return name, int(frame), _box(box)
+        return name, int(frame), parse_box(box)
 
 
-def format_keyframe(name: str, frame: int, box: Box | None) -> str:
+def format_keyframe(name: str, frame: int, box: KeyframeBox) -> str:
     """Return the text that `parse_keyframe` parses."""
-    return f"{name}@{frame}={ABSENT if box is None else ','.join(f'{side:.10g}' for side in box)}"
+    return f"{name}@{frame}={','.join(filter(None, cells(box)))}"
 
 
 def read_keyframes(path: Path) -> list[Keyframe]:
@@ -60,30 +68,30 @@ def read_keyframes(path: Path) -> list[Keyframe]:
 def parse_row(path: Path, line: int, row: Mapping[str, str]) -> Keyframe:
     """Parse a row of a CSV file, by the names of its columns; VideoError if it is malformed."""
     try:
-        box = ABSENT if row["x"] == ABSENT else ",".join(row[side] for side in "xywh")
-        return check_name(row["object"]), int(row["frame"]), _box(box)
+        box = row["x"] if row["x"] in (ABSENT, HIDDEN) else ",".join(row[side] for side in "xywh")
+        return check_name(row["object"]), int(row["frame"]), parse_box(box)
     except (KeyError, TypeError, ValueError):
         raise VideoError(
             f"{str(path)!r}, line {line}: expected the columns {','.join(_HEADER)} with a number of a frame, and a "
-            f"box or {ABSENT!r} in x"
+            f"box, {ABSENT!r} or {HIDDEN!r} in x"
         ) from None
 
 
-def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, Box | None]]) -> None:
+def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
     """Write the file that `read_keyframes` reads, atomically, in the order of the frames."""
     places = sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn)
     rows = ([frame, name, *cells(keyframes[name][frame])] for frame, name in places)
     write_csv(path, _HEADER, rows, VideoError)
 
 
-def cells(box: Box | None) -> tuple[str, ...]:
+def cells(box: KeyframeBox) -> tuple[str, ...]:
     """The columns x, y, w, h of a box."""
-    return (ABSENT, "", "", "") if box is None else tuple(f"{side:.10g}" for side in box)
+    return tuple(f"{side:.10g}" for side in box) if isinstance(box, Box) else (box or ABSENT, "", "", "")
 
 
-def by_object(keyframes: Iterable[Keyframe]) -> dict[str, dict[int, Box | None]]:
+def by_object(keyframes: Iterable[Keyframe]) -> dict[str, dict[int, KeyframeBox]]:
     """The boxes of each object by frame; BoxError if an object has two boxes in one frame."""
-    objects: dict[str, dict[int, Box | None]] = {}
+    objects: dict[str, dict[int, KeyframeBox]] = {}
     for name, frame, box in keyframes:
         drawn = objects.setdefault(name, {})
         if frame in drawn:
@@ -92,5 +100,8 @@ def by_object(keyframes: Iterable[Keyframe]) -> dict[str, dict[int, Box | None]]
     return objects
 
 
-def _box(text: str) -> Box | None:
-    return None if text.strip() == ABSENT else Box.parse(text).checked()
+def parse_box(box: str | Iterable[float]) -> KeyframeBox:
+    """Parse a box, four numbers or a text that may be `absent` or `hidden`. BoxError if it is malformed."""
+    if isinstance(box, str) and box.strip() in (ABSENT, HIDDEN):
+        return None if box.strip() == ABSENT else HIDDEN
+    return Box.parse(box).checked()

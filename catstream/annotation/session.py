@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from catstream.annotation.annotation import Annotation, NextFrame, Task
-from catstream.base.box import Box
+from catstream.annotation.keyframes import KeyframeBox
 from catstream.errors import CatstreamError, ObjectError, VideoError
 from catstream.messages.kinds import Track
 
@@ -57,7 +57,7 @@ class Session:
         self.next_frames: list[NextFrame] = []
         self.problem: CatstreamError | None = None
         self.finished, self.lock = threading.Event(), threading.Condition(threading.RLock())
-        self._history: list[tuple[str, int | None, dict[str, dict[int, Box | None]]]] = []  # with the boxes before
+        self._history: list[tuple[str, int | None, dict[str, dict[int, KeyframeBox]]]] = []  # with the boxes before
         self._newest: dict[str, int] = {}  # frame of the newest box of each object
         self._turns: dict[str, int] = {}  # number of the newest pass of each object, without one its turn is next
         self._missing: list[Task] = []
@@ -79,8 +79,8 @@ class Session:
     def can_undo(self) -> bool:
         return bool(self._history)
 
-    def draw(self, object: str, frame: int, box: Box | None) -> None:
-        """Add or replace the box of an object at a frame, None if it is absent there; errors as of `Annotation`."""
+    def draw(self, object: str, frame: int, box: KeyframeBox) -> None:
+        """Add or replace the box of an object at a frame; errors as of `Annotation`."""
         with self.lock:
             before = self.annotation.keyframes
             self._newest[object] = frame
@@ -120,7 +120,7 @@ class Session:
             tracked = {task: count.stat().st_size for task, count in self._running.values()}
             return sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing)
 
-    def _replace(self, keyframes: dict[str, dict[int, Box | None]]) -> None:
+    def _replace(self, keyframes: dict[str, dict[int, KeyframeBox]]) -> None:
         before = self.annotation.keyframes
         self.annotation.set_boxes(keyframes)
         try:

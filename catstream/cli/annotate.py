@@ -59,10 +59,11 @@ def annotate(
     continues. Ctrl-C or the button Done ends it.
 
     With boxes, it tracks and ends. Frames count from 0. A box is absent where
-    the object is not in the frame: anna@412=absent. An object without a name is
-    @FRAME=X,Y,W,H. One box of each object is enough to begin with. The command
-    prints the frame to look at next: add its box, and run the command again
-    with --boxes OUTPUT/keyframes.csv --overwrite.
+    the object is not in the frame, anna@412=absent, or hidden where too much of
+    it is covered to draw one. An object without a name is @FRAME=X,Y,W,H. One
+    box of each object is enough to begin with. The command prints the frame to
+    look at next: add its box, and run the command again with --boxes
+    OUTPUT/keyframes.csv --overwrite.
 
     Each stretch between two keyframes is tracked from both of its ends. A frame
     is checked if the two agree so well that its box is right with a probability
@@ -71,8 +72,8 @@ def annotate(
     \b
     OUTPUT
       NAME.ndjson, NAME.csv  the log of the tracks, for catstream export, with
-                             checked (keyframe, checked or unchecked) and
-                             probability; unchecked boxes are doubtful
+                             checked (keyframe, hidden, checked or unchecked)
+                             and probability; unchecked boxes are doubtful
       keyframes.csv          all boxes: frame,object,x,y,w,h
       next.csv               frames to look at, those with most expected errors
                              first: frame,object,errors

@@ -38,7 +38,7 @@ from catstream.messages.schema import (
 
 State = Literal["bootstrapping", "present", "absent"]
 
-Check = Literal["", "keyframe", "checked", "unchecked"]
+Check = Literal["", "keyframe", "hidden", "checked", "unchecked"]
 
 Level = Literal["lost", "redetected", "weak", "confident"]
 
@@ -294,7 +294,8 @@ class Track(_Numbered):
     began          number of the object's first frame. Another number is another object of the same name
     doubtful       whether the box should be checked: the level of belief is "weak" or "redetected"
     source_frame   number of the frame in its file or folder: start + stride * frame; `frame` for a live source
-    checked        in an annotation: "keyframe" with a drawn box, "checked" if both directions agree, else "unchecked"
+    checked        in an annotation: "keyframe" with a drawn box, "hidden" if a person said so and the box is estimated,
+                   "checked" if both directions agree, else "unchecked"
     probability    in an annotation: probability that the box, or its absence, is right
 
     >>> Track(12, 0.4, "present", Box(120.04, 80, 64, 48), 0.9314, 4)

@@ -41,7 +41,7 @@ _CVAT_LABEL = (
 )
 _CVAT_CHECKED = (
     "<attribute><name>checked</name><mutable>True</mutable><input_type>select</input_type><default_value>unchecked"
-    "</default_value><values>unchecked\nchecked\nkeyframe</values></attribute>"
+    "</default_value><values>unchecked\nchecked\nhidden\nkeyframe</values></attribute>"
 )
 _CVAT_BOX = (
     '<box frame="{}" outside="{:d}" occluded="0" keyframe="1" xtl="{:.2f}" ytl="{:.2f}" xbr="{:.2f}" ybr="{:.2f}" '

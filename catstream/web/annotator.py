@@ -24,6 +24,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from catstream.annotation.keyframes import HIDDEN
 from catstream.annotation.session import Session
 from catstream.base.box import Box
 from catstream.base.names import check_name
@@ -69,11 +70,12 @@ class AnnotationSite:
             for name, drawn in session.annotation.keyframes.items():
                 track = next(iter(session.tracks.get(name, [])[number : number + 1]), None)
                 box = track.box if track else None
+                answer = drawn.get(number, box)
                 check = track.checked if track else "unchecked"
                 proposals = session.annotation.proposals(name, number) if session.decoded else {}
                 objects[name] = {
-                    "box": _rounded(drawn.get(number, box)),
-                    "checked": "keyframe" if number in drawn else check,
+                    "box": _rounded(box if answer == HIDDEN else answer),
+                    "checked": HIDDEN if answer == HIDDEN else "keyframe" if number in drawn else check,
                     "proposals": [[_rounded(proposals[way])] if way in proposals else None for way in (True, False)],
                 }
         return JSONResponse({"size": session.annotation.frames.size_of(number), "objects": objects})

@@ -84,6 +84,20 @@ def test_absent_object_has_no_box(demo):
         assert annotation.tracks[""][-1].box == truth[-1]
 
 
+def test_a_hidden_object_keeps_its_estimated_box_and_is_not_asked_for_there(demo):
+    video, truth = demo
+    with annotate(video, {0: truth[0]}, jobs=1) as annotation:
+        passes, tracks = annotation.passes(), annotation.tracks[""]
+        asked = []
+        for _ in range(3):
+            asked.append(annotation.next_frame().frame)
+            annotation.add(asked[-1], "hidden")
+        assert len({*asked}) == 3
+        assert annotation.passes() == passes
+        assert [track.box for track in annotation.tracks[""]] == [track.box for track in tracks]
+        assert [annotation.checked[""][frame] for frame in (0, *asked)] == ["keyframe", *["hidden"] * 3]
+
+
 def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
     video, truth = demo
     work, started = module._work, []

@@ -2,17 +2,19 @@
 
 import pytest
 
-from catstream.annotation.keyframes import by_object, parse_keyframe, read_keyframes, write_keyframes
+from catstream.annotation.keyframes import by_object, format_keyframe, parse_keyframe, read_keyframes, write_keyframes
 from catstream.base.box import Box
 from catstream.errors import BoxError, CatstreamError, VideoError
 
-DRAWN = {"anna": {0: Box(1.5, 2, 30, 40), 412: None}, "": {7: Box(0.1, 0.2, 3, 4)}}
+DRAWN = {"anna": {0: Box(1.5, 2, 30, 40), 412: None, 413: "hidden"}, "": {7: Box(0.1, 0.2, 3, 4)}}
 
 
 def test_a_file_of_keyframes_is_read_as_it_was_written(tmp_path):
     write_keyframes(tmp_path / "keyframes.csv", DRAWN)
     assert by_object(read_keyframes(tmp_path / "keyframes.csv")) == DRAWN
-    assert (tmp_path / "keyframes.csv").read_text().splitlines()[3] == "412,anna,absent,,,"
+    assert (tmp_path / "keyframes.csv").read_text().splitlines()[3:] == ["412,anna,absent,,,", "413,anna,hidden,,,"]
+    texts = [format_keyframe(name, frame, box) for name, boxes in DRAWN.items() for frame, box in boxes.items()]
+    assert by_object(map(parse_keyframe, texts)) == DRAWN
 
 
 def test_a_file_needs_no_columns_after_absent(tmp_path):

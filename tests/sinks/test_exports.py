@@ -95,7 +95,7 @@ def test_cvat_has_a_keyframe_for_each_box_and_an_outside_one_after_the_last(tmp_
 
 
 def test_cvat_has_the_checks_of_an_annotation_as_an_attribute_of_every_keyframe(tmp_path):
-    checks = ("keyframe", "checked", "unchecked")
+    checks = ("keyframe", "hidden", "checked", "unchecked")
     log = [TrackedFrame([present(frame, "anna", checked=check)]) for frame, check in enumerate(checks)]
     root = ElementTree.parse(made(tmp_path / "t.xml", log=log, size=(100, 80))).getroot()
     boxes = [(box.get("keyframe"), box.findtext("attribute[@name='checked']")) for box in root.iter("box")]

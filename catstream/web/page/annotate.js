@@ -6,7 +6,7 @@ import { Stage } from "./stage.js";
 
 const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
-const CHECKS = { keyframe: "your box", checked: "checked", unchecked: "may be wrong" };
+const CHECKS = { keyframe: "your box", hidden: "hidden, estimated", checked: "checked", unchecked: "may be wrong" };
 const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
 
 /** The picture of a frame; a box is saved as soon as it is drawn. */
