@@ -6,20 +6,19 @@ boxes in several frames, the video is annotated: `catstream.annotate` tracks bet
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
+from msgspec import convert
 
 from catstream.annotation.annotation import Annotation
 from catstream.annotation.keyframes import Keyframe, KeyframeBox, by_object, cells, format_keyframe, parse_row
 from catstream.base.box import Box
-from catstream.base.files import write_csv
 from catstream.base.settings import Settings
+from catstream.base.tables import Row, read_table, write_table
 from catstream.base.text import listed
 from catstream.base.threads import one_thread
 from catstream.base.workers import run_tasks
@@ -92,31 +91,31 @@ class Summary:
         )
 
 
+_COLUMNS = tuple(field.name for field in fields(Summary))
+
+
 def read_boxes(table: Path) -> dict[str, list[Keyframe]]:
     """Read the boxes of each video from a table with the columns file, object, x, y, w, h, and optionally frame.
 
     The frame is 0 by default. An empty object has no name; `absent` in x is no box. Raises VideoError if the table
     cannot be read, a column is missing, or a value is invalid.
     """
-    try:
-        rows = list(csv.DictReader(table.read_text(encoding="utf-8-sig").splitlines(), restval=""))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise VideoError(
-            f"cannot read the boxes in {str(table)!r} ({getattr(error, 'strerror', None) or 'it is not a CSV file'}): "
-            "pass a table with the columns file, object, x, y, w, h, or --ask with videos"
-        ) from None
     boxes: dict[str, list[Keyframe]] = {}
-    for line, row in enumerate(rows, start=2):
-        if not row.get("file"):
-            raise VideoError(f"{str(table)!r}, line {line}: expected the path of a video in the column file")
-        boxes.setdefault(row["file"], []).append(parse_row(table, line, row | {"frame": row.get("frame") or "0"}))
+
+    def parse(row: Row) -> tuple[str, Keyframe]:
+        if not (file := row.text("file")):
+            raise ValueError("column file: expected the path of a video")
+        return str(Path(file)), parse_row(row, frame=0)
+
+    for file, keyframe in read_table(table, ("file", "object", "x", "y", "w", "h"), parse):
+        boxes.setdefault(file, []).append(keyframe)
     return boxes
 
 
 def write_boxes(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> None:
     """Write a table that `read_boxes` reads, atomically."""
     rows = ((file, name, *cells(box), frame) for file, drawn in boxes.items() for name, frame, box in drawn)
-    write_csv(table, ("file", "object", "x", "y", "w", "h", "frame"), rows, VideoError)
+    write_table(table, ("file", "object", "x", "y", "w", "h", "frame"), rows, VideoError)
 
 
 def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Video]:
@@ -195,8 +194,7 @@ class Batch:
         return self.videos[number]
 
     def _write(self) -> None:
-        names = [field.name for field in fields(Summary)]
-        write_csv(self._table, names, (astuple(row) for row in self.rows if row is not None), VideoError)
+        write_table(self._table, _COLUMNS, (astuple(row) for row in self.rows if row is not None), VideoError)
 
 
 def _track_numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
@@ -229,9 +227,8 @@ def read_summaries(path: Path) -> list[Summary]:
     if not path.exists():
         return []
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return [msgspec.convert(row, Summary, strict=False) for row in csv.DictReader(file)]
-    except (OSError, UnicodeDecodeError, csv.Error, msgspec.ValidationError) as error:
+        return read_table(path, _COLUMNS, lambda row: convert(row.values, Summary, strict=False))
+    except VideoError as error:
         raise VideoError(f"{path} is not the table of a batch ({error}): pass another --output") from None
 
 

@@ -6,15 +6,14 @@ covered to draw a box.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, Literal
 
 from catstream.base.box import Box
-from catstream.base.files import write_csv
 from catstream.base.names import check_name, errors_about
+from catstream.base.tables import Row, read_table, write_table
 from catstream.base.text import listed
 from catstream.errors import BoxError, VideoError
 
@@ -54,34 +53,24 @@ def format_keyframe(name: str, frame: int, box: KeyframeBox) -> str:
 
 
 def read_keyframes(path: Path) -> list[Keyframe]:
-    """Read a CSV file with the columns frame, object, x, y, w, h; VideoError if it cannot be read or is malformed."""
-    try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise VideoError(
-            f"cannot read the boxes in {str(path)!r} ({getattr(error, 'strerror', error)}): pass a CSV file "
-            f"{','.join(_HEADER)}"
-        ) from None
-    return [parse_row(path, line, row) for line, row in enumerate(rows, start=2)]
+    """Read a table with the columns frame, object, x, y, w, h; VideoError if it cannot be read or is malformed."""
+    return read_table(path, _HEADER, parse_row)
 
 
-def parse_row(path: Path, line: int, row: Mapping[str, str]) -> Keyframe:
-    """Parse a row of a CSV file, by the names of its columns; VideoError if it is malformed."""
-    try:
-        box = row["x"] if row["x"] in (ABSENT, HIDDEN) else ",".join(row[side] for side in "xywh")
-        return check_name(row["object"]), int(row["frame"]), parse_box(box)
-    except (KeyError, TypeError, ValueError):
-        raise VideoError(
-            f"{str(path)!r}, line {line}: expected the columns {','.join(_HEADER)} with a number of a frame, and a "
-            f"box, {ABSENT!r} or {HIDDEN!r} in x"
-        ) from None
+def parse_row(row: Row, frame: int | None = None) -> Keyframe:
+    """Parse a row of a table, with a default for an empty frame; ValueError if it is malformed."""
+    word = row.text("x").lower()
+    box = parse_box(word if word in (ABSENT, HIDDEN) else [row.number(side) for side in "xywh"])
+    if (number := row.integer("frame", frame)) < 0:
+        raise ValueError(f"column frame: expected a number from 0, got {number}")
+    return check_name(row.text("object")), number, box
 
 
 def write_keyframes(path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
     """Write the file that `read_keyframes` reads, atomically, in the order of the frames."""
     places = sorted((frame, name) for name, drawn in keyframes.items() for frame in drawn)
     rows = ([frame, name, *cells(keyframes[name][frame])] for frame, name in places)
-    write_csv(path, _HEADER, rows, VideoError)
+    write_table(path, _HEADER, rows, VideoError)
 
 
 def cells(box: KeyframeBox) -> tuple[str, ...]:

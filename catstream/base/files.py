@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import errno
 import glob
-import io
 import os
 import re
 import secrets
@@ -46,17 +44,6 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, mode: int = 0o66
     remove_parts(path)
     with _written_beside(path, data, mode) as part:
         part.replace(path)
-
-
-def write_csv(
-    path: Path, columns: Iterable[str], rows: Iterable[Iterable[object]], kind: type[CatstreamError] = ServiceError
-) -> None:
-    """Write a table atomically, and make its folder; an error of this kind if it cannot be written."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    with writing(path, kind):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, text.getvalue().encode(errors="surrogateescape"))  # names of files need not be UTF-8
 
 
 def create_atomically(path: str | os.PathLike[str], data: bytes) -> None:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import click
 from rich.progress import Progress
 
-from catstream.base.files import locked_folder, write_csv
+from catstream.base.files import locked_folder
 from catstream.base.settings import Settings
+from catstream.base.tables import write_table
 from catstream.base.text import counted
 from catstream.base.threads import cores
 from catstream.cli.common import INTERRUPTS, line_of, messages, stopped
@@ -196,7 +197,7 @@ class _ResultFiles:
             for tracks in zip(*self._annotation.tracks.values(), strict=True):
                 files.write(TrackedFrame(list(tracks)))
         rows = ((frame, name, f"{errors:.1f}") for frame, name, errors in self._annotation.next_frames())
-        write_csv(self._next, ("frame", "object", "errors"), rows, VideoError)
+        write_table(self._next, ("frame", "object", "errors"), rows, VideoError)
 
     def _log(self) -> RunFiles:
         from catstream.sinks.destinations import Head, Origin

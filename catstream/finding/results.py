@@ -12,7 +12,8 @@ import msgspec
 import numpy as np
 
 from catstream.base.box import Box
-from catstream.base.files import open_locked, write_csv, writing
+from catstream.base.files import open_locked, writing
+from catstream.base.tables import write_table
 from catstream.errors import ServiceError
 from catstream.finding.files import File
 from catstream.finding.find import Detection
@@ -149,7 +150,7 @@ def write_detections(path: Path, intervals: Iterable[Interval]) -> None:
         for interval in intervals
         for at in interval.detections
     )
-    write_csv(path, columns, rows)
+    write_table(path, columns, rows)
 
 
 def write_report(path: Path, objects: Iterable[str], results: Sequence[FileResult], intervals: list[Interval]) -> Path:

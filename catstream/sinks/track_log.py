@@ -10,7 +10,6 @@ counts as not written: it is cut, and tracked again.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
@@ -22,7 +21,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby, pairwise
-from math import isfinite, isnan
+from math import isnan
 from pathlib import Path
 from typing import IO, Any, get_args
 
@@ -30,8 +29,9 @@ from catstream.base.addresses import is_live
 from catstream.base.box import Box
 from catstream.base.files import check_distinct, open_locked, writing
 from catstream.base.names import UNNAMED, check_name
+from catstream.base.tables import Columns, Row
 from catstream.base.text import listed
-from catstream.errors import ProtocolError, VideoError
+from catstream.errors import VideoError
 from catstream.jobs.job import Results
 from catstream.messages.kinds import Check, State, Track
 from catstream.sinks.database import read_database, read_database_head
@@ -304,24 +304,25 @@ class Log:
         self.damaged = self.gap = 0
         if not self.path.exists():
             return
-        parse, end, problem, is_cut = self._parser(), 0, "", False
+        (start, parse), end, problem, is_cut = self._parser(), 0, "", False
         with self.path.open("rb") as file:
             for number, line in enumerate(file, 1):
                 end += len(line)
-                if number == 1 and self.path.suffix == ".csv":
+                if number <= start:
                     continue
                 if problem:
                     self._report(problem)
                     problem = ""
                 try:
                     track = parse(line.decode("utf-8-sig"))
-                except (KeyError, TypeError, ValueError, ProtocolError) as error:
+                except ValueError as error:
                     if (head := Head.from_json(line)) is not None:  # the first line of a log, a gap, an appended log
                         self.gap += head.gap
                         continue
                     problem = f"{self.path}, line {number} is no track ({error})"
                     is_cut = not line.endswith(b"\n") or not line.strip()
-                else:
+                    continue
+                if track is not None:
                     yield track, end if line.endswith(b"\n") else 0
         if problem and not is_cut:
             self._report(problem)
@@ -332,24 +333,21 @@ class Log:
             raise VideoError(f"{problem}: pass --skip-damaged to continue after it")
         self.damaged += 1
 
-    def _parser(self) -> Callable[[str], Track]:
-        """Return the function that parses a line; VideoError if the names of the columns of a CSV file are wrong."""
+    def _parser(self) -> tuple[int, Callable[[str], Track | None]]:
+        """Return the number of lines before the first track, and the function that parses a line: None if it is empty.
+
+        VideoError if the names of the columns of a CSV file are wrong.
+        """
         if self.path.suffix != ".csv":
-            return lambda line: decode_json(line.encode(), Track)
+            return 0, lambda line: decode_json(line.encode(), Track)
         with self.path.open(encoding="utf-8-sig", errors="replace") as file:
-            first = file.readline().strip()
-        separator = max(",;\t", key=first.count)
-        columns = [column.strip().lower() for column in next(csv.reader([first], delimiter=separator), [])]
-        if first and (missing := [column for column in _COLUMNS if column not in (*columns, *_OPTIONAL)]):
-            raise VideoError(f"{self.path} lacks the column {listed(missing)}: its first line has to name the columns")
+            columns = Columns(self.path, file, [name for name in _COLUMNS if name not in _OPTIONAL])
 
-        def parse(line: str) -> Track:
-            values = next(csv.reader([line.strip("\r\n")], delimiter=separator), [])
-            if len(values) < len(columns):
-                raise ValueError(f"{len(values)} values for {len(columns)} columns")
-            return _parse_row(dict(zip(columns, values, strict=False)))
+        def parse(line: str) -> Track | None:
+            row = columns.row(line, whole=True)
+            return None if row is None else _parse_row(row)
 
-        return parse
+        return columns.start, parse
 
 
 def _with_time(path: Path, seconds: float) -> Path:
@@ -379,36 +377,20 @@ class JoinedLog(Log):
         )
 
 
-def _parse_row(row: Mapping[str, str]) -> Track:
-    """The track of a row of a CSV file; raise ValueError or KeyError if it is none.
+def _parse_row(row: Row) -> Track:
+    """The track of a row of a CSV file; raise ValueError if it is none.
 
     It has no `pts`, `began` and `doubtful`, which are not in the file.
     """
-    box = Box(*(_number(row[side]) for side in "xywh")) if row["x"] else None
-    frame = _integer(row["frame"])
+    box = Box(*(row.number(side) for side in "xywh")) if row.text("x") else None
     return Track(
-        *(frame, _number(row["seconds"]), _STATES[row["state"]], box, _number(row["score"])),
-        model_version=_integer(row["model_version"]),
-        object=check_name(row["object"]),
-        source_frame=_integer(row.get("source_frame") or "-1"),
-        checked=_CHECKS[row.get("checked") or ""],
-        probability=_number(row["probability"]) if row.get("probability") else None,
+        *(row.integer("frame"), row.number("seconds"), row.choice("state", _STATES), box, row.number("score")),
+        model_version=row.integer("model_version"),
+        object=check_name(row.text("object")),
+        source_frame=row.integer("source_frame", default=-1),
+        checked=row.choice("checked", _CHECKS),
+        probability=row.number("probability") if row.text("probability") else None,
     )
-
-
-def _number(text: str) -> float:
-    if "," in text:
-        raise ValueError(f"{text!r} has a decimal comma: save the table with decimal points")
-    if not isfinite(number := float(text)):
-        raise ValueError(f"{text!r} is no number")
-    return number
-
-
-def _integer(text: str) -> int:
-    """A whole number, which pandas writes as 5.0 if other rows lack it."""
-    if not (number := _number(text)).is_integer():
-        raise ValueError(f"{text!r} is no whole number")
-    return int(number)
 
 
 def _objects(frame: TrackedFrame) -> frozenset[str]:

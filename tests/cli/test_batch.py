@@ -96,8 +96,8 @@ def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
     ("rows", "message"),
     [
         ([], "boxes.csv has no box"),
-        (["a.mp4,anna,1,2,30,x,0"], "line 2: expected the columns"),
-        ([",anna,1,2,30,40,0"], "line 2: expected the path of a video"),
+        (["a.mp4,anna,1,2,30,x,0"], "line 2: column h: expected a number, got 'x'"),
+        ([",anna,1,2,30,40,0"], "line 2: column file: expected the path of a video"),
         (["a.mp4,anna,1,2,30,40,0", "a.mp4,anna,1,2,30,40,0"], "a.mp4: anna has two boxes in frame 0"),
         (["a/b.mp4,,1,2,30,40,0", "a_b.avi,,1,2,30,40,0"], "several videos would have the results a_b"),
     ],

@@ -265,7 +265,7 @@ def test_a_video_has_the_frames_of_its_tracks(demo_video, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["t.ndjson", "t.csv"])
-@pytest.mark.parametrize("damage", [b"\n", b"\0\0\0\n", b"null\n", b'{"frame": "7"}\n', b"7,0.2\n"])
+@pytest.mark.parametrize("damage", [b"?\n", b"\0\0\0\n", b"null\n", b'{"frame": "7"}\n', b"7,0.2\n"])
 def test_a_damaged_line_before_the_end_is_an_error_with_its_number_or_skipped(tmp_path, name, damage):
     log = tmp_path / name
     add(RunFiles(Origin(), None, [str(log)]), [[""]] * 9)
@@ -313,12 +313,9 @@ def table(path, columns, separator=",", change=lambda rows: rows, encoding="utf-
     [
         {"columns": COLUMNS[::-1]},
         {"columns": ["", *COLUMNS[:-1], "note"]},
-        {"columns": COLUMNS, "separator": ";", "encoding": "utf-8-sig"},
-        {"columns": COLUMNS, "separator": "\t", "ending": "\r\n"},
+        {"columns": COLUMNS, "separator": ";", "encoding": "utf-8-sig", "ending": "\r\n;;;;;;;;;;;;\r\n"},
         {"columns": COLUMNS, "change": lambda rows: sorted(rows, key=lambda row: row["object"])},
         {"columns": COLUMNS, "change": lambda rows: rows[::-1]},
-        {"columns": COLUMNS, "change": lambda rows: [row | {"frame": f"{row['frame']}.0"} for row in rows]},
-        {"columns": COLUMNS, "change": lambda rows: [row | {"object": f'"{row["object"]}"'} for row in rows]},
     ],
 )  # fmt: skip
 def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp_path, form):
@@ -335,11 +332,10 @@ def test_a_csv_file_is_read_by_the_names_of_its_columns_in_any_order_of_rows(tmp
     [
         ({"columns": COLUMNS[1:]}, "lacks the column frame"),
         ({"columns": [*COLUMNS[:3], *COLUMNS[5:]]}, "lacks the column x, y"),
-        ({"columns": COLUMNS, "separator": ";", "change": lambda rows: [row | {"x": "1,5"} for row in rows]},
-         "line 2 is no track .*decimal comma"),
+        ({"columns": COLUMNS, "change": lambda rows: [row | {"state": "hidden"} for row in rows]},
+         "line 2 is no track .column state: expected .* got 'hidden'"),
         ({"columns": COLUMNS, "change": lambda rows: [*rows, rows[3]]}, "two rows of ben in frame 1"),
-        ({"columns": COLUMNS, "change": lambda rows: [row | {"frame": 0.5} for row in rows]}, "0.5' is no whole"),
-        ({"columns": COLUMNS, "change": lambda rows: [row | {"x": "nan"} for row in rows]}, "line 2 is no track"),
+        ({"columns": COLUMNS, "change": lambda rows: [row | {"frame": 0.5} for row in rows]}, "line 2 .* whole number"),
     ],
 )  # fmt: skip
 def test_a_csv_file_that_is_ambiguous_is_an_error_that_says_what_is_wrong(tmp_path, form, words):
