@@ -1,11 +1,12 @@
 """Many videos: boxes in a table, and the tracks of each video, which one process computes.
 
-If each object has one box, the video is tracked frame by frame from the first of them to its end. If an object has
-boxes in several frames, the video is annotated: `catstream.annotate` tracks between them, and checks the frames.
+An object with one box is tracked frame by frame from there to the end of its video. An object with boxes in several
+frames is annotated: `catstream.annotate` tracks between them, and checks the frames.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, fields, replace
@@ -27,7 +28,7 @@ from catstream.jobs.job import Results
 from catstream.messages.kinds import Track
 from catstream.multi import MultiTracker
 from catstream.sinks.destinations import Head, Origin, TrackedFrame
-from catstream.sinks.track_log import RunFiles, places_of
+from catstream.sinks.track_log import Log, RunFiles, places_of
 from catstream.video.source import open_source
 
 #: Name of the table of results in the folder of a batch.
@@ -125,9 +126,11 @@ def videos_of(table: Path, boxes: Mapping[str, Iterable[Keyframe]]) -> list[Vide
     """
     videos = []
     for file, keyframes in boxes.items():
-        name = "_".join(part for part in Path(file).with_suffix("").parts if part not in ("/", "..", "."))
+        path = (table.parent / file).absolute()
+        stem = Path(file) if path.is_dir() else Path(file).with_suffix("")
+        name = "_".join(part for part in stem.parts if part not in ("/", "..", "."))
         try:
-            videos.append(Video(file, (table.parent / file).absolute(), name, by_object(keyframes)))
+            videos.append(Video(file, path, name, by_object(keyframes)))
         except BoxError as error:
             raise BoxError(f"{file}: {error}") from None
     names = [video.name for video in videos]
@@ -142,23 +145,36 @@ def read_videos(table: Path) -> list[Video]:
 
 
 def check_results(videos: Iterable[Video], output: Path) -> None:
-    """Raise VideoError if a file of the results of a video exists in a folder without batch.csv."""
-    if not (output / SUMMARIES).exists():  # otherwise, all files there are of this batch
-        for video in videos:
-            _files(video, output, Head(source=str(video.path)), overwrite=False)
+    """Raise VideoError if a folder has results that are not of these videos, or not of a batch."""
+    for video in videos:
+        log = output / f"{video.name}.ndjson"
+        if not (output / SUMMARIES).exists():
+            _files(video, output, overwrite=False)
+        elif log.exists():
+            source = (Log(log).head() or Head()).source
+            if os.path.realpath(source) != os.path.realpath(video.path):
+                raise VideoError(
+                    f"{log} is the log of {source or 'another run'}, not of {video.path}: pass another --output, or "
+                    "--overwrite to replace it"
+                )
 
 
 class Batch:
-    """The videos of a batch, and its table batch.csv in the folder of the results.
+    """The videos of a batch, and the table batch.csv in the folder of the results, which may have rows of other ones.
 
-    rows  the row of each video; None before it is tracked, also if it failed earlier, or had other boxes
+    rows  the row of each video; None before it is tracked, also if it failed earlier, had other boxes, or lacks a file
     """
 
     def __init__(self, videos: Sequence[Video], output: Path, *, overwrite: bool) -> None:
         self.videos, self._output, self._table = videos, output, output / SUMMARIES
-        earlier = {} if overwrite else {(row.video, row.boxes): row for row in read_summaries(self._table)}
-        rows = (earlier.get((video.file, video.boxes)) for video in videos)
-        self.rows: list[Summary | None] = [None if row is None or row.error else row for row in rows]
+        earlier = {row.video: row for row in read_summaries(self._table) if not row.error}
+        self.rows: list[Summary | None] = []
+        for video in videos:
+            row = earlier.pop(video.file, None)
+            files = _files(video, output, overwrite=True)
+            is_complete = row is not None and row.boxes == video.boxes and not files.missing() and not overwrite
+            self.rows.append(row if is_complete else None)
+        self._others = list(earlier.values())
         self._write()
 
     @property
@@ -166,8 +182,8 @@ class Batch:
         """The numbers of the videos that are still to be tracked."""
         return [number for number, row in enumerate(self.rows) if row is None]
 
-    def track(self, settings: Settings, jobs: int) -> Generator[Video]:
-        """Track the missing videos in `jobs` processes, and yield each one after its row was written.
+    def track(self, settings: Settings, jobs: int) -> Generator[Summary]:
+        """Track the missing videos in `jobs` processes, and yield the row of each one after it was written.
 
         If a process is killed, for example because memory is exhausted, the remaining videos are tracked one by one.
         """
@@ -183,18 +199,19 @@ class Batch:
                         number, Summary(video.file, len(video.keyframes), error=str(error), boxes=video.boxes)
                     )
 
-    def _track(self, numbers: Iterable[int], settings: Settings, jobs: int) -> Iterator[Video]:
+    def _track(self, numbers: Iterable[int], settings: Settings, jobs: int) -> Iterator[Summary]:
         tasks = [(number, self.videos[number], self._output, settings) for number in numbers]
         for number, row in run_tasks(_track_numbered, tasks, jobs):
             yield self._add(number, row)
 
-    def _add(self, number: int, row: Summary) -> Video:
+    def _add(self, number: int, row: Summary) -> Summary:
         self.rows[number] = row
         self._write()
-        return self.videos[number]
+        return row
 
     def _write(self) -> None:
-        write_table(self._table, _COLUMNS, (astuple(row) for row in self.rows if row is not None), VideoError)
+        rows = (row for row in (*self._others, *self.rows) if row is not None)
+        write_table(self._table, _COLUMNS, map(astuple, rows), VideoError)
 
 
 def _track_numbered(number: int, video: Video, output: Path, settings: Settings) -> tuple[int, Summary]:
@@ -207,10 +224,9 @@ def track_video(video: Video, output: Path, settings: Settings) -> Summary:
     An error is in the summary; the tracks up to it are in the files. Existing files are replaced.
     """
     summary = Summary(video.file, len(video.keyframes), boxes=video.boxes)
-    method = _annotated if any(len(boxes) > 1 for boxes in video.keyframes.values()) else _tracked
     try:
         with one_thread(opencv=True), ExitStack() as stack:
-            head, frames = method(video, settings, stack)
+            head, frames = _frames(video, settings, stack)
             files = _files(video, output, head, overwrite=True)
             files.make_folder()
             output_files = stack.enter_context(files.opened(""))
@@ -232,26 +248,60 @@ def read_summaries(path: Path) -> list[Summary]:
         raise VideoError(f"{path} is not the table of a batch ({error}): pass another --output") from None
 
 
-def _files(video: Video, output: Path, head: Head, *, overwrite: bool) -> RunFiles:
+def _files(video: Video, output: Path, head: Head | None = None, *, overwrite: bool) -> RunFiles:
     """The files of a video; VideoError if they exist, unless `overwrite`, or cannot be written."""
-    files = RunFiles(Origin(head), output, places_of(video.name, Results(output=output)))
+    origin = Origin(head or Head(source=str(video.path)))
+    files = RunFiles(origin, output, places_of(video.name, Results(output=output)))
     files.check(overwrite=overwrite, earlier=[])
     return files
 
 
-def _tracked(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, Iterator[TrackedFrame]]:
-    """Track the objects of a video, each from its only box on; the same tracks as of `catstream track` in lockstep."""
+def _frames(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, Iterator[TrackedFrame]]:
+    """The tracks of all objects of a video, frame by frame."""
+    several = {name: boxes for name, boxes in video.keyframes.items() if len(boxes) > 1}
+    single = {name: boxes for name, boxes in video.keyframes.items() if len(boxes) == 1}
+    if not several:
+        return _tracked(video.path, single, settings, stack)
+
+    # Step 1: track between the boxes of objects with several.
+    annotation = stack.enter_context(Annotation(str(video.path), several, settings, jobs=1))
+    annotation.track()
+    frames = annotation.frames
+    head = Head(
+        source=str(video.path),
+        size=frames.size,
+        rate=frames.rate,
+        frames=len(frames),
+        settings=tuple(annotation.settings.changed()),
+    )
+
+    # Step 2: add the others from their boxes on. Their own run would begin at frame 0.
+    def merged() -> Iterator[TrackedFrame]:
+        part, others = _tracked(video.path, single, settings, stack) if single else (Head(start=len(frames)), iter(()))
+        for number, tracks in enumerate(zip(*annotation.tracks.values(), strict=True)):
+            added = next(others).tracks if number >= part.start else ()
+            shifted = (replace(track, frame=number, began=track.began + part.start) for track in added)
+            yield TrackedFrame([*tracks, *shifted])
+        next(others, None)  # raises the error of a box after the last frame
+
+    return head, merged()
+
+
+def _tracked(
+    path: Path, keyframes: Mapping[str, Mapping[int, KeyframeBox]], settings: Settings, stack: ExitStack
+) -> tuple[Head, Iterator[TrackedFrame]]:
+    """Track objects, each from its only box on; the same tracks as of `catstream track` in lockstep."""
     begins: dict[int, dict[str, Box]] = {}
-    for name, boxes in video.keyframes.items():
+    for name, boxes in keyframes.items():
         for frame, box in boxes.items():
             if not isinstance(box, Box):
                 raise BoxError(f"{name or 'the object'} has no box: pass its box in at least one frame")
             begins.setdefault(frame, {})[name] = box
     first = min(begins, default=0)
-    source = stack.enter_context(open_source(str(video.path), part=slice(first, None), settings=settings.run))
+    source = stack.enter_context(open_source(str(path), part=slice(first, None), settings=settings.run))
     settings = settings.for_length(source.frames)
     head = Head(
-        source=str(video.path),
+        source=str(path),
         size=source.size,
         rate=source.rate,
         frames=source.frames,
@@ -275,18 +325,3 @@ def _tracked(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, 
             )
 
     return head, frames()
-
-
-def _annotated(video: Video, settings: Settings, stack: ExitStack) -> tuple[Head, Iterator[TrackedFrame]]:
-    """Track the objects of a video between their boxes."""
-    annotation = stack.enter_context(Annotation(str(video.path), video.keyframes, settings, jobs=1))
-    annotation.track()
-    frames = annotation.frames
-    head = Head(
-        source=str(video.path),
-        size=frames.size,
-        rate=frames.rate,
-        frames=len(frames),
-        settings=tuple(annotation.settings.changed()),
-    )
-    return head, (TrackedFrame(list(tracks)) for tracks in zip(*annotation.tracks.values(), strict=True))

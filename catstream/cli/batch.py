@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,7 +59,7 @@ def batch(
 
     A video that fails does not stop the others; the exit status is then 1. The
     same command continues after Ctrl-C, and tracks only videos that failed, are
-    new, or have other boxes, unless --overwrite is passed.
+    new, have other boxes, or whose log was removed, unless --overwrite is passed.
 
     \b
     OUTPUT
@@ -84,12 +86,23 @@ def batch(
         raise VideoError(f"{boxes} has no box: add a row for each object")
     if not overwrite:
         check_results(videos, output)
+    click.get_current_context().with_resource(locked_folder(output, VideoError))
     batch = Batch(videos, output, overwrite=overwrite)
+    jobs, total, console = jobs or cores(), len(batch.missing), messages()
+    if not console.is_terminal:
+        console.print(f"tracking {counted(total, 'video')}, {len(videos) - total} complete")
+    began = time.monotonic()
     try:
-        with line_of(messages()) as progress, closing(batch.track(settings, jobs or cores())) as tracked:
-            task = progress.add_task("tracking", total=len(batch.missing))
-            for video in tracked:
-                progress.update(task, advance=1, description=video.name)
+        with line_of(console) as progress, closing(batch.track(settings, jobs)) as tracked:
+            task = progress.add_task("tracking", total=total)
+            for done, row in enumerate(tracked, 1):
+                progress.update(task, advance=1, description=row.video)
+                if not console.is_terminal:
+                    left = timedelta(seconds=round((time.monotonic() - began) / done * (total - done)))
+                    result = (
+                        row.error or f"{counted(row.frames, 'frame')}, {row.present / max(row.tracks, 1):.0%} present"
+                    )
+                    console.print(f"{done} of {total} ({done / total:.0%}), {left} left: {row.video}: {result}")
     except KeyboardInterrupt:
         stopped("the results so far are saved; the same command continues")
     summaries = [row for row in batch.rows if row is not None]

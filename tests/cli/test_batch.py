@@ -8,6 +8,8 @@ import psutil
 import pytest
 
 from catstream import MultiTracker
+from catstream.base.box import Box
+from catstream.batch import videos_of
 from catstream.sinks.track_log import Log
 from catstream.video.source import open_source
 
@@ -74,15 +76,62 @@ def test_an_object_with_one_box_is_tracked_as_by_a_tracker_from_its_frame_on(dem
 def test_only_videos_that_failed_or_have_other_boxes_are_tracked_again(demo, batch, demo_video, tmp_path):
     boxes, log = [f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},"], tmp_path / "out" / "two_cam.ndjson"
     batch(*boxes)
-    first = log.stat()
+    first = log.stat().st_mtime_ns
     (tmp_path / "broken.mp4").write_bytes(demo_video(FRAMES)[0].read_bytes())
     code, rows = batch(*boxes)
-    assert (code, log.stat()) == (0, first)
+    assert (code, log.stat().st_mtime_ns) == (0, first)
     assert not any(row["error"] for row in rows.values())
 
     code, rows = batch(boxes[1], f"two/cam.mp4,anna,{demo[-1]},{FRAMES - 1}")
-    assert log.stat() != first
+    assert log.stat().st_mtime_ns != first
     assert rows["two/cam.mp4"]["checked"] == str(FRAMES)
+
+
+def test_results_of_another_table_are_not_replaced_and_its_rows_stay(demo, batch, succeed, fail, demo_video, tmp_path):
+    batch(f"two/cam.mp4,anna,{demo[0]},")
+    (tmp_path / "three" / "two").mkdir(parents=True)
+    for name in ("cam.mp4", "side.mp4"):
+        (tmp_path / "three" / "two" / name).write_bytes(demo_video(FRAMES)[0].read_bytes())
+    words = ["--output", tmp_path / "out", "--jobs", 1]
+    other = table(tmp_path / "three", f"two/cam.mp4,anna,{demo[0]},")
+    assert f"two_cam.ndjson is the log of {tmp_path}/two/cam.mp4, not of" in fail("batch", other, *words)
+    succeed("batch", table(tmp_path / "three", f"two/side.mp4,anna,{demo[0]},"), *words)
+    assert [*summaries(tmp_path / "out")] == ["two/cam.mp4", "two/side.mp4"]
+    other = table(tmp_path / "three", f"two/cam.mp4,anna,{demo[0]},")
+    succeed("batch", other, *words, "--overwrite")
+    assert Log(tmp_path / "out" / "two_cam.ndjson").head().source == f"{tmp_path}/three/two/cam.mp4"
+
+
+def test_a_video_whose_log_was_removed_is_tracked_again(demo, batch, tmp_path):
+    batch(f"two/cam.mp4,anna,{demo[0]},")
+    (tmp_path / "out" / "two_cam.ndjson").unlink()
+    batch(f"./two/cam.mp4,anna,{demo[0]},")
+    assert sum(1 for _ in Log(tmp_path / "out" / "two_cam.ndjson")) == FRAMES
+
+
+def test_an_object_with_one_box_has_the_same_tracks_beside_one_with_several(demo, batch, tmp_path):
+    def ben(*others):
+        batch(*others, f"two/cam.mp4,ben,{demo[3]},3")
+        tracks = (track for frame in Log(tmp_path / "out" / "two_cam.ndjson") for track in frame.tracks)
+        return [(track.source_frame, track.box, track.doubtful) for track in tracks if track.object == "ben"]
+
+    alone = ben()
+    assert (alone[0][0], len(alone)) == (3, FRAMES - 3)
+    assert ben(f"two/cam.mp4,anna,{demo[0]},", f"two/cam.mp4,anna,{demo[-1]},{FRAMES - 1}") == alone
+
+
+def test_a_line_for_each_video_that_has_ended_is_printed_without_a_terminal(demo, said, tmp_path):
+    boxes = table(tmp_path, f"broken.mp4,,{demo[0]},", f"two/cam.mp4,anna,{demo[0]},")
+    _, _, errors = said("batch", boxes, "--output", tmp_path / "out", "--jobs", 1)
+    assert errors.startswith("tracking 2 videos, 0 complete\n1 of 2 (50%), 0:0")
+    assert "2 of 2 (100%), 0:00:00 left: two/cam.mp4: 12 frames, 100% present\n" in errors
+
+
+def test_only_the_suffix_of_a_file_is_no_part_of_the_name_of_its_results(tmp_path):
+    for folder in ("seq.01", "seq.02"):
+        (tmp_path / folder).mkdir()
+    boxes = {name: [("", 0, Box(1, 2, 30, 40))] for name in ("seq.01", "./seq.02", "a/cam.2.mp4")}
+    assert [video.name for video in videos_of(tmp_path / "t.csv", boxes)] == ["seq.01", "seq.02", "a_cam.2"]
 
 
 def test_existing_logs_of_something_else_are_not_replaced(demo, fail, tmp_path):
