@@ -185,7 +185,7 @@ class DetectorLoop:
         saved = {beginning.name: beginning.model for beginning in beginnings if beginning.model is not None}
         tracks, features = self.detectors.step(Pyramid(frame.image), frame.time, results)
         self.models.adopt_early(tracks.tracks)
-        number = self.process.job.source_frame(frame.number)
+        number = self.process.job.source_frame(tracks.frame)
         numbered = {name: replace(track, pts=frame.pts, source_frame=number) for name, track in tracks.tracks.items()}
         tracks = replace(tracks, tracks=numbered)
         parts = {name: replace(features.objects[name], model=model.to_bytes()) for name, model in saved.items()}
