@@ -204,9 +204,11 @@ class Outcome:
 
     def lines(self) -> Iterator[str]:
         """Yield the last lines, after the summary of the tracks."""
-        if self.missing and self.frames:
+        if self.missing:
             yield f"missing results, which another program removed: {', '.join(self.missing)}"
-        if self.is_resumed and not self.frames and not self.interrupted:
+        if not self.frames and not self.is_resumed:
+            yield "no frame was tracked"
+        elif not self.frames and not self.interrupted:
             yield (
                 f"no frames remained to track, the run in {self.folder} is complete: to track the source again, "
                 "start a new run in another folder (--state DIR)"
@@ -220,7 +222,8 @@ class Outcome:
         >>> Outcome(True, 9, [], [], [Path("m")], Path("state"), False, True).rest()
         'the results so far are kept; not saved: m; to continue: catstream track --resume state'
         """
-        parts = ["some results are missing" if self.missing else "the results so far are kept"]
+        kept = ["the results so far are kept"] if self.frames or self.is_resumed else []
+        parts = ["some results are missing"] if self.missing else kept
         if self.unsaved:
             parts.append(f"not saved: {', '.join(map(str, self.unsaved))}")
         if self.folder is not None and self.has_run:
@@ -297,7 +300,8 @@ class _Run:
         saved = pipeline.saved_models
         unsaved = [file for file in pipeline.results.models.values() if file not in saved]
         has_run = self.folder is not None and contains_run(self.folder)
-        ended = (interrupted, progress.frames, files.missing(), saved, unsaved)
+        missing = files.missing() if progress.frames else []
+        ended = (interrupted, progress.frames, missing, saved, unsaved)
         return Outcome(*ended, self.folder, self.is_resumed, has_run)
 
     def _serve(self, view: HostPort, stack: ExitStack, console: Console) -> None:

@@ -179,11 +179,11 @@ def test_a_model_does_not_replace_the_video_that_is_tracked(video, fail):
 def test_a_model_that_was_not_saved_before_an_interrupt_is_not_said_to_be(video, said, monkeypatch, tmp_path):
     monkeypatch.setattr(Pipeline, "by_frame", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     source, _ = video  # without a box: nothing is learned, however late the interrupt arrives
-    code, _, errors = said("track", source, "--save-model", tmp_path / "model")
+    code, _, errors = said("track", source, "--save-model", tmp_path / "model", "--write", tmp_path / "tracks.csv")
     assert (code, list(tmp_path.iterdir())) == (130, [])
     assert "saved model:" not in errors
     assert "nothing was learned" in errors
-    assert errors.endswith(f"stopped: the results so far are kept; not saved: {tmp_path / 'model'}\n")
+    assert errors.endswith(f"no frame was tracked\nstopped: not saved: {tmp_path / 'model'}\n")
 
 
 def test_doubtful_options_are_reported_before_the_run_and_saved_models_after_it(video, said, succeed, tmp_path):
