@@ -26,7 +26,7 @@ from catstream.base.settings import Settings
 from catstream.errors import ServiceError, SettingsError
 from catstream.jobs.job import Job, Models, Results, files_by_name
 from catstream.jobs.probe import prepared, probe
-from catstream.jobs.state import last_seq, last_time, locked_for_run, saved
+from catstream.jobs.state import check_new, last_seq, last_time, locked_for_run, saved
 from catstream.messages.kinds import RunState, Track, run_state
 from catstream.processes.start_server import start_server
 from catstream.processes.supervisor import Supervisor
@@ -113,8 +113,8 @@ class Pipeline:
     SettingsError
         From the constructor, if the settings do not suit the source: a live one in lockstep.
     ServiceError, ProtocolError
-        From the constructor, if the model cannot be read, a file of `save_model` cannot be written, or the folder to
-        resume contains no run or a damaged one.
+        From the constructor, if the model cannot be read, a file of `save_model` cannot be written, the folder to
+        resume contains no run or a damaged one, or the folder of the state contains a run.
     ServiceError
         At the start, if the endpoint or the state folder is in use, or if the pipeline has run already. While
         iterating, if a process fails repeatedly, or another thread closes the pipeline.
@@ -142,6 +142,8 @@ class Pipeline:
         text = None if source is None else source_text(source)
         self._earlier: Job | None = None
         self._state = None if state is None else Path(state).absolute()
+        if self._state is not None:
+            check_new(self._state)
         if resume is None:
             job = Job.new(text, box, settings, models=model, part=part, results=results, paused=paused)
         else:

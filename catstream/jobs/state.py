@@ -115,16 +115,23 @@ def locked(folder: Path, seconds: float = 0.0) -> Iterator[Path]:
         yield folder
 
 
+def check_new(folder: Path) -> None:
+    """Raise ServiceError if a folder contains a run, or a part of one."""
+    if contains_run(folder):
+        hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
+    elif (folder / CHECKPOINTS).exists():
+        hint = f"contains a run without its {_SMALL[0]}, which cannot be continued: use another folder"
+    else:
+        return
+    raise ServiceError(f"{str(folder)!r} {hint}")
+
+
 @contextlib.contextmanager
 def locked_for_run(folder: Path, resumed: Job | None, job: Job) -> Iterator[None]:
     """Lock the state folder, and store the job there if it is new or has changed."""
     with locked(folder):
-        if resumed is None and any((folder / name).exists() for name in (_SMALL[0], CHECKPOINTS)):
-            if contains_run(folder):
-                hint = f"already contains a run: continue it (--resume {quote(str(folder))}), or use another folder"
-            else:
-                hint = f"contains a run without its {_SMALL[0]}, which cannot be continued: use another folder"
-            raise ServiceError(f"{str(folder)!r} {hint}")
+        if resumed is None:
+            check_new(folder)
         if job != resumed:
             job.save(folder)
         yield

@@ -101,7 +101,7 @@ def test_a_run_whose_processes_were_all_killed_resumes_with_each_frame_once(kill
 def test_a_state_folder_that_is_in_use_or_has_other_settings_is_rejected(killed, video, fail, tmp_path):
     kept, (source, box) = killed / "kept", video
     refusals = {
-        "continue it": ["track", source, "--box", box, "--state", kept],
+        "continue it": ["track", source, "--box", box, "--state", kept, "--output", killed / "out"],  # which exists
         "started with coreset.size=64, not 32": ["track", "--resume", kept, *OFTEN, "--set", "coreset.size=32"],
         "frames 3 to the last": ["track", "--resume", kept, "--start", "3"],
         "contains no run": ["track", "--resume", tmp_path / "none"],
