@@ -101,7 +101,8 @@ class Stream(threading.Thread):
         self.address: Address | None = None
         self.error: CatstreamError | None = None
         self.totals: dict[str, int] = {}
-        self._url, self._boxes, self._settings = url, boxes, settings
+        self._url, self._boxes = url, boxes
+        self._settings = settings.replace({"run.endpoint": ""})  # each pipeline has its own
         self._pipeline: Pipeline | None = None
 
     def run(self) -> None:

@@ -74,8 +74,6 @@ class Plan:
             raise SettingsError(
                 "a load test does not support lockstep, because its frames do not wait for models: omit run.lockstep"
             )
-        if self.settings.run.endpoint:
-            raise SettingsError("each stream of a load test has its own endpoint: omit run.endpoint")
 
     def __str__(self) -> str:
         objects = f", {self.objects} objects" if self.objects > 1 else ""
