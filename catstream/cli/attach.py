@@ -18,6 +18,7 @@ from rich.console import Console
 from catstream.base.box import Box
 from catstream.base.files import check_file
 from catstream.base.names import UNNAMED, check_name, split_name
+from catstream.base.text import counted
 from catstream.cli.options import (
     FOLDER,
     PATH,
@@ -133,7 +134,7 @@ def watch(channel: str, address: Address, wait: float, name: str | None, as_json
                 if received == count:
                     break
         reason = f": {messages.end.reason}" if messages.end is not None else ""
-        click.echo(f"{received} {channel}, {messages.losses()}{reason}", err=True)
+        click.echo(f"{counted(received, 'message')}, {messages.losses()}{reason}", err=True)
 
 
 def with_silence_warnings(messages: Subscription[Any], idle: Callable[[], None] = lambda: None) -> Iterator[Any]:

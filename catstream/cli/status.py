@@ -59,7 +59,7 @@ class Status(msgspec.Struct):
             yield "state", run_state(counters)[1]
             yield "frames", f"{counters['sent']:.0f}{rate}"
             behind, not_stored = (counters["sent"] - counters[name] for name in ("processed", "stored"))
-            yield "learning", f"{behind:.0f} messages behind, {not_stored:.0f} not stored"
+            yield "learning", f"{counted(behind, 'message')} behind, {not_stored:.0f} not stored"
             yield "model", f"{counters['model_version']:.0f}"
             if "skipped" in counters:  # not of a file
                 reconnects = "reconnects" in counters and f", {counted(int(counters['reconnects']), 'reconnect')}"

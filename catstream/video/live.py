@@ -131,11 +131,15 @@ class LiveSource(Source):
         while (newest := self._wait_for_newest()) is None:
             if self._problem:
                 self.close()
-                hint = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
                 problem, _, advice = self._problem.partition(": ")
-                unauthorized = re.search("40[13]", problem)
-                cause = "its user and password" if unauthorized else "that it is running, and its address"
-                raise VideoError(f"cannot open {self._address!r} ({problem}): {advice or f'check {cause}{hint}'}")
+                if re.search("40[13]", problem):
+                    cause = "its user and password"
+                elif "://" in self._text:
+                    cause = "that it is running, and its address"
+                else:
+                    cause = "that the camera is connected (ls /dev/video*)"
+                folder = f"; the folder of that name is ./{self._text}" if self._text.isdigit() else ""
+                raise VideoError(f"cannot open {self._address!r} ({problem}): {advice or f'check {cause}{folder}'}")
         return self._frame(*newest)
 
     def _wait_for_newest(self) -> tuple[float, VideoFrame] | None:

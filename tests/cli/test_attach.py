@@ -45,7 +45,7 @@ def test_watch_prints_tracks_as_json_lines_until_the_end_and_features_as_lines(l
     found = [json.loads(line) for line in output.splitlines()]
     assert found[0].keys() == {field.name for field in dataclasses.fields(Track)}
     assert [track["frame"] for track in found] == list(range(60 - len(found), 60))
-    assert errors.startswith(f"{len(found)} tracks, {60 - len(found)} missed"), "those before it came"
+    assert errors.startswith(f"{len(found)} messages, {60 - len(found)} missed"), "those before it came"
     assert errors.endswith(": the source has ended\n")
     lines = shown.splitlines()
     assert len(lines) == 3
@@ -60,7 +60,7 @@ def test_late_subscriber_gets_the_last_model_with_its_arrays_described(resting, 
     assert model["version"] >= 1
     assert model["weights"].keys() == {"dtype", "shape", "norm"}
     assert (model["weights"]["dtype"], model["weights"]["shape"]) == ("float32", [ROW_LENGTH])
-    assert (code, errors) == (0, "1 models, 0 missed\n")
+    assert (code, errors) == (0, "1 message, 0 missed\n")
 
 
 def test_watch_says_why_nothing_arrives(resting, catstream):
