@@ -107,6 +107,8 @@ def annotate(
                 annotation.set_boxes(by_object(read_keyframes(results.keyframes)))
             interrupted = _serve(annotation, jobs, results, listen)
     _report(annotation)
+    if interrupted and not annotation.keyframes:
+        stopped()
     click.echo(f"results: {results.folder}")
     if interrupted:
         stopped(f"the results so far are in {results.folder}")
@@ -135,7 +137,7 @@ def _serve(annotation: Annotation, jobs: int, results: _ResultFiles, listen: Hos
     with Session(annotation, jobs, results.save, results.write) as session:
         results.begin()
         interrupted = serve(session, listen)
-    if interrupted and session.decoded:
+    if interrupted and session.decoded and annotation.keyframes:
         with INTERRUPTS.deferred():
             results.write()
     if session.problem is not None:

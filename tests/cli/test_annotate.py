@@ -79,3 +79,10 @@ def test_ctrl_c_keeps_the_boxes_and_the_finished_tracks(demo, said, tmp_path, mo
     assert (code, errors) == (130, f"stopped: the results so far are in {tmp_path / 'out'}\n")
     assert len(rows(tmp_path / "out" / "keyframes.csv")) == 1
     assert len(rows(tmp_path / "out" / "demo.csv")) == FRAMES
+
+
+def test_ctrl_c_before_the_first_box_writes_no_log(demo, said, tmp_path, monkeypatch):
+    monkeypatch.setattr("catstream.cli.annotate.serve", lambda *_: True)
+    code, output, errors = said("annotate", demo[0], "--output", tmp_path)
+    assert (code, output, errors) == (130, "no box was drawn\n", "stopped\n")
+    assert [file.name for file in tmp_path.iterdir()] == ["keyframes.csv"]
