@@ -19,15 +19,7 @@ from catstream.base.box import Box
 from catstream.base.files import check_file
 from catstream.base.names import UNNAMED, check_name, split_name
 from catstream.base.text import counted
-from catstream.cli.options import (
-    FOLDER,
-    PATH,
-    NumberRange,
-    combined,
-    with_boxes,
-    with_keys,
-    with_overwrite,
-)
+from catstream.cli.options import FOLDER, PATH, NumberRange, combined, with_boxes, with_json, with_keys, with_overwrite
 from catstream.client.address import Address
 from catstream.client.attach import control, subscribe, wait_until_running
 from catstream.client.control import Control
@@ -76,12 +68,7 @@ with_address = combined(
 )
 
 with_wait = click.option(
-    "--wait",
-    type=NumberRange(0),
-    default=30.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="Seconds to wait for the pipeline at --endpoint.",
+    "--wait", default=30.0, show_default=True, type=NumberRange(0), help="Seconds to wait for the pipeline."
 )
 
 
@@ -96,7 +83,7 @@ def wait_for_pipeline(address: Address, seconds: float) -> None:
 @with_address
 @with_wait
 @click.option("--object", "name", metavar="NAME", help="Only the tracks, models or samples of this object.")
-@click.option("--json", "as_json", is_flag=True, help="Print each message as a line of JSON.")
+@with_json
 @click.option("--count", type=click.IntRange(min=1), help="End after this number of messages.")
 def watch(channel: str, address: Address, wait: float, name: str | None, as_json: bool, count: int | None) -> None:
     """Print the messages of a running pipeline, one a line, until it ends or Ctrl-C.
@@ -172,7 +159,7 @@ def _line(value: Any) -> str:
     if isinstance(value, dict):
         texts = {name: _line(field) for name, field in value.items()}
         texts |= {name: f"({text})" for name, text in texts.items() if isinstance(value[name], dict)}
-        return "  ".join(f"{name} {text}" for name, text in texts.items() if text not in ("", "()"))
+        return "  ".join(f"{name or '-'} {text}" for name, text in texts.items() if text not in ("", "()"))
     if isinstance(value, list | tuple):
         return ",".join(map(_line, value))
     if isinstance(value, bytes):

@@ -97,18 +97,14 @@ def evaluate(
 def demo(output: Path, frames: int, render_only: bool, live: str | None) -> None:
     """Render a video with ground truth, track its object, and print the accuracy.
 
-    A dahlia moves over a lake: it rotates and changes its size, the brightness
-    changes, a similar flower crosses it, a pagoda occludes it, and it leaves the
-    picture and returns.
-
     The source demo:SEED is a part of the video as a live source, which needs no
     camera and never ends. SEED is a number. --live prints the box of its first
     frame.
 
     \b
-    Writes
-      OUTPUT/demo.mp4, groundtruth_rect.txt   the video and its ground truth: a sequence for `catstream evaluate`
-      OUTPUT/tracks/                          the results of `catstream track`, with the annotated video
+    OUTPUT
+      demo.mp4, groundtruth_rect.txt  a sequence for `catstream evaluate`
+      tracks/                         the results of `catstream track`
 
     \b
     EXAMPLES

@@ -116,11 +116,10 @@ def view(address: Address, listen: HostPort) -> None:
     next one. Ctrl-C ends the server; the pipeline continues.
 
     Only users with the token can watch and control: open the printed link,
-    which ends with it. The token is generated once and stored in
-    ~/.local/state/catstream/view-token; delete the file to generate a new one. The
-    variable VIEW_TOKEN sets another one of at least 16 characters; "none" lets every
-    user of this machine watch and control. The connection is not encrypted: from
-    other machines, use an ssh tunnel, or a proxy with TLS.
+    which ends with it. The variable VIEW_TOKEN sets another one of at least 16
+    characters; "none" lets every user of this machine watch and control. The
+    connection is not encrypted: from other machines, use an ssh tunnel, or a
+    proxy with TLS.
 
     \b
     EXAMPLES
