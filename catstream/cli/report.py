@@ -16,42 +16,47 @@ from catstream.errors import VideoError
 @click.argument("log", type=PATH)
 @click.argument("page", type=PATH, required=False)
 @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of a log.")
+@click.option("--scale", metavar="0.05mm", help="Size of a pixel and its unit; by default, lengths are in pixels.")
 @with_overwrite
-def report(log: Path, page: Path | None, skip_damaged: bool, overwrite: bool) -> None:
+def report(log: Path, page: Path | None, skip_damaged: bool, scale: str | None, overwrite: bool) -> None:
     """Write an HTML page about the tracks of a run.
 
     LOG is an .ndjson, .sqlite or .csv file, or a folder, for example that of
     catstream batch, whose .ndjson files are reported together. PAGE is by default
     LOG with the extension .html, or report.html in the folder.
 
-    The page shows a timeline of each object, its speed, and the frames to look
-    at. The video is read for the pictures; without it, the page has none.
+    The page shows a timeline of each object, distance and speed, and the frames to
+    look at. PAGE-objects.csv, beside it, has the table of all objects. The video
+    is read for the pictures; without it, the page has none.
 
     \b
     EXAMPLES
       catstream report out/walk.ndjson
-      catstream report out
+      catstream report out --scale 0.05mm
     """
     with INTERRUPTS.leaving():
         from catstream.base.files import check_file
-        from catstream.reports.tracks import Section, write_report
+        from catstream.reports.tracks import PIXELS, Scale, Section, write_report
         from catstream.sinks.track_log import logs_of
 
     logs = logs_of(log)
     page = page or (log / "report.html" if log.is_dir() else log.with_suffix(".html"))
-    check_file(page, overwrite=overwrite, kind=VideoError)
+    table = page.with_name(f"{page.stem}-objects.csv")
+    for file in (page, table):
+        check_file(file, overwrite=overwrite, kind=VideoError)
+    size = PIXELS if scale is None else Scale.parse(scale)
     sections = []
     with line_of(messages()) as progress:
         task = progress.add_task("reading", total=len(logs))
         for path in logs:
-            section = Section(path, skip_damaged=skip_damaged)
+            section = Section(path, skip_damaged=skip_damaged, scale=size)
             section.add_pictures()
             sections.append(section)
             progress.advance(task)
-    write_report(page, sections)
+    write_report(page, table, sections)
     for section in sections:
         if section.gap:
             complain(f"{section.name}: the log lacks {counted(section.gap, 'frame')}, as the disk was full")
         if section.problem:
             complain(f"{section.name}: no pictures ({section.problem})")
-    click.echo(f"report: {page}")
+    click.echo(f"report: {page}, {table}")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import groupby, islice
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +16,7 @@ import numpy as np
 from catstream.base.addresses import is_live
 from catstream.base.arrays import Float64
 from catstream.base.settings import RunSettings
+from catstream.base.tables import write_table
 from catstream.base.text import counted
 from catstream.errors import VideoError
 from catstream.messages.kinds import Track
@@ -26,6 +30,8 @@ from catstream.video.source import open_source
 _PICTURES = 8  #: most frames to look at in a video
 _SIDE = 480  #: of a picture, pixels
 _BINS = 200  #: of the plot of the speed
+_SPEED_SECONDS = 0.25  #: of which a speed is the mean, at least
+_GAP_SECONDS = 1.0  #: without a frame, from which the source was lost, if it is also five intervals
 
 
 class _Bar(NamedTuple):
@@ -44,68 +50,93 @@ class _Picture(NamedTuple):
     text: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Object:
-    """The tracks of an object.
+class Scale(NamedTuple):
+    """Size of a pixel in a unit of length."""
 
-    frames   int (n,), their numbers
-    times    float64 (n,), seconds
-    steps    float64 (n - 1,), distance from each centre of the box to the next one, pixels; NaN beside an absence
-    states   present, doubtful or absent
-    checked  share of the frames that are keyframes or checked, from 0 to 1
-    """
-
-    frames: np.ndarray
-    times: Float64
-    steps: Float64
-    states: list[str]
-    checked: float
+    size: float
+    unit: str
 
     @classmethod
-    def of(cls, tracks: Sequence[Track]) -> _Object:
+    def parse(cls, text: str) -> Scale:
+        """Parse a size with its unit; VideoError if it is none.
+
+        >>> Scale.parse("0.05mm")
+        Scale(size=0.05, unit='mm')
+        """
+        parts = re.fullmatch(r"([\d.]+(?:e-?\d+)?)\s*([^\W\d]+)", text)
+        with suppress(ValueError):
+            if parts is not None and 0 < (size := float(parts[1])) < np.inf:
+                return cls(size, parts[2])
+        raise VideoError(f"expected the size of a pixel with its unit, for example 0.05mm, got {text!r}")
+
+    def format(self, value: float, per: str = "") -> str:
+        """Format a length or a speed, rounded to a pixel."""
+        digits = max(0, -math.floor(math.log10(self.size)))
+        return "-" if math.isnan(value) else f"{value:.{digits}f} {self.unit}{per}"
+
+
+PIXELS = Scale(1, "px")
+
+#: Columns of the table of objects: those of `_Object.row`.
+_COLUMNS = ("frames", "present", "doubtful", "absent", "checked", "seconds", "distance", "mean_speed", "maximum_speed")
+
+
+class _Object:
+    """The tracks of an object: from a frame to the next one, unless there is a gap, or it is absent in one of them.
+
+    frames   int (n,), their numbers in the source
+    times    float64 (n,), seconds
+    ends     float64 (n,), seconds: the time of the next frame; before a gap, after one interval
+    gaps     bool (n - 1,), whether the source was lost between a frame and the next one
+    steps    float64 (n - 1,), distance from each centre of the box to the next one; NaN next to an absence or a gap
+    states   present, doubtful or absent, (n,)
+    """
+
+    def __init__(self, tracks: Sequence[Track], rate: float, scale: Scale) -> None:
+        self.frames = np.array([track.source_frame for track in tracks])
+        self.times: Float64 = np.array([track.time for track in tracks])
+        intervals = np.diff(self.times)
+        self.interval = float(np.median(intervals)) if len(intervals) else 1 / rate
+        self.gaps = intervals > max(_GAP_SECONDS, 5 * self.interval)
+        self.ends = self.times + np.append(np.where(self.gaps, self.interval, intervals), self.interval)
         boxes = np.array([track.box or [np.nan] * 4 for track in tracks], np.float64)
-        return cls(
-            np.array([track.frame for track in tracks]),
-            np.array([track.time for track in tracks]),
-            np.hypot(*np.diff(boxes[:, :2] + boxes[:, 2:] / 2, axis=0).T),
-            [("doubtful" if track.doubtful else "present") if track.box else "absent" for track in tracks],
-            float(np.mean([track.checked in ("keyframe", "checked") for track in tracks])),
-        )
+        self.steps: Float64 = scale.size * np.hypot(*np.diff(boxes[:, :2] + boxes[:, 2:] / 2, axis=0).T)
+        self.steps[self.gaps] = np.nan
+        states = [("doubtful" if track.doubtful else "present") if track.box else "absent" for track in tracks]
+        self.states = np.array(states)
+        self._checked = float(np.mean([track.checked in ("keyframe", "checked") for track in tracks]))
 
     def runs(self) -> Iterator[tuple[str, slice]]:
-        """Yield the stretches of frames with one state."""
-        start = 0
-        for state, group in groupby(self.states):
-            stop = start + len([*group])
-            yield state, slice(start, stop)
-            start = stop
+        """Yield the stretches of frames with one state and without a gap."""
+        cuts = np.flatnonzero((self.states[1:] != self.states[:-1]) | self.gaps) + 1
+        for start, stop in pairwise([0, *cuts, len(self.states)]):
+            yield str(self.states[start]), slice(start, stop)
 
-    def row(self, name: str) -> list[str]:
-        """The row of the table."""
+    def row(self) -> list[float]:
+        """The values of `_COLUMNS`: shares from 0 to 1, NaN if unknown. Seconds are those in which it is present.
+
+        The maximum speed is that of the fastest quarter of a second, because boxes jitter from frame to frame.
+        """
         distance, tracked = np.nansum(self.steps), np.diff(self.times)[~np.isnan(self.steps)].sum()
-        shares = (self.states.count(state) / len(self.states) for state in ("present", "doubtful", "absent"))
-        return [
-            name or "object",
-            str(len(self.states)),
-            *(f"{share:.1%}" for share in shares),
-            f"{self.checked:.1%}" if self.checked else "-",
-            f"{distance:.0f} px",
-            f"{distance / tracked:.0f} px/s" if tracked else "-",
-        ]
+        shares = [float(np.mean(self.states == state)) for state in ("present", "doubtful", "absent")]
+        seconds = (self.ends - self.times)[self.states != "absent"].sum()
+        width = max(_SPEED_SECONDS, 2 * self.interval)
+        speeds = self.speeds(np.arange(self.times[0], self.ends[-1] + width, width))
+        fastest = np.nanmax(speeds, initial=0) if tracked else np.nan
+        return [len(self.states), *shares, self._checked, seconds, distance, distance / (tracked or np.nan), fastest]
 
-    def lane(self, duration: float) -> list[_Bar]:
-        """Its bars in the timeline of a video of this duration in seconds."""
-        bars, scale = [], 100 / duration
-        ends = [*self.times[1:], duration]
+    def lane(self, start: float, end: float) -> list[_Bar]:
+        """Its bars in a timeline between two times in seconds."""
+        bars, scale = [], 100 / (end - start)
         for state, frames in self.runs():
-            first, last = self.times[frames.start], ends[frames.stop - 1]
+            first, last = self.times[frames.start], self.ends[frames.stop - 1]
             numbers = f"frames {self.frames[frames.start]} to {self.frames[frames.stop - 1]}"
             text = f"{state}, {clock(first)} to {clock(last)}, {numbers}"
-            bars.append(_Bar(state, scale * first, scale * (last - first), text))
+            bars.append(_Bar(state, scale * (first - start), scale * (last - first), text))
         return bars
 
     def speeds(self, edges: Float64) -> Float64:
-        """Mean speed in px/s between neighbours of `edges`, seconds; NaN while it is absent."""
+        """Mean speed per second between neighbours of `edges`, seconds; NaN while it is absent."""
         tracked = ~np.isnan(self.steps)
         middles, seconds = ((self.times[1:] + self.times[:-1]) / 2)[tracked], np.diff(self.times)[tracked]
         distances, _ = np.histogram(middles, edges, weights=self.steps[tracked])
@@ -120,22 +151,29 @@ class Section:
     Raises VideoError if the log cannot be read, or contains no track.
     """
 
-    def __init__(self, path: Path, *, skip_damaged: bool = False) -> None:
+    def __init__(self, path: Path, *, skip_damaged: bool = False, scale: Scale = PIXELS) -> None:
         self._log = Log(path, skip_damaged=skip_damaged)
-        self.name, self._head = path.stem, self._log.head() or Head()
-        tracks: dict[str, list[Track]] = {}
+        self.name, self._head, self.unit = path.stem, self._log.head() or Head(), scale.unit
+        tracks: dict[tuple[str, int], list[Track]] = {}
         for frame in self._log:
             for track in frame.tracks:
-                tracks.setdefault(track.object, []).append(track)
+                tracks.setdefault((track.object, track.began), []).append(track)
         if not tracks:
             raise VideoError(f"{path} contains no track: pass the log of a run")
         self.gap = self._log.gap
-        self._objects = {name: _Object.of(rows) for name, rows in tracks.items()}
+        self._labels, self._scale = dict[tuple[str, int], str](), scale
+        for (name, began), rows in tracks.items():  # another object that reuses a name has a label of its own
+            is_other = name in self._labels.values()
+            self._labels[name, began] = f"{name}@{rows[0].source_frame}" if is_other else name
+        rate = self._head.rate or RATE
+        self._objects = {label: _Object(tracks[key], rate, scale) for key, label in self._labels.items()}
         self._palette = Colours()
-        self.colours = {name: self._palette.of(name) for name in tracks}
-        self.duration = max(item.times[-1] for item in self._objects.values()) + 1 / (self._head.rate or RATE)
-        self.rows = [item.row(name) for name, item in self._objects.items()]
-        self.lanes = {name: item.lane(self.duration) for name, item in self._objects.items()}
+        self.colours = {label: self._palette.of(label) for label in self._objects}
+        self.start = min(item.times[0] for item in self._objects.values())
+        self.end = max(item.ends[-1] for item in self._objects.values())
+        self.figures = {label or "object": item.row() for label, item in self._objects.items()}
+        self.rows = [[label, *_texts(row, scale)] for label, row in self.figures.items()]
+        self.lanes = {label: item.lane(self.start, self.end) for label, item in self._objects.items()}
         self.speeds, self.top_speed = self._speeds()
         self.pictures, self.problem = list[_Picture](), ""
 
@@ -144,16 +182,18 @@ class Section:
         if not self._head.source or is_live(self._head.source):
             self.problem = "the log names no video"
         elif frames := self._frames_to_look_at():
-            logged = {frame.number: frame for frame in self._log if frame.number in frames}
-            part, rate = slice(self._head.start, None, self._head.stride), self._head.rate or RATE
+            logged = {frame.tracks[0].source_frame: frame.tracks for frame in self._log}
+            first, rate = min(frames), self._head.rate or RATE
             # A run skips damaged frames and scales others, or ends at the first: in any case these are its frames.
             settings = RunSettings(image_rate=rate, skip_damaged=True, resize=True)
             try:
+                part = slice(first, max(frames) + 1)
                 with open_source(self._head.source, part=part, settings=settings) as source:
-                    for frame in islice(source, max(frames) + 1):
-                        if frame.number in frames:
-                            image = draw(frame.image, logged[frame.number].tracks, self._palette)
-                            text = f"frame {frame.number}, {clock(frame.time)}: {frames[frame.number]}"
+                    for number, frame in enumerate(source, first):
+                        if number in frames:
+                            tracks = [replace(t, object=self._labels[t.object, t.began]) for t in logged[number]]
+                            image = draw(frame.image, tracks, self._palette)
+                            text = f"frame {number}, {clock(frame.time)}: {frames[number]}"
                             self.pictures.append(_Picture(jpeg(image, side=_SIDE), text))
             except VideoError as error:
                 self.problem = str(error)
@@ -171,12 +211,14 @@ class Section:
 
     def _speeds(self) -> tuple[dict[str, list[str]], float]:
         """The polylines of the speed of each object in a plot of 1000 x 460, and the speed at its upper end."""
-        edges = np.linspace(0, self.duration, min(_BINS, max(2, int(self.duration * 4))) + 1)
+        duration = self.end - self.start
+        width = max(_SPEED_SECONDS, *(2 * item.interval for item in self._objects.values()))
+        edges = np.linspace(self.start, self.end, min(_BINS, max(2, int(duration / width))) + 1)
         speeds = {name: item.speeds(edges) for name, item in self._objects.items()}
-        fastest = max(1.0, *(float(np.nanmax(item, initial=0)) for item in speeds.values()))
+        fastest = max(self._scale.size, *(float(np.nanmax(item, initial=0)) for item in speeds.values()))
         step = 10 ** np.floor(np.log10(fastest)) / 2
         top = step * np.ceil(fastest / step)  # a round number
-        xs = 1000 * (edges[1:] + edges[:-1]) / 2 / self.duration
+        xs = 1000 * ((edges[1:] + edges[:-1]) / 2 - self.start) / duration
         lines = {}
         for name, values in speeds.items():
             points = np.column_stack([xs, 460 - 440 * values / top])
@@ -185,6 +227,20 @@ class Section:
         return lines, float(top)
 
 
-def write_report(path: Path, sections: Iterable[Section]) -> Path:
-    """Write the report of videos."""
-    return write_page(path, "tracks.html", sections=[*sections])
+def _texts(row: Sequence[float], scale: Scale) -> list[str]:
+    """The cells of a row of the page."""
+    frames, *shares, checked, seconds, distance, mean, fastest = row
+    speeds = (scale.format(speed, "/s") for speed in (mean, fastest))
+    texts = [f"{frames:.0f}", *(f"{share:.1%}" for share in shares), f"{checked:.1%}" if checked else "-"]
+    return [*texts, f"{seconds:.1f} s", scale.format(distance), *speeds]
+
+
+def write_report(path: Path, table: Path, sections: Sequence[Section]) -> None:
+    """Write the page of videos, and the table of their objects."""
+    write_page(path, "tracks.html", sections=sections)
+    rows = (
+        (section.name, label, *("" if math.isnan(value) else f"{value:.6g}" for value in row), section.unit)
+        for section in sections
+        for label, row in section.figures.items()
+    )
+    write_table(table, ("video", "object", *_COLUMNS, "unit"), rows, VideoError)

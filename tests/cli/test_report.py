@@ -1,5 +1,6 @@
 """`catstream report`: the numbers of its tables, its pictures, and what it says if there are none."""
 
+import csv
 import json
 import re
 
@@ -34,13 +35,47 @@ def test_a_report_has_shares_distance_and_mean_speed_of_each_object(succeed, fai
     assert "walk: no pictures (there is no video or folder '/nowhere.mp4'" in errors
     page = (tmp_path / "walk.html").read_text()
     # Six steps of 3 and 4 pixels, five of 0.1 s before the absence, and one after it.
-    assert ["anna", "10", "60.0%", "20.0%", "20.0%", "-", "30 px", "50 px/s"] in cells(page)
+    row = ["anna", "10", "60.0%", "20.0%", "20.0%", "-", "0.8 s", "30 px", "50 px/s", "50 px/s"]
+    assert row in cells(page)
     assert re.findall(r'<i class="(\w+)" title="(.*?)" style="left:(.*?)%;width:(.*?)%">', page) == [
         ("present", "present, 0:00.0 to 0:00.4, frames 0 to 3", "0.00", "40.00"),
         ("doubtful", "doubtful, 0:00.4 to 0:00.6, frames 4 to 5", "40.00", "20.00"),
         ("present", "present, 0:00.8 to 0:01.0, frames 8 to 9", "80.00", "20.00"),
     ]
     assert "exists already" in fail("report", log)
+    succeed("report", log, "--scale", "0.05mm", "--overwrite")
+    assert [*row[:7], "1.50 mm", "2.50 mm/s", "2.50 mm/s"] in cells((tmp_path / "walk.html").read_text())
+    with (tmp_path / "walk-objects.csv").open() as file:
+        (figures,) = csv.DictReader(file)
+    assert figures == {
+        **{"video": "walk", "object": "anna", "frames": "10", "present": "0.6", "doubtful": "0.2", "absent": "0.2"},
+        **{"checked": "0", "seconds": "0.8", "distance": "1.5", "mean_speed": "2.5", "maximum_speed": "2.5"},
+        "unit": "mm",
+    }
+    assert "with its unit, for example 0.05mm" in fail("report", log, "--scale", "5", "--overwrite")
+
+
+def test_another_object_that_reuses_a_name_and_an_outage_are_not_joined(succeed, tmp_path):
+    """Two objects named ben stand still in frames 100 to 119 of a video, which is lost for a minute in the middle."""
+    lines = [Head(rate=10.0, start=100).to_json()]
+    for number in range(20):
+        box, began = (Box(10, 10, 20, 20), 0) if number < 5 else (Box(300, 200 if number < 10 else 0, 20, 20), 5)
+        time = 10 + number / 10 + (60 if number >= 10 else 0)
+        track = Track(number, time, "present", box, 0.9, 1, object="ben", began=began, source_frame=100 + number)
+        lines.append(json.dumps(track.to_dict()))
+    (tmp_path / "walk.ndjson").write_text("\n".join(lines) + "\n")
+    succeed("report", tmp_path / "walk.ndjson")
+    page = (tmp_path / "walk.html").read_text()
+    assert [(row[0], *row[6:8]) for row in cells(page) if row] == [
+        ("ben", "0.5 s", "0 px"),
+        ("ben@105", "1.5 s", "0 px"),
+    ]
+    assert re.findall(r'title="present, (.*?)" style="left:(.*?)%', page) == [
+        ("0:10.0 to 0:10.5, frames 100 to 104", "0.00"),
+        ("0:10.5 to 0:11.0, frames 105 to 109", "0.81"),
+        ("1:11.0 to 1:12.0, frames 110 to 119", "98.39"),
+    ]
+    assert "print-color-adjust: exact" in page
 
 
 def test_the_pictures_of_a_report_are_the_middles_of_doubtful_stretches(walk, succeed, tmp_path):
