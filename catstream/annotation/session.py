@@ -10,7 +10,8 @@ from typing import Any, Self
 
 from catstream.annotation.annotation import Annotation, NextFrame, Task
 from catstream.annotation.keyframes import KeyframeBox
-from catstream.errors import CatstreamError, ObjectError, VideoError
+from catstream.base.box import Box
+from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, VideoError
 from catstream.messages.kinds import Track
 
 #: Passes of more frames have processes of their own, so that a correction of a short stretch does not wait for them.
@@ -88,10 +89,24 @@ class Session:
             self._replace({**before, object: {**before.get(object, {}), frame: box}})
             self._history.append((object, frame, before))
 
-    def rename(self, object: str, name: str) -> None:
-        """Rename an object, which keeps its passes; ObjectError if there is an object with this name."""
+    def delete(self, object: str, frame: int | None = None) -> None:
+        """Delete the box of an object at a frame; without a frame, or with its last box, delete the object."""
         with self.lock:
             before = self.annotation.keyframes
+            left = {name: drawn for name, drawn in before.items() if name != object}
+            kept = {place: box for place, box in before.get(object, {}).items() if frame not in (None, place)}
+            if any(isinstance(box, Box) for box in kept.values()):
+                left = {name: kept if name == object else drawn for name, drawn in before.items()}
+            if left != before:
+                self._replace(left)
+                self._history.append((object, frame, before))
+
+    def rename(self, object: str, name: str) -> None:
+        """Rename an object, which keeps its passes; ObjectError if there is another object with this name."""
+        with self.lock:
+            before = self.annotation.keyframes
+            if name == object:
+                return
             if name in before:
                 raise ObjectError(f"there is an object {name} already: use another name")
             self._replace({name if other == object else other: drawn for other, drawn in before.items()})
@@ -112,7 +127,7 @@ class Session:
             if not self.decoded:
                 raise VideoError("the video is not decoded yet: wait, or press Ctrl-C where the command runs")
             self._write()
-        self.finished.set()
+            self.finished.set()
 
     def remaining(self) -> int:
         """Number of frames that passes have to track, in both directions."""
@@ -121,6 +136,8 @@ class Session:
             return sum(max(1, task.frames - tracked.get(task, 0)) for task in self._missing)
 
     def _replace(self, keyframes: dict[str, dict[int, KeyframeBox]]) -> None:
+        if self.finished.is_set():
+            raise CommandRejectedError("the results are written: run the same command to continue")
         before = self.annotation.keyframes
         self.annotation.set_boxes(keyframes)
         try:

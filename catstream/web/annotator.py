@@ -90,17 +90,20 @@ class AnnotationSite:
         edit = await json_of(request, Edit)
         if edit.server != self._id:
             raise CommandRejectedError("this page belongs to an earlier command: reload it")
-        return JSONResponse({"done": True, **await run_in_threadpool(self._change, edit)})
+        more = await run_in_threadpool(self._change, edit)
+        return JSONResponse({"done": True, "revision": self._session.revision, **more})
 
     def _change(self, edit: Edit) -> dict[str, object]:
         if edit.verb == "undo":
             return dict(zip(("object", "frame"), self._session.undo() or (), strict=False))
         if edit.verb == "rename":
             self._session.rename(edit.object, edit.name)
+        elif edit.verb == "delete":
+            self._session.delete(edit.object, edit.frame)
         elif edit.verb == "done":
             self._session.finish()
         else:
-            self._session.draw(check_name(edit.object), edit.frame, edit.box and Box(*edit.box))
+            self._session.draw(check_name(edit.object), edit.frame or 0, edit.box and Box(*edit.box))
         return {}
 
     async def _states(self) -> AsyncIterator[str]:
@@ -148,17 +151,18 @@ class Edit:
     """A change of the page.
 
     server  id of the server, from the state of the page
-    verb    "draw" a box at a frame, none if the object is absent; "undo" the last one; "rename" an object; "done"
+    verb    "draw" a box at a frame, none if the object is absent; "delete" it; "undo" the last change; "rename" an
+            object; "done"
     object  name of the object
-    frame   number of the frame
+    frame   number of the frame; none deletes the object
     box     x, y, w, h in pixels
     name    the new name
     """
 
     server: str
-    verb: Literal["draw", "undo", "rename", "done"]
+    verb: Literal["draw", "delete", "undo", "rename", "done"]
     object: str = ""
-    frame: int = 0
+    frame: int | None = None
     box: tuple[float, float, float, float] | None = None
     name: str = ""
 

@@ -8,7 +8,7 @@ from catstream.annotation import session as module
 from catstream.annotation.annotation import Annotation
 from catstream.annotation.session import Session
 from catstream.base.box import Box
-from catstream.errors import BoxError, ObjectError, ServiceError, VideoError
+from catstream.errors import BoxError, CommandRejectedError, ObjectError, ServiceError, VideoError
 
 FRAMES = 24
 
@@ -62,12 +62,41 @@ def test_a_renamed_object_keeps_its_passes_and_gets_its_name_back(session, demo,
     until(lambda: session.annotation.passes("anna"))
     session.rename("anna", "ben")
     assert session.annotation.passes("ben")
-    session.draw("ben", 3, None)
-    with pytest.raises(ObjectError, match="there is an object ben already"):
-        session.rename("ben", "ben")
-    assert session.undo() == ("ben", 3)
+    session.draw("carl", 3, demo[1][0])
+    with pytest.raises(ObjectError, match="there is an object carl already"):
+        session.rename("ben", "carl")
+    session.rename("ben", "ben")
+    assert session.undo() == ("carl", 3)
     assert session.undo() == ("anna", None)
     assert session.annotation.keyframes == {"anna": {0: demo[1][0]}}
+
+
+def test_a_deleted_box_or_object_comes_back(session, saved, demo, until):
+    first, last = demo[1][0], demo[1][-1]
+    until(lambda: session.decoded)
+    for name, frame, box in (("anna", 0, first), ("anna", 9, None), ("anna", FRAMES - 1, last), ("ben", 0, first)):
+        session.draw(name, frame, box)
+    drawn = [saved[-1]]
+    for deleted in (("anna", 5), ("anna", 0), ("anna", FRAMES - 1), ("ben",)):
+        session.delete(*deleted)
+        drawn.append(saved[-1])
+    assert drawn[1:] == [
+        drawn[0],
+        {"anna": {9: None, FRAMES - 1: last}, "ben": {0: first}},
+        {"ben": {0: first}},  # an absence alone teaches nothing
+        {},
+    ]
+    assert [session.undo() for _ in range(3)] == [("ben", None), ("anna", FRAMES - 1), ("anna", 0)]
+    assert saved[-1] == drawn[0]
+
+
+def test_no_change_follows_the_results(session, saved, demo, until):
+    until(lambda: session.decoded)
+    session.draw("anna", 0, demo[1][0])
+    session.finish()
+    with pytest.raises(CommandRejectedError):
+        session.rename("anna", "ben")
+    assert [*saved[-1]] == ["anna"]
 
 
 def test_a_new_box_stops_the_passes_that_are_not_missing_any_more(session, demo, until, monkeypatch):

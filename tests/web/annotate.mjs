@@ -1,7 +1,7 @@
 // What a person does on the page of catstream annotate, by mouse and keys; says what was seen, a line each.
 //   node annotate.mjs URL CHROMIUM PROFILE BOXES WIDTH HEIGHT, with the boxes in the first and the last frame as JSON
 
-import { axe, drawOn, errorsOf, patience, violationsOf, withBrowser } from "./browser.mjs";
+import { axe, drawOn, errorsOf, patience, touchOn, violationsOf, withBrowser } from "./browser.mjs";
 
 const [url, executablePath, profile, boxes, ...size] = process.argv.slice(2);
 const [first, last] = JSON.parse(boxes);
@@ -76,8 +76,35 @@ await withBrowser(executablePath, profile, async (browser) => {
   await says("#check", "ben in frame 23: your box");
   await keys("Control+z");
   await undone();
+  await keys("End");
+  await says("#check", "ben in frame 23: your box");
+  await keys("Backspace");
+  await undone();
+  await keys("Home");
+  await says("#check", "ben in frame 0: your box");
+  await page.click("#delete"); // with its last box, the object
+  await says("#check", "A new object");
+  await page.evaluate(() => dispatchEvent(new KeyboardEvent("keydown", { key: "\u0433", code: "KeyU" }))); // of a Cyrillic keyboard
+  await says("#check", "ben in frame 0: your box");
+  await keys("u");
+  await says("#check", "ben in frame 23: your box");
+  await keys("Shift+Delete");
+  await says("#check", "A new object");
+  await page.click("#undo");
+  await says("#check", "ben in frame 23: your box");
+  await keys("?");
+  await page.waitForSelector("#keys[open]", patience);
+  await keys("Delete", "Escape");
   await page.locator("#timelines svg").first().click();
   await page.waitForFunction(() => /anna in frame 1[12]: checked/.test(document.querySelector("#check").textContent), null, patience); // the middle
+  const fingers = await touchOn(page, browser);
+  await fingers("touchStart", [0.3, 0.3]);
+  await fingers("touchMove", [0.4, 0.4]);
+  await fingers("touchStart", [0.4, 0.4], [0.6, 0.6]);
+  await fingers("touchMove", [0.3, 0.3], [0.7, 0.7]);
+  await fingers("touchEnd", [0.3, 0.3]);
+  await fingers("touchMove", [0.5, 0.3]);
+  await fingers("touchEnd");
   console.log("objects", (await page.locator("#timelines b").allInnerTexts()).join());
 
   await page.evaluate(axe);
@@ -92,7 +119,9 @@ await withBrowser(executablePath, profile, async (browser) => {
   const other = await browser.newPage();
   await other.goto(url);
   await other.waitForFunction(() => document.querySelector("#overlay").textContent === "", null, patience);
-  await page.click("#done");
+  await page.locator("#timelines button").last().click();
+  await page.fill("#name", "carl");
+  await keys("Control+Enter");
   await says("#overlay", "Done: the results are written");
   await other.waitForFunction(() => document.querySelector("#overlay").textContent.includes("does not answer"), null, patience);
   console.log("errors", JSON.stringify(wrong.filter((line) => !/40[04]|ERR_/.test(line))));

@@ -45,6 +45,16 @@ export async function drawOn(page, [width, height], [x, y, w, h]) {
   await page.mouse.up();
 }
 
+/** A function that sends a touch event at places in the picture, which are shares of its width and height. */
+export async function touchOn(page, browser) {
+  const session = await browser.newCDPSession(page), view = await placeOf(page, "#picture");
+  await session.send("Emulation.setTouchEmulationEnabled", { enabled: true });
+  return (type, ...places) => {
+    const touchPoints = places.map(([x, y], id) => ({ x: view.x + x * view.width, y: view.y + y * view.height, id }));
+    return session.send("Input.dispatchTouchEvent", { type, touchPoints });
+  };
+}
+
 /** What axe, which the page has evaluated, finds wrong with it. */
 export async function violationsOf(page) {
   const { violations } = await page.evaluate(() => axe.run({ resultTypes: ["violations"] }));

@@ -7,7 +7,14 @@ import { Stage } from "./stage.js";
 const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
 const CHECKS = { keyframe: "your box", hidden: "hidden, estimated", checked: "checked", unchecked: "may be wrong" };
-const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new" };
+const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new",
+  delete: "delete", backspace: "delete", "?": "help" };
+
+/** The name of a key in `KEYS`: by its label, else by its place, as on a keyboard with other letters. */
+function nameOf({ key, code }) {
+  const label = key.toLowerCase();
+  return label in KEYS ? label : code.replace(/^(Key|Digit|Numpad)/, "").toLowerCase();
+}
 
 /** The picture of a frame; a box is saved as soon as it is drawn. */
 class FrameStage extends Stage {
@@ -15,32 +22,80 @@ class FrameStage extends Stage {
     return `frames/${frame}.jpg`;
   }
 
-  release(clicked) {
-    super.release(clicked);
+  constructor(...all) {
+    super(...all);
+    this.fingers = new Map(); // on the picture: the first one draws, two zoom
+    for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, ({ pointerId }) => this.fingers.delete(pointerId));
+  }
+
+  press(event) {
+    if (event.pointerType === "touch") this.fingers.set(event.pointerId, event);
+    if (this.fingers.size < 2) return super.press(event);
+    if (this.fingers.has(this.pointer)) this.abort({ pointerId: this.pointer });
+  }
+
+  end() {
+    this.changed = false;
+    super.end();
+  }
+
+  /** Change the box with a key; false if the key does not. */
+  key(event) {
+    const { box } = this, by = event.shiftKey ? 10 : 1;
+    const arrows = { ArrowLeft: [-by, 0], ArrowRight: [by, 0], ArrowUp: [0, -by], ArrowDown: [0, by] };
+    const [x, y] = arrows[event.key] ?? [0, 0];
+    if (event.key === "Escape") this.cancel();
+    else if (event.key === "Enter") this.save();
+    else if (!box || !(event.key in arrows)) return false;
+    else if (event.ctrlKey || event.metaKey) this.change(box.x, box.y, Math.max(1, box.w + x), Math.max(1, box.h + y));
+    else this.change(box.x + x, box.y + y, box.w, box.h);
+    return true;
+  }
+
+  change(...box) {
+    this.changed = true;
+    this.set(...box);
+  }
+
+  release(event) {
+    if (event.pointerId !== this.pointer) return;
+    super.release(event);
+    if (this.box !== this.before.box) this.save();
+    else if (!this.before.drawing) this.cancel();
+  }
+
+  /** Save the box if a key has changed it, and end the drawing. */
+  leave() {
+    return this.changed ? this.save() : this.cancel();
+  }
+
+  /** Save the box, if there is one, and end the drawing. */
+  save() {
     const { box } = this;
     this.cancel();
-    if (box) this.actions.follow([box.x, box.y, box.w, box.h]);
+    return box && this.actions.follow([box.x, box.y, box.w, box.h]);
   }
 }
 
 class AnnotatePage {
   constructor() {
-    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], silent: false, ended: "" });
+    Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], edits: [], sent: Promise.resolve(), silent: false, ended: "" });
     this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {} });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
       first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
-      new: () => this.choose(null), done: () => this.done() };
+      delete: () => this.delete(this.frame), forget: () => this.delete(null), new: () => { this.stage.leave(); this.choose(null); }, help: () => $("#keys").showModal(), done: () => this.done() };
     for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
     $("#slider").oninput = () => this.go(Number($("#slider").value));
-    $("#name").onchange = () => { this.renaming = this.rename(); };
+    $("#name").onchange = () => this.rename();
     $("#naming").onsubmit = (event) => { event.preventDefault(); $("#name").blur(); };
     addEventListener("keydown", (event) => this.key(event));
+    addEventListener("pagehide", () => this.commit());
     addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // Enter means next again
     new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
     this.events = new EventSource("events");
     this.events.onmessage = ({ data }) => this.receive(JSON.parse(data));
-    this.events.onerror = () => { this.silent = true; this.show(); };
+    this.events.onerror = () => { this.silent = true; this.arrived?.(); this.show(); };
     this.choose(null);
   }
 
@@ -52,8 +107,10 @@ class AnnotatePage {
       const before = this.state;
       this.state = state;
       if (!before?.objects.length && state.objects.length && this.chosen === null) this.choose(state.objects[0].name);
+      if (!this.edits.length && before?.objects.some(({ name }) => name === this.chosen) && !this.get(this.chosen)) this.choose(null, this.chosen);
       if (state.revision !== before?.revision) this.load();
     }
+    this.arrived?.();
     this.show();
   }
 
@@ -67,20 +124,20 @@ class AnnotatePage {
   }
 
   /** Choose an object, null for a new one; a proposal is taken. */
-  choose(name) {
+  choose(name, typed = name) {
     if (Object.hasOwn(WAYS, name)) return this.take(name);
     this.chosen = name;
     let number = 1;
-    while (this.get(`object-${number}`)) number += 1;
-    $("#name").value = name ?? `object-${number}`;
-    if (name === null && this.state?.objects.length) $("#name").select(), $("#name").focus();
+    while (this.get(`object-${number}`) || this.edits.some(({ object }) => object === `object-${number}`)) number += 1;
+    $("#name").value = typed ?? `object-${number}`;
+    if (typed === null && this.state?.objects.length) $("#name").select(), $("#name").focus();
     this.showBoxes();
     this.show();
   }
 
   /** Go to a frame, and choose an object. */
   go(frame, name = this.missing(frame)) {
-    this.stage.cancel();
+    this.stage.leave();
     this.frame = Math.max(0, Math.min((this.state?.frames ?? 1) - 1, frame));
     this.boxes = {}; // the proposals of another frame cannot be taken
     if (name !== this.chosen) this.choose(name);
@@ -142,20 +199,56 @@ class AnnotatePage {
     this.stage.draw();
   }
 
-  /** Send a change; returns the answer, null if it was rejected, after showing the reason. */
-  async send(verb, more = {}) {
-    const answer = await post("edit", { server: this.state.server, verb, ...more });
-    write($("#message"), answer.reason ?? "");
-    return answer.done ? answer : null;
+  /** Send a change after the earlier ones; returns the answer once its state is here, null if it is rejected, with the reason shown. */
+  send(verb, more = {}) {
+    const edit = { verb, ...more };
+    this.edits.push(edit);
+    this.sent = this.sent.then(async () => {
+      const answer = await post("edit", { server: this.state.server, ...edit });
+      write($("#message"), answer.reason ?? "");
+      while (answer.done && this.state.revision < answer.revision && !this.silent) await new Promise((resolve) => { this.arrived = resolve; });
+      this.edits.shift();
+      if (!answer.done) return null;
+      if (verb === "rename") {
+        for (const later of this.edits) if (later.object === edit.object) later.object = edit.name;
+        if (this.chosen === edit.object) this.chosen = edit.name;
+      }
+      return answer;
+    });
+    return this.sent;
+  }
+
+  /** Delete the box that was drawn for the chosen object in a frame, null for the object; its last box is the object. */
+  async delete(frame) {
+    this.stage.cancel();
+    const { chosen } = this;
+    if (frame !== null && !this.shows(frame)) return;
+    if (await this.send("delete", { object: chosen, frame }) && !this.get(chosen) && this.chosen === chosen) this.choose(null, chosen);
+  }
+
+  /** True if the picture of a frame is shown; else what was meant for it is refused. */
+  shows(frame) {
+    return this.stage.picture?.frame === frame || Boolean(this.refuse(`Frame ${frame} is not shown yet: try again`));
+  }
+
+  refuse(reason) {
+    write($("#message"), reason);
+    return null;
+  }
+
+  /** Send the box and the name that are being changed; false if one of them is rejected. */
+  async commit() {
+    return !(await Promise.all([this.stage.leave(), this.rename()])).includes(null);
   }
 
   /** Save the box of the chosen object, or of a new one, in the frame that is shown; null if it is absent. */
   async set(box, frame = this.frame) {
-    if (this.stage.picture?.frame !== frame) return null; // another one is shown still
-    await this.renaming;
-    const object = this.chosen ?? $("#name").value.trim();
+    this.stage.cancel();
+    const { chosen, typed } = this, object = chosen ?? typed;
+    if (!this.shows(frame)) return null;
+    if (chosen === null && this.get(object)) return this.refuse(`There is an object ${object} already: use another name`);
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
-    if (answer && this.chosen === null) this.choose(object.normalize("NFC"));
+    if (answer && this.chosen === null && this.typed === object) this.choose(object);
     if (answer && this.state.videos.length) this.choose(this.missing(frame, this.chosen));
     return answer;
   }
@@ -166,27 +259,36 @@ class AnnotatePage {
 
   /** Begin with the box that is there, to change it with the keyboard. */
   async draw() {
-    if (this.stage.picture?.frame !== this.frame) return; // another one is shown still
+    if (this.stage.drawing || !this.shows(this.frame)) return;
     await this.stage.begin();
     const { width, height } = this.stage.picture;
     const [x, y, w, h] = this.boxes[this.chosen]?.box ?? [width * 0.4, height * 0.4, width * 0.2, height * 0.2];
     this.stage.set(x, y, w, h);
   }
 
+  /** The name in its field. */
+  get typed() {
+    return $("#name").value.trim().normalize("NFC");
+  }
+
   async rename() {
-    const name = $("#name").value.trim().normalize("NFC");
-    if (this.chosen === null || name === this.chosen) return;
-    if (await this.send("rename", { object: this.chosen, name })) this.chosen = name;
-    else $("#name").value = this.chosen;
+    const { chosen, typed } = this;
+    if (chosen === null || typed === chosen) return true;
+    const answer = await this.send("rename", { object: chosen, name: typed });
+    if (!answer && this.chosen === chosen) $("#name").value = chosen;
+    return answer;
   }
 
   async undo() {
+    if (this.stage.drawing) return this.stage.cancel();
     const { object, frame } = (await this.send("undo")) ?? {};
-    if (object !== undefined) this.go(frame ?? this.frame, object);
+    if (object === undefined) return;
+    this.go(frame ?? this.frame, this.chosen);
+    this.choose(this.get(object) ? object : null, object);
   }
 
   async done() {
-    if (await this.send("done")) this.end(`Done: ${this.state.videos.length ? "the command tracks the videos now" : "the results are written, and the command has ended"}. This tab can be closed.`);
+    if (await this.commit() && await this.send("done")) this.end(`Done: ${this.state.videos.length ? "the command tracks the videos now" : "the results are written, and the command has ended"}. This tab can be closed.`);
   }
 
   /** Show no other state from now on, but the reason. */
@@ -209,21 +311,23 @@ class AnnotatePage {
   }
 
   key(event) {
-    const { key, target } = event;
+    const { key, code, target, ctrlKey, metaKey, shiftKey } = event, modified = ctrlKey || metaKey, name = nameOf(event);
     const steps = { ArrowLeft: -1, ArrowRight: 1, PageUp: -JUMP, PageDown: JUMP, Home: -Infinity, End: Infinity };
-    if (key === "Enter" && (event.ctrlKey || event.metaKey)) return $("#done").click();
-    if (target.id === "name" || event.altKey || (event.ctrlKey || event.metaKey) !== (key === "z")) return;
-    if (this.stage.drawing) return this.stage.key(event);
-    if (key in steps) this.go(this.frame + steps[key]);
-    else if (key === "z") this.undo();
-    else if (key.toLowerCase() in KEYS && (key !== "Enter" || target.tagName !== "BUTTON")) $(`#${KEYS[key.toLowerCase()]}`).click();
+    if (event.isComposing || event.altKey || $("#keys").open || this.stage.pointer !== null) return;
+    if (key === "Enter" && modified) return $("#done").click();
+    if (target.id === "name") return;
+    if (this.stage.drawing && this.stage.key(event)) return event.preventDefault();
+    if (modified && !shiftKey && (key === "z" || (code === "KeyZ" && key > "\x7f"))) this.undo();
+    else if (modified) return;
+    else if (key in steps) this.go(this.frame + steps[key]);
+    else if (name in KEYS && (key !== "Enter" || target.tagName !== "BUTTON")) event.repeat || $(`#${name === "delete" && shiftKey ? "forget" : KEYS[name]}`).click();
     else return;
     event.preventDefault();
   }
 
   makeRow(name) {
     const element = document.createElement("li");
-    const choose = add(element, "button", { type: "button", onclick: () => this.choose(name) });
+    const choose = add(element, "button", { type: "button", onclick: () => { this.stage.leave(); this.choose(name); } });
     add(choose, "i", { className: "swatch" });
     add(choose, "b", { textContent: name || "no name" });
     const line = make("svg", { role: "img", preserveAspectRatio: "none" });
@@ -279,6 +383,8 @@ class AnnotatePage {
     $("#next").disabled = off || place === undefined;
     $("#absent").disabled = off || !known || several;
     for (const id of ["first", "second", "absent", "legend"]) $(`#${id}`).hidden = several;
+    $("#delete").disabled = off || this.boxes[chosen]?.checked !== "keyframe";
+    $("#forget").disabled = off || !known;
     $("#undo").disabled = off || !state.undo;
     $("#back").disabled = !this.visited.length;
     for (const id of ["draw", "new", "done", "name"]) $(`#${id}`).disabled = off;

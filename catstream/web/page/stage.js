@@ -16,13 +16,13 @@ export class Stage {
     Object.assign(this, { element, objects, actions });
     this.image = element.querySelector("img");
     this.boxes = element.querySelector("svg"); // over the image, in pixels of the frame
-    this.picture = this.box = this.start = this.still = null;
+    this.picture = this.box = this.start = this.still = this.pointer = null;
     this.drawing = this.loading = false;
     this.turn = 0; // number of pipelines shown before
     element.addEventListener("pointerdown", (event) => this.press(event));
     element.addEventListener("pointermove", (event) => this.drag(event));
-    element.addEventListener("pointerup", () => this.release());
-    element.addEventListener("pointercancel", () => this.release(false));
+    element.addEventListener("pointerup", (event) => this.release(event));
+    element.addEventListener("lostpointercapture", (event) => this.abort(event)); // without a release before
     element.addEventListener("keydown", (event) => this.key(event));
   }
 
@@ -99,31 +99,44 @@ export class Stage {
     this.tell();
   }
 
+  /** Start with the first pointer: others do not draw as long as it is down. */
   press(event) {
-    if (event.button !== 0 || !this.picture) return;
+    if (event.button !== 0 || !this.picture || this.pointer !== null) return;
     this.element.setPointerCapture(event.pointerId);
+    this.pointer = event.pointerId;
+    this.before = { drawing: this.drawing, box: this.box };
     this.start = { ...this.place(event), screen: [event.clientX, event.clientY] };
   }
 
   drag(event) {
-    if (!this.start || this.asking) return;
+    if (event.pointerId !== this.pointer || !this.start || this.asking) return;
     const [across, down] = this.start.screen;
-    if (!this.box && Math.hypot(event.clientX - across, event.clientY - down) < STILL) return;
+    this.start.moved ||= Math.hypot(event.clientX - across, event.clientY - down) >= STILL;
+    if (!this.start.moved) return;
     this.begin();
     const { x, y } = this.place(event);
     this.set(Math.min(x, this.start.x), Math.min(y, this.start.y), Math.abs(x - this.start.x), Math.abs(y - this.start.y));
   }
 
-  release(clicked = true) {
-    if (!this.start) return;
+  release(event) {
+    if (event.pointerId !== this.pointer) return;
     const place = this.start;
-    this.start = null;
-    if (!this.drawing) {
-      if (clicked) this.choose(place);
-    } else if (!this.box || this.box.w < SMALLEST || this.box.h < SMALLEST) {
-      this.box = null;
+    this.pointer = this.start = null;
+    if (!place) return;
+    if (!this.drawing) this.choose(place);
+    else if (!this.box || this.box.w < SMALLEST || this.box.h < SMALLEST) {
+      this.box = this.before.box;
       this.tell();
     }
+  }
+
+  /** Drop what a pointer has drawn: a second finger zooms, or the browser needs the pointer. */
+  abort(event) {
+    if (event.pointerId !== this.pointer) return;
+    this.pointer = this.start = null;
+    if (!this.before.drawing) return this.cancel();
+    this.box = this.before.box;
+    this.tell();
   }
 
   /** Choose the object whose box contains a place; the smallest one, if there are several. */
