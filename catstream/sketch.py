@@ -73,9 +73,15 @@ class CoresetPCA(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimato
         return self
 
     def merge(self, other: CoresetPCA) -> Self:
-        """Add the rows of another estimator of the same size, with the bound of one into which all were inserted."""
+        """Add the rows of another estimator of the same size, with the bound of one into which all were inserted.
+
+        ValueError if its columns differ in number, names or order.
+        """
         for estimator in (self, other):
             check_is_fitted(estimator)
+        names, others = (getattr(estimator, "feature_names_in_", None) for estimator in (self, other))
+        if names is not None and others is not None and not np.array_equal(names, others):
+            raise ValueError(f"cannot merge the columns {[*others]} into {[*names]}: fit both to the same ones")
         tree, p, q = self.tree_.merged(other.tree_), self.n_samples_seen_, other.n_samples_seen_
         shift = other.mean_ - self.mean_
         tree.insert(np.sqrt(p * q / (p + q)) * shift[None])

@@ -61,6 +61,26 @@ def test_two_estimators_merged_are_one_of_all_rows(rows):
     assert_same(merged, CoresetPCA(5, size=64).fit(np.vstack([rows[:300], rows[300:] + 7])))
 
 
+def test_estimators_of_other_columns_are_not_merged(rows):
+    def fitted(*names):
+        pca = CoresetPCA(2).fit(rows[:, : len(names)])
+        pca.feature_names_in_ = np.array(names)  # as of a data frame
+        return pca
+
+    fitted("x", "y", "z").merge(fitted("x", "y", "z"))
+    for other in (fitted("x", "z", "y"), fitted("x", "y", "u"), fitted("x", "y"), CoresetPCA(2).fit(rows[:, :2])):
+        with pytest.raises(ValueError, match="cannot merge"):
+            fitted("x", "y", "z").merge(other)
+
+
+@pytest.mark.parametrize("size", [16, 64])
+@pytest.mark.parametrize("scale", [1e-35, 1e-25, 1e17, 1e33])
+def test_components_do_not_depend_on_the_unit_of_the_rows(rows, size, scale):
+    right, scaled = (CoresetPCA(5, size).fit((rows - 1000) * unit) for unit in (1.0, scale))
+    assert_allclose(scaled.explained_variance_ratio_, right.explained_variance_ratio_, rtol=ROUNDING)
+    assert_allclose(abs(scaled.components_ @ right.components_.T), np.eye(5), atol=1e-3)
+
+
 def test_components_are_orthonormal_and_fewer_than_rows_are(rows):
     pca = CoresetPCA(5).partial_fit(rows[:3])
     assert pca.components_.shape == (3, 40)

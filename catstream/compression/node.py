@@ -65,9 +65,10 @@ class Node:
         if d < 2 * n:
             return None
         gram = np.zeros((2 * n, 2 * n), np.float32)
-        gram[:n, :n] = self.products
-        gram[n:, n:] = newer.products
-        gram[n:, :n] = newer.rows @ self.rows.T
+        with np.errstate(over="ignore", invalid="ignore"):  # `reduce` then computes it in another unit
+            gram[:n, :n] = self.products
+            gram[n:, n:] = newer.products
+            gram[n:, :n] = newer.rows @ self.rows.T
         return gram
 
     def directions(self, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from catstream.base.arrays import Float32, Float64
 
-_TINY = np.float32(1e-30)  # divisor in place of an energy of 0
+_SQUARES = 1e-30, 1e30  # range of the largest square in which float32 neither underflows nor overflows
 
 
 def energy(rows: np.ndarray) -> float:
@@ -80,23 +80,29 @@ def shrink(
     [[8.0, 0.0, 0.0], [0.0, 3.0, 0.0]]
     """
     energies, strongest = _strongest(rows, size + 1, towards, gram)
-    scale = np.sqrt(1 - energies[size] / np.maximum(energies[:size], _TINY))
-    shrunk: Float32 = strongest[:size] * scale[:, None]
+    scale = np.sqrt(1 - energies[size] / np.where(energies[:size] > 0, energies[:size], 1))
+    shrunk: Float32 = (strongest[:size] * scale[:, None]).astype(np.float32)
     return shrunk
 
 
 def _strongest(
     rows: np.ndarray, count: int, towards: np.ndarray | None, gram: np.ndarray | None
-) -> tuple[Float32, Float32]:
-    """Energies and rows s_i v_i of the `count` strongest singular vectors, or of all if there are fewer rows."""
+) -> tuple[np.ndarray, Float32]:
+    """Energies, in any unit, and rows s_i v_i of the `count` strongest singular vectors, or all if there are fewer."""
     count = min(count, len(rows))
     target = (rows.sum(axis=0) if towards is None else towards).astype(np.float32)
     if rows.shape[1] < len(rows):
         return _strongest_of_short_rows(rows, count, target)
     from scipy.linalg.lapack import ssyevd
 
+    gram = products(rows) if gram is None else gram
+    if not _SQUARES[0] < gram.diagonal().max() < _SQUARES[1] and (peak := np.abs(rows).max()) > 0:
+        # In another unit: a power of two changes no digit. The energies stay in it, as they are only compared.
+        exponent = np.frexp(peak)[1]
+        energies, strongest = _strongest(np.ldexp(rows, -exponent), count, np.ldexp(target, -exponent), None)
+        return energies, np.ldexp(strongest, exponent)
     # Divide and conquer: other drivers lose orthogonality, or vectors, if many eigenvalues are equal.
-    energies, vectors, failed = ssyevd(products(rows) if gram is None else gram, lower=1)
+    energies, vectors, failed = ssyevd(gram, lower=1)
     if failed:
         raise np.linalg.LinAlgError(f"the eigenvectors of the Gram matrix of {len(rows)} rows did not converge")
     # The rows of A are weighted by row i of `strongest`, and their sum is s_i v_i.
@@ -106,7 +112,7 @@ def _strongest(
     return energies[: -count - 1 : -1].clip(min=0), strongest @ rows
 
 
-def _strongest_of_short_rows(rows: Float32, count: int, target: Float32) -> tuple[Float32, Float32]:
+def _strongest_of_short_rows(rows: Float32, count: int, target: Float32) -> tuple[Float64, Float32]:
     """The same from A'A, d x d, in float64; zeros follow the d strongest."""
     from scipy.linalg.blas import dsyrk
     from scipy.linalg.lapack import dsyevd
@@ -119,4 +125,4 @@ def _strongest_of_short_rows(rows: Float32, count: int, target: Float32) -> tupl
     energies[: len(values)] = values[: -count - 1 : -1].clip(min=0)
     strongest[: len(values)] = vectors.T[: -count - 1 : -1]
     strongest[strongest @ target < 0] *= -1
-    return energies.astype(np.float32), (np.sqrt(energies)[:, None] * strongest).astype(np.float32)
+    return energies, (np.sqrt(energies)[:, None] * strongest).astype(np.float32)
