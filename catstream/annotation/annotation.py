@@ -7,14 +7,13 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple, Self, cast
 
 import numpy as np
 
-from catstream.annotation.decoded import DecodedFrames, decode
 from catstream.annotation.fusion import fuse
 from catstream.annotation.keyframes import HIDDEN, KeyframeBox, parse_box
 from catstream.annotation.passes import Pass, box_of, row_of, run_pass
@@ -28,8 +27,8 @@ from catstream.base.threads import cores
 from catstream.base.workers import Workers
 from catstream.errors import BoxError, ObjectError, VideoError
 from catstream.messages.kinds import Check, Track
-from catstream.video.frames import Source
-from catstream.video.source import ALL_FRAMES, open_source
+from catstream.video.source import ALL_FRAMES
+from catstream.video.video_frames import VideoFrames
 
 #: Called during the work with its name, the number of finished frames, and of all; None if that is unknown.
 Progress = Callable[[str, int, int | None], object]
@@ -79,11 +78,11 @@ class _Stretch(NamedTuple):
 class Annotation:
     """The keyframes of the objects of a video, and the tracks between them.
 
-    Call `track` after the constructor, which decodes nothing yet; `annotate` does both. Each stretch between two
+    Call `track` after the constructor, which only opens the video; `annotate` does both. Each stretch between two
     keyframes is tracked from both ends. If that does not check all of its frames, it is tracked from both ends again,
     with the merged model of all other boxes of the object. `add` tracks only beside its box; earlier passes are still
     used as far as they agree with the boxes. No pass begins or ends in a frame where the object is hidden. Close the
-    annotation, or use it in a `with`: until then, its processes run, and the decoded frames are in a temporary file.
+    annotation, or use it in a `with`: until then, its processes run. Frames are decoded from the video when needed.
 
     Parameters
     ----------
@@ -98,18 +97,18 @@ class Annotation:
 
     Attributes
     ----------
-    frames : DecodedFrames
+    frames : VideoFrames
     keyframes : dict of the boxes of each object, by name and frame
-    counters : dict of the counters of the video by name, see `catstream.video.frames.describe_counters`
+    counters : counters of the video by name, see `catstream.video.frames.describe_counters`
     progress : as of the parameters
     videos : paths of the videos if each frame is of another one, see `FirstFrames`
 
     Raises
     ------
     VideoError
-        If the video is live or cannot be read.
+        If the video is live or cannot be read; from `track` also if a frame cannot be decoded.
     BoxError
-        For a box outside its frame; from `decode` and `track` also for a frame beyond the end of the video.
+        For a box outside its frame; from `scan` and `track` also for a frame beyond the end of the video.
     ObjectError
         For a name that is not valid, an object without a box, or too many.
     """
@@ -131,14 +130,12 @@ class Annotation:
         if is_live(os.fspath(video)):
             redacted = without_password(os.fspath(video))
             raise VideoError(f"cannot annotate a live source ({redacted}): record it to a file first")
-        self.counters: dict[str, float] = {}
         self._passes: dict[Task, Pass | None] = {}  # None if it cannot start
         self._workers = Workers(self._jobs)
         self._folder = tempfile.TemporaryDirectory(prefix="catstream-annotate-", ignore_cleanup_errors=True)
         try:
-            self._video: Source | None
-            self.frames: DecodedFrames
-            self._video, self.frames = self._open(os.fspath(video), part)
+            self.frames = self._open(os.fspath(video), part)
+            self._is_scanned = False
             self.set_boxes(boxes)
         except BaseException:
             self._folder.cleanup()
@@ -155,10 +152,9 @@ class Annotation:
         return f"<catstream.Annotation of {self.frames.name}: {count} boxes, {self.share_checked:.0%} checked>"
 
     def close(self) -> None:
-        """End the processes and delete the decoded frames; `add` and `track` cannot be called any more."""
+        """End the processes and close the video; `add` and `track` cannot be called any more."""
         self._workers.kill()
-        if self._video is not None:
-            self._video.close()
+        self.frames.close()
         self._folder.cleanup()
 
     def add(self, frame: int, box: str | Iterable[float] | None, object: str = UNNAMED) -> None:
@@ -181,27 +177,39 @@ class Annotation:
             name: {frame: box for frame, box in boxes.items() if box != HIDDEN} for name, boxes in parsed.items()
         }
 
-    def decode(self) -> None:
-        """Decode the frames, if they are not yet. VideoError if one cannot be decoded: those before it are there."""
-        if self._video is not None:
-            try:
-                decode(self._video, self.frames, lambda *done: self.progress("decoding", *done))
-            finally:
-                self.counters, self._video = self._video.counters, None
+    @property
+    def counters(self) -> dict[str, float]:
+        return self.frames.counters
+
+    def scan(self, *, exact: bool = False) -> None:
+        """Number the frames, if they are not yet; `exact` as of `VideoFrames.scan`.
+
+        VideoError if a frame cannot be decoded: those before it are numbered, and `track` uses them.
+        """
+        if exact or not self._is_scanned:
+            self._is_scanned = True
+            self._passes.clear()
+            self.progress("reading", len(self.frames), None)
+            self.frames.scan(lambda *done: self.progress("reading", *done), exact=exact)
         self._check(self.keyframes)
 
     def track(self) -> None:
         """Run the passes that are missing. If it is interrupted, the finished passes remain."""
-        self.decode()
+        self.scan()
         while tasks := self.missing():
             total, finished = sum(task.frames for task in tasks), 0
-            work = [(task, self.frames, self.settings) for task in tasks]
+            work = [(task, self.frames, self.settings, Path(self._folder.name)) for task in tasks]
             results = self._workers.run(_work, work) if self._jobs > 1 else (_work(*task) for task in work)
-            with closing(results):
-                for task, one in results:
-                    self._passes[task] = one
-                    finished += task.frames
-                    self.progress("tracking again" if task.use_memory else "tracking", finished, total)
+            try:
+                with closing(results):
+                    for task, one in results:
+                        self._passes[task] = one
+                        finished += task.frames
+                        self.progress("tracking again" if task.use_memory else "tracking", finished, total)
+            except VideoError:
+                if self.frames.is_exact:
+                    raise
+                self.scan(exact=True)
 
     def missing(self) -> list[Task]:
         """The passes that are missing, longest first: of each stretch those without a memory, then those with one.
@@ -224,11 +232,14 @@ class Annotation:
         """
         file, count = tempfile.mkstemp(dir=self._folder.name)
         os.close(file)
-        frames = replace(self.frames, count=Path(count))
-        return self._workers.submit(_work, task, frames, self.settings), Path(count)
+        work = task, self.frames, self.settings, Path(self._folder.name), Path(count)
+        return self._workers.submit(_work, *work), Path(count)
 
     def store(self, future: Future[tuple[Task, Pass | None]]) -> None:
-        """Store a pass that was submitted; it is used as long as the boxes that it began with are there."""
+        """Store a pass that was submitted; it is used as long as the boxes that it began with are there.
+
+        VideoError if a frame could not be decoded.
+        """
         task, one = self._workers.result(future)
         self._passes[task] = one
 
@@ -280,17 +291,15 @@ class Annotation:
         unchecked = (stretch for stretch in self._stretches() if not self._is_checked(stretch))
         return sorted(map(self._next_in, unchecked), key=lambda frame: -frame.errors)
 
-    def _open(self, video: str, part: slice) -> tuple[Source | None, DecodedFrames]:
-        """Open the video; its frames, and where they come from if they are not decoded yet."""
-        opened = open_source(video, part=part, settings=self.settings.run)
-        return opened, DecodedFrames(Path(self._folder.name, "frames"), opened.size, [], opened.rate, opened.name)
+    def _open(self, video: str, part: slice) -> VideoFrames:
+        return VideoFrames(video, part, self.settings.run)
 
     def _check(self, keyframes: Mapping[str, Mapping[int, KeyframeBox]]) -> None:
-        """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as it is decoded."""
+        """Raise BoxError if a box is not in its frame, or a keyframe not in the video, as soon as that is known."""
         for name, drawn in keyframes.items():
             for frame, box in drawn.items():
                 with errors_about(name):
-                    if self._video is None and not 0 <= frame < len(self.frames):
+                    if self._is_scanned and not 0 <= frame < len(self.frames):
                         raise BoxError(
                             f"frame {frame} is outside the video: pass a frame from 0 to {len(self.frames) - 1}"
                         )
@@ -338,7 +347,7 @@ class Annotation:
             if frame in self.keyframes[name]:
                 check = "keyframe" if frame in drawn else HIDDEN
             yield Track(
-                *(frame, self.frames.times[frame], "absent" if box is None else "present", box, float(score)),
+                *(frame, float(self.frames.times[frame]), "absent" if box is None else "present", box, float(score)),
                 model_version=0,
                 object=name,
                 doubtful=doubtful,
@@ -407,9 +416,11 @@ def annotate(
     return annotation
 
 
-def _work(task: Task, frames: DecodedFrames, settings: Settings) -> tuple[Task, Pass | None]:
-    one = run_pass(frames, task.start, task.stop, dict(task.keyframes), settings, use_memory=task.use_memory)
-    return task, one
+def _work(
+    task: Task, frames: VideoFrames, settings: Settings, models: Path, count: Path | None = None
+) -> tuple[Task, Pass | None]:
+    way = task.start, task.stop, dict(task.keyframes)
+    return task, run_pass(frames, *way, settings, models, use_memory=task.use_memory, count=count)
 
 
 def _parsed(boxes: KeyframeBoxes) -> dict[str, dict[int, KeyframeBox]]:

@@ -3,29 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from catstream.annotation.annotation import Annotation, Progress, Task
-from catstream.annotation.decoded import DecodedFrames, decode
 from catstream.annotation.keyframes import Keyframe, by_object
 from catstream.base.arrays import UInt8
-from catstream.base.settings import Settings
+from catstream.base.settings import RunSettings, Settings
 from catstream.errors import VideoError
-from catstream.video.source import open_source
+from catstream.video.video_frames import VideoFrames
 
 
-@dataclass(frozen=True, slots=True)
-class _Frames(DecodedFrames):
-    """The first frame of each of `videos`."""
+class _Frames(VideoFrames):
+    """The first frame of each of some videos, which are opened again for each picture."""
 
-    videos: list[DecodedFrames] = field(default_factory=list)
+    def __init__(self, folder: Path, settings: RunSettings) -> None:
+        self.name, self.rate, self.size, self.times = "", 0.0, (0, 0), np.zeros(0)
+        self.counters, self.is_exact = {}, True
+        self._folder, self._settings = folder, settings
+        self._videos: list[tuple[str, tuple[int, int]]] = []
+
+    def append(self, file: str) -> None:
+        """Add a video; VideoError if it cannot be read."""
+        self._videos.append((file, self._opened(file).size))
+        self.times = np.zeros(len(self._videos))
 
     def __getitem__(self, number: int) -> UInt8:
-        return self.videos[number][0]
+        return self._opened(self._videos[number][0])[0]
 
     def size_of(self, number: int) -> tuple[int, int]:
-        return self.videos[number].size
+        return self._videos[number][1]
+
+    def scan(self, *_: object, **__: object) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def _opened(self, file: str) -> VideoFrames:
+        return VideoFrames(self._folder / file, slice(0, 1), self._settings)
 
 
 class FirstFrames(Annotation):
@@ -73,18 +90,14 @@ class FirstFrames(Annotation):
     def missing(self) -> list[Task]:
         return []
 
-    def _open(self, video: str, _: slice) -> tuple[None, DecodedFrames]:
-        frames = _Frames(Path(self._folder.name), (0, 0), [], 0.0, "")
+    def _open(self, video: str, _: slice) -> VideoFrames:
+        frames = _Frames(Path(video), self.settings.run)
         for number, file in enumerate(self._files):
             try:
-                source = open_source(Path(video) / file, part=slice(0, 1), settings=self.settings.run)
-                first = DecodedFrames(frames.path / str(number), source.size, [], source.rate, file)
-                decode(source, first, lambda *_: None)
+                frames.append(file)
             except VideoError as error:
                 self.errors.append(error)
             else:
                 self.videos.append(file)
-                frames.videos.append(first)
-                frames.times.extend(first.times)
             self.progress("opening", number + 1, len(self._files))
-        return None, frames
+        return frames

@@ -6,12 +6,13 @@ with a memory: the merged coreset trees of all other boxes of the object.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from catstream.annotation.decoded import DecodedFrames
 from catstream.base.arrays import Float64
 from catstream.base.box import Box
 from catstream.base.names import UNNAMED
@@ -25,6 +26,7 @@ from catstream.jobs.saved_model import SavedModel, merge
 from catstream.messages.kinds import Track
 from catstream.multi import MultiTracker
 from catstream.training.trainer import Trainer
+from catstream.video.video_frames import VideoFrames
 
 #: The boxes of an object at its keyframes, by number of the frame; None where it is absent.
 Keyframes = Mapping[int, Box | None]
@@ -97,26 +99,46 @@ def iou(one: Float64, other: Float64) -> Float64:
 
 @one_thread(opencv=True)
 def run_pass(
-    frames: DecodedFrames, start: int, stop: int, keyframes: Keyframes, settings: Settings, *, use_memory: bool
+    frames: VideoFrames,
+    start: int,
+    stop: int,
+    keyframes: Keyframes,
+    settings: Settings,
+    models: Path,
+    *,
+    use_memory: bool,
+    count: Path | None = None,
 ) -> Pass | None:
     """Track the object of some keyframes from the one at `start` to the frame `stop`.
 
     Without a memory of the other boxes, only that at `start` is used. With it, an object that is absent at `start` is
     searched for in the frames after it. Returns None if tracking cannot start: without a box, or with a box that looks
     like all around it.
+
+    models : folder for the models of the boxes
+    count : file to which a byte is appended for each frame; if it is deleted, the pass ends with an OSError
     """
     box, others = keyframes[start], {number: box for number, box in keyframes.items() if number != start}
-    learned = _memory(frames, others, settings) if use_memory else None
+    learned = _memory(frames, others, settings, models) if use_memory else None
     if box is None and learned is None:
         return None
     step = 1 if stop > start else -1
     route = range(start, stop + step, step)
     try:
-        tracks = [*_tracks((frames[number] for number in route), box, learned, settings)][1:]
+        tracks = [*_tracks(_images(frames, route, count), box, learned, settings)][1:]
     except BoxError:
         return None
     boxes = np.stack([row_of(track.box) for track in tracks])
     return Pass(start, stop, boxes, np.array([track.score for track in tracks], np.float64), use_memory)
+
+
+def _images(frames: VideoFrames, numbers: Iterable[int], count: Path | None) -> Iterator[np.ndarray]:
+    for number in numbers:
+        if count is not None:
+            file = os.open(count, os.O_WRONLY | os.O_APPEND)
+            os.write(file, b".")
+            os.close(file)
+        yield frames[number]
 
 
 def _tracks(
@@ -139,18 +161,18 @@ def _tracks(
         yield tracks.tracks[UNNAMED]
 
 
-def _memory(frames: DecodedFrames, keyframes: Keyframes, settings: Settings) -> SavedModel | None:
+def _memory(frames: VideoFrames, keyframes: Keyframes, settings: Settings, models: Path) -> SavedModel | None:
     """The merged model of the boxes of an object. The rows of each box fill a leaf, which is 16 tracked frames."""
-    models: dict[tuple[str, ...], SavedModel] = {}  # by their rows, which frames of a still video share
+    parts: dict[tuple[str, ...], SavedModel] = {}  # by their rows, which frames of a still video share
     for number, box in keyframes.items():
-        if box is not None and (model := _model(frames, number, box, settings)):
-            models[model.origins] = model
-    return merge(models.values(), force=True) if len(models) > 1 else next(iter(models.values()), None)
+        if box is not None and (model := _model(frames, number, box, settings, models)):
+            parts[model.origins] = model
+    return merge(parts.values(), force=True) if len(parts) > 1 else next(iter(parts.values()), None)
 
 
-def _model(frames: DecodedFrames, number: int, box: Box, settings: Settings) -> SavedModel | None:
-    """The model of one box, trained once: it is saved beside the frames. None if tracking cannot start at the box."""
-    file = frames.path.with_name(f"{number}={','.join(map(str, box))}.safetensors")
+def _model(frames: VideoFrames, number: int, box: Box, settings: Settings, models: Path) -> SavedModel | None:
+    """The model of one box, trained once: it is saved in a folder. None if tracking cannot start at the box."""
+    file = models / f"{number}={','.join(map(str, box))}.safetensors"
     if not file.exists():
         tracker = MultiTracker(settings)
         try:

@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from catstream.annotation.annotation import Annotation, NextFrame, Task
 from catstream.annotation.keyframes import KeyframeBox
+from catstream.base.arrays import UInt8
 from catstream.base.box import Box
 from catstream.errors import CatstreamError, CommandRejectedError, ObjectError, VideoError
 from catstream.messages.kinds import Track
@@ -26,14 +27,14 @@ class _StoppedError(Exception):
 
 
 class Session:
-    """Changes the boxes of an annotation, while a thread decodes the video and runs the missing passes.
+    """Changes the boxes of an annotation, while a thread reads the video and runs the missing passes.
 
     Objects take turns, beginning with the object of the newest box; the passes of the newest box of each run first. The
     methods may be called from any thread. Use it in a `with`; the owner of the annotation closes it afterwards.
 
     Parameters
     ----------
-    annotation : Annotation that is not decoded yet
+    annotation : Annotation whose frames are not numbered yet
     jobs : number of passes that run at a time, and as many long ones beside them
     save : function that is called after each change of the keyframes
     write : function that is called by `finish`, for the results
@@ -41,10 +42,10 @@ class Session:
     Attributes
     ----------
     revision : number of changes of the keyframes and of what follows
-    decoded : whether the frames of the video are decoded
+    decoded : whether the frames of the video are numbered
     tracks : the newest tracks of the objects, by name
     next_frames : frames to look at next, but those in stretches that are tracked at present
-    problem : error that ended decoding or tracking; None if there is none
+    problem : error that ended reading or tracking; None if there is none
     finished : event that `finish` sets
     lock : held while the annotation changes
     """
@@ -63,9 +64,9 @@ class Session:
         self._turns: dict[str, int] = {}  # number of the newest pass of each object, without one its turn is next
         self._missing: list[Task] = []
         self._running: dict[Future[Any], tuple[Task, Path]] = {}  # with the file that counts its frames
-        self._wakes, self._closed = True, False
+        self._wakes, self._closed, self._is_damaged = True, False, False
         self._thread = threading.Thread(target=self._run, name="session", daemon=True)
-        annotation.progress = self._decoded_one
+        annotation.progress = self._check_closed
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -121,11 +122,21 @@ class Session:
             self._replace(before)
             return object, frame
 
+    def image(self, number: int) -> UInt8:
+        """Return the image of a frame. VideoError if it cannot be decoded: the damage is then looked for."""
+        try:
+            return self.annotation.frames[number]
+        except VideoError:
+            with self.lock:
+                self._is_damaged = not self.annotation.frames.is_exact
+                self._wake()
+            raise
+
     def finish(self) -> None:
         """Write the results so far, and set `finished`. VideoError if they cannot be written."""
         with self.lock:
             if not self.decoded:
-                raise VideoError("the video is not decoded yet: wait, or press Ctrl-C where the command runs")
+                raise VideoError("the video is not read yet: wait, or press Ctrl-C where the command runs")
             self._write()
             self.finished.set()
 
@@ -153,40 +164,56 @@ class Session:
             self._wakes = True
             self.lock.notify()
 
-    def _decoded_one(self, *_: object) -> None:
+    def _check_closed(self, *_: object) -> None:
         if self._closed:
             raise _StoppedError
 
     def _run(self) -> None:
         try:
-            try:
-                self.annotation.decode()
-            except VideoError as error:  # the frames before it are annotated
-                self.problem = error
-            self.annotation.decode()
-            self.decoded = True
+            self._scan()
             while True:
                 with self.lock:
                     self.lock.wait_for(lambda: self._wakes or self._closed)
                     if self._closed:
                         return
                     self._wakes = False
-                    self._schedule()
+                    if not self._is_damaged:
+                        self._schedule()
+                if self._is_damaged:
+                    self._scan(exact=True)
         except CatstreamError as error:
             self.problem = error
-        except _StoppedError:  # while it decodes
+        except _StoppedError:  # while it reads
             pass
+
+    def _scan(self, *, exact: bool = False) -> None:
+        """Number the frames: before the first damaged one, they can be annotated."""
+        self.decoded = self._is_damaged = False
+        for running in [*self._running]:
+            self._stop(running)
+        try:
+            self.annotation.scan(exact=exact)
+        except VideoError as error:
+            self.problem = error
+        self.annotation.scan()
+        self.decoded = True
+        self._wake()
 
     def _schedule(self) -> None:
         """Store the passes that ended, stop those that are not missing any more, and start others."""
         for future in [future for future in self._running if future.done()]:
             del self._running[future]
-            self.annotation.store(future)
+            try:
+                self.annotation.store(future)
+            except VideoError:
+                if self.annotation.frames.is_exact:
+                    raise
+                self._is_damaged = True
+                return
         self._missing = self.annotation.missing()
-        for future, (task, count) in [*self._running.items()]:
+        for future, (task, _) in [*self._running.items()]:
             if task not in self._missing:
-                count.unlink()  # ends it
-                del self._running[future]
+                self._stop(future)
         while following := self._next_task():
             self._turns[following.object] = max(self._turns.values(), default=0) + 1
             future, count = self.annotation.submit(following)
@@ -197,6 +224,10 @@ class Session:
         frames = (frame for frame in self.annotation.next_frames() if frame.errors >= least)
         self.next_frames = [frame for frame in frames if not self._is_tracked(frame)]
         self.revision += 1
+
+    def _stop(self, future: Future[Any]) -> None:
+        _, count = self._running.pop(future)
+        count.unlink()  # ends it
 
     def _next_task(self) -> Task | None:
         """The missing pass that starts next: the shortest beside the newest box of the object whose turn it is."""

@@ -118,8 +118,8 @@ def _track(annotation: Annotation, results: _ResultFiles, bar: Progress) -> bool
     """Track between all boxes, and write the results; return whether it was interrupted."""
     interrupted = False
     with bar:
-        bar.add_task("decoding", total=None)
-        annotation.decode()
+        bar.add_task("reading", total=None)
+        annotation.scan()
         results.begin()
         try:
             annotation.track()

@@ -108,6 +108,18 @@ class ImageReader:
         return image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
 
 
+def of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: Path, number: int) -> np.ndarray:
+    """Return an image in the size of the first one. Raises VideoError if it has another size, unless `resize`."""
+    if image.shape == shape:
+        return image
+    if resize:
+        return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    raise VideoError(
+        f"all images of a source need one size: {str(path)!r} (frame {number}) is {image.shape[1]}x{image.shape[0]}, "
+        f"the first {shape[1]}x{shape[0]}: --set run.resize=true scales it to that"
+    )
+
+
 def _range(image: np.ndarray) -> tuple[float, float]:
     """The least and the largest finite value of an image."""
     finite = image[np.isfinite(image)]

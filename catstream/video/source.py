@@ -23,29 +23,33 @@ keyframe. The other sources are live: see `catstream.video.live`.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator
 from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
-import cv2
 import numpy as np
 
 from catstream.base.addresses import is_live, without_password
 from catstream.base.settings import RunSettings
 from catstream.errors import VideoError
-from catstream.video.frames import RATE, Frame, Source, UprightConverter, ffmpeg_reason, open_video, video_stream
-from catstream.video.images import EXPECTED, IMAGES, ImageReader, first_pages, image_files, pages_of, visible
-from catstream.video.times import FrameClock
-
-if TYPE_CHECKING:
-    from av import Packet, VideoFrame
+from catstream.video.frames import Frame, Source
+from catstream.video.images import (
+    EXPECTED,
+    IMAGES,
+    ImageReader,
+    first_pages,
+    image_files,
+    of_one_size,
+    pages_of,
+    visible,
+)
+from catstream.video.video_file import VideoFile
 
 #: All frames of a source.
 ALL_FRAMES = slice(None)
@@ -60,21 +64,12 @@ _VIDEOS = (
 VIDEOS = {f".{suffix}" for suffix in _VIDEOS.split()}
 _FOLDERS = ("img", "imgs", "color", "rgb")
 
-#: Number of errors of the container without a packet between them after which a file is treated as ended.
-_MAX_FAILURES = 3
 
-#: A Matroska file whose pictures end this much (in seconds) before the end that its header states may be truncated.
-_TRUNCATED_SECONDS = 1.0
-
-#: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
-_MAX_COUNTED_BYTES = 1 << 30
-
-
-class _FileSource(Source):
+class FileSource(Source):
     """The frames of a `part` of a file or of images, from number `start` on. The constructor decodes the first one."""
 
-    def __init__(self, name: str, reader: _Images | _Video, part: slice, start: int) -> None:
-        self._reader, self._part = reader, part
+    def __init__(self, name: str, reader: Images | VideoFile, part: slice, start: int) -> None:
+        self.reader, self._part = reader, part
         numbers = range(sys.maxsize)[part]
         self._frames = reader.frames(numbers, start)
         self._first: Frame | None = next(self._frames, None)
@@ -91,15 +86,12 @@ class _FileSource(Source):
 
     @cached_property
     def frames(self) -> int | None:
-        total = self._reader.count()
+        total = self.reader.count()
         return len(range(total)[self._part]) if total else None
 
     @property
     def counters(self) -> dict[str, float]:
-        """`damaged`: number of skipped packets, one for each frame; `scaled`: number of frames that were
-        scaled to the size of the first one; `truncated`: seconds at the end that are missing."""
-        names = ("damaged", "scaled", "truncated")
-        return {name: count for name in names if (count := getattr(self._reader, name))}
+        return counters_of(self.reader)
 
     def __next__(self) -> Frame:
         if self._first is not None:
@@ -110,6 +102,13 @@ class _FileSource(Source):
     def close(self) -> None:
         self._first = None
         self._frames.close()
+
+
+def counters_of(reader: Images | VideoFile) -> dict[str, float]:
+    """`damaged`: number of skipped packets, one for each frame; `scaled`: number of frames that were scaled to the size
+    of the first one; `truncated`: seconds at the end that are missing."""
+    names = ("damaged", "scaled", "truncated")
+    return {name: count for name in names if (count := getattr(reader, name))}
 
 
 def open_source(
@@ -166,26 +165,26 @@ def open_source(
         name, reader = _open_reader(Path(source_text(text)), settings)
     except OSError as error:
         raise VideoError(f"cannot open {redacted!r} ({error.strerror}): {EXPECTED}") from None
-    return _FileSource(name, reader, part, start)
+    return FileSource(name, reader, part, start)
 
 
-def _open_reader(path: Path, settings: RunSettings) -> tuple[str, _Images | _Video]:
+def _open_reader(path: Path, settings: RunSettings) -> tuple[str, Images | VideoFile]:
     """Open a file, a folder or a pattern; return its name for results, and its reader."""
     if path.is_dir():
         name = _folder_name(path)
         for folder in (*(path / inner for inner in _FOLDERS), path):
             if folder.is_dir() and visible(folder, IMAGES):
-                return name, _Images(first_pages(image_files(folder)), settings)
+                return name, Images(first_pages(image_files(folder)), settings)
         videos = visible(path, VIDEOS)
         if len(videos) == 1:
-            return videos[0].stem, _Video(videos[0], settings)
+            return videos[0].stem, VideoFile(videos[0], settings)
         content = f"{len(videos)} videos" if videos else "neither images nor a video"
         raise VideoError(f"the folder {str(path)!r} holds {content}: {EXPECTED}")
     if path.is_file():
         pages = pages_of(path)
-        return path.stem, _Images(pages, settings) if pages else _Video(path, settings)
+        return path.stem, Images(pages, settings) if pages else VideoFile(path, settings)
     if re.search(r"%0?\d*d|[*?\[]", path.name):
-        return _folder_name(path.parent), _Images(first_pages(image_files(path)), settings)
+        return _folder_name(path.parent), Images(first_pages(image_files(path)), settings)
     if path.exists():
         raise VideoError(
             f"{str(path)!r} is a pipe or a device, whose frames a restarted process cannot read again: "
@@ -220,7 +219,7 @@ def source_text(source: object) -> str:
     return unquote(address.path)
 
 
-class _Images:
+class Images:
     """Images that are read as frames. `scaled` is the number of images that had another size than the first one."""
 
     damaged, truncated, pixel_aspect = 0, 0, Fraction(1)
@@ -243,9 +242,16 @@ class _Images:
         for index, number in enumerate(numbers[start:], start):
             image = self._read(number)
             shape = shape or image.shape
-            scaled = _of_one_size(image, shape, resize, self._path(number), number)
-            self.scaled += scaled is not image
-            yield Frame(index, number / self.rate, scaled)
+            yield Frame(index, number / self.rate, self._in_shape(image, shape, number))
+
+    def image(self, number: int, shape: tuple[int, ...]) -> np.ndarray:
+        """Return an image by its number, scaled to the shape of the first one as `frames` does."""
+        return self._in_shape(self._read(number), shape, number)
+
+    def _in_shape(self, image: np.ndarray, shape: tuple[int, ...], number: int) -> np.ndarray:
+        scaled = of_one_size(image, shape, self.settings.resize, self._path(number), number)
+        self.scaled += scaled is not image
+        return scaled
 
     def _path(self, number: int) -> Path:
         return self._read_image.pages[number][0]
@@ -258,156 +264,6 @@ class _Images:
         return image
 
 
-def _of_one_size(image: np.ndarray, shape: tuple[int, ...], resize: bool, path: Path, number: int) -> np.ndarray:
-    """Return an image in the size of the first one. Raises VideoError if it has another size, unless `resize`."""
-    if image.shape == shape:
-        return image
-    if resize:
-        return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
-    raise VideoError(
-        f"all images of a source need one size: {str(path)!r} (frame {number}) is {image.shape[1]}x{image.shape[0]}, "
-        f"the first {shape[1]}x{shape[0]}: --set run.resize=true scales it to that"
-    )
-
-
 def prepare() -> None:
     """Import the modules that read a video."""
     import av.video.reformatter  # noqa: F401
-
-
-class _Video:
-    """A video file that is read once. `damaged` is the number of skipped packets, `scaled` the number of frames that
-    had another size than the first one, `truncated` the seconds that its header states after the last frame."""
-
-    images: Sequence[Path] = ()
-
-    def __init__(self, path: Path, settings: RunSettings) -> None:
-        import av  # imported here because it takes 0.1 s and folders do not need it
-
-        self.path, self.settings, self.damaged, self.scaled, self.truncated = path, settings, 0, 0, 0
-        try:
-            self.container = open_video(str(path.absolute()), settings.hwaccel)
-        except (av.FFmpegError, OSError) as error:
-            raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {EXPECTED}") from None
-        self.stream = video_stream(self.container)
-        # FFmpeg opens any text file as a video of its text (format "tty").
-        if self.stream is None or self.container.format.name == "tty":
-            self.container.close()
-            raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
-        self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
-        # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
-        # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
-        self._is_avi = self.container.format.name == "avi"
-        self._has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
-        self.pixel_aspect = self.stream.sample_aspect_ratio or Fraction(1)
-        self.rate = float((self._has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
-
-    def count(self) -> int | None:
-        """Return the number of frames: index entries that hold pictures, or else packets."""
-        video = _Video(self.path, self.settings)
-        with video.container:
-            index, stated = video.stream.index_entries, video.stream.frames
-            if 0 < stated <= len(index):
-                # Entries without data repeat the frame before; those that are discarded are before a cut.
-                return sum(entry.size > 0 and not entry.is_discard for entry in index) or None
-            if self.path.stat().st_size > _MAX_COUNTED_BYTES:
-                return stated or round((video.container.duration or 0) / 1e6 * self.rate) or None
-            return sum(not isinstance(packet, str) for packet in video._packets()) - 1 or None
-
-    def frames(self, wanted: range, start: int) -> Generator[Frame]:
-        """Yield the frames with these numbers, from the one at index `start` on."""
-        shape, upright, rest = None, UprightConverter(), wanted[start:]
-        clock = FrameClock(self.rate, self.stream.time_base if self._has_times else None)
-        end = 0.0
-        with self.container:
-            for number, frame in enumerate(self._decoded()):
-                end = max(end, frame.time or 0.0)
-                time = clock.time(number, None if self._is_avi else frame.pts, frame.dts)
-                if number in rest or (number in wanted and shape is None):
-                    image = upright(frame)
-                    if shape is None:
-                        shape = image.shape
-                        if shape[0] != frame.height:  # it was turned
-                            self.pixel_aspect = 1 / self.pixel_aspect
-                    scaled = _of_one_size(image, shape, self.settings.resize, self.path, number)
-                    self.scaled += scaled is not image
-                    if number in rest:
-                        yield Frame(wanted.index(number), time, scaled)
-                if number + 1 >= wanted.stop:  # damage after the part must not be an error
-                    return
-            if (missing := self._stated_end() - end) > _TRUNCATED_SECONDS:
-                self.truncated = round(missing)
-
-    def _stated_end(self) -> float:
-        """The time of the end that the header of a Matroska file states in seconds, else 0.
-
-        FFmpeg ends without an error where such a file is truncated. It does not for others, or estimates their
-        durations from the available data.
-        """
-        if "matroska" not in self.container.format.name:
-            return 0.0
-        if tag := re.fullmatch(r"(\d+):(\d+):([\d.]+)", self.stream.metadata.get("DURATION", "")):  # without the sound
-            hours, minutes, seconds = map(float, tag.groups())
-            return 3600 * hours + 60 * minutes + seconds
-        return (self.container.duration or 0) / 1e6
-
-    def _decoded(self) -> Iterator[VideoFrame]:
-        """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next keyframe."""
-        import av
-
-        decoder, skip, good = self.stream.codec_context, self.settings.skip_damaged, 0
-        waits_for_key = is_spoilt = False  # of the packets after an error, and of the frames after a damaged one
-        for packet in self._packets():
-            if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
-                self.damaged += 1
-                continue
-            frames: list[VideoFrame] = []
-            problem = packet if isinstance(packet, str) else ""
-            try:
-                frames = [] if problem else decoder.decode(packet)
-            except av.FFmpegError as error:
-                problem = ffmpeg_reason(error)
-            waits_for_key = bool(problem)
-            if problem and skip:
-                self.damaged += 1
-                with contextlib.suppress(av.FFmpegError):  # the decoder still holds frames before it
-                    frames = decoder.decode(None)
-                decoder.flush_buffers()
-            for frame in frames:
-                is_spoilt = frame.is_corrupt or (is_spoilt and not frame.key_frame)
-                if is_spoilt and not skip:
-                    problem = "the picture cannot be decoded"
-                    break
-                if is_spoilt:
-                    self.damaged += 1
-                else:
-                    yield frame
-                    good += 1
-            if problem and not skip:
-                raise VideoError(
-                    f"{str(self.path)!r} is damaged at frame {good} ({problem}): "
-                    "--skip-damaged (run.skip_damaged=true) continues at the next keyframe"
-                )
-
-    def _packets(self) -> Iterator[Packet[Any] | str | None]:
-        """Yield the packets that hold data, the reason of each error of the container, and None at the end."""
-        import av
-
-        packets, failures = self.container.demux(self.stream), 0
-        while failures < _MAX_FAILURES:
-            try:
-                packet = next(packets, None)
-            except av.FFmpegError as error:
-                packets = self.container.demux(self.stream)  # continues at the current position
-                if not isinstance(error, av.BlockingIOError):  # that asks to try again
-                    failures += 1
-                    yield ffmpeg_reason(error)
-                continue
-            if packet is None:
-                break
-            if packet.size:
-                failures = 0
-                # MPEG-TS counts again from 0 where files were joined. This is no damage; what the decoder lacks is.
-                packet.is_corrupt = False
-                yield packet
-        yield None

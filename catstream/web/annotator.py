@@ -58,9 +58,7 @@ class AnnotationSite:
         self._closed = True
 
     def _picture(self, request: Request) -> Response:
-        return Response(
-            jpeg(self._session.annotation.frames[self._number(request)], _SIDE, 90), media_type="image/jpeg"
-        )
+        return Response(jpeg(self._session.image(self._number(request)), _SIDE, 90), media_type="image/jpeg")
 
     def _frame(self, request: Request) -> Response:
         """The size of a frame, the box of each object in it, and the proposals if it is unchecked."""
@@ -83,7 +81,7 @@ class AnnotationSite:
     def _number(self, request: Request) -> int:
         number: int = request.path_params["number"]
         if number >= len(self._session.annotation.frames):
-            raise HTTPException(404, f"frame {number} is not in the video, or not decoded yet\n")
+            raise HTTPException(404, f"frame {number} is not in the video, or not read yet\n")
         return number
 
     async def _edit(self, request: Request) -> Response:

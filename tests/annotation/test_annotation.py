@@ -1,13 +1,14 @@
 """Annotation of a rendered video: what is tracked, what is checked, and which frame is asked for."""
 
 import multiprocessing
+import shutil
 
 import pytest
 
 from catstream.annotation import annotation as module
 from catstream.annotation.annotation import Annotation, annotate
 from catstream.base.box import Box
-from catstream.errors import BoxError, CatstreamError, ObjectError, VideoError
+from catstream.errors import BoxError, ObjectError, VideoError
 
 FRAMES = 24
 
@@ -118,17 +119,24 @@ def test_finished_passes_remain_after_ctrl_c(demo, monkeypatch):
         assert len(annotation.passes()) == 2
 
 
-def test_the_decoded_frames_are_deleted_with_the_annotation_and_after_an_error(demo):
-    video, truth = demo
-    annotation = annotate(video, {0: truth[0]}, part=slice(0, 3), jobs=1)
-    path = annotation.frames.path
-    assert path.stat().st_size == sum(annotation.frames[number].size for number in range(3))
-    annotation.close()
-    assert not path.parent.exists()
-    before = {*path.parent.parent.iterdir()}
+def test_no_file_remains_and_none_holds_the_frames(demo, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with annotate(demo[0], {0: demo[1][0], FRAMES - 1: demo[1][-1]}, jobs=1) as annotation:
+        sizes = [file.stat().st_size for file in tmp_path.rglob("*") if file.is_file()]
+        assert sum(sizes) < annotation.frames[0].nbytes
     with pytest.raises(BoxError):
-        annotate(video, {99: truth[0]})
-    assert {*path.parent.parent.iterdir()} == before
+        annotate(demo[0], {99: demo[1][0]})
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_frames_before_damage_that_a_pass_meets_are_tracked(walk, tmp_path):
+    images = shutil.copytree(walk / "img", tmp_path / "img")
+    (images / "0006.png").write_bytes(b"no image")
+    with Annotation(images, {0: (20, 20, 30, 30)}, jobs=1) as annotation:
+        with pytest.raises(VideoError, match=r"^5 frames could be read: .*0006\.png"):
+            annotation.track()
+        annotation.track()
+        assert len(annotation.tracks[""]) == 5
 
 
 @pytest.mark.parametrize(
@@ -149,9 +157,3 @@ def test_boxes_that_cannot_be_tracked_are_an_error(demo, boxes, error, message):
 def test_a_live_source_is_an_error():
     with pytest.raises(VideoError, match="a live source"):
         annotate("rtsp://10.0.0.7/stream", {0: Box(1, 2, 30, 40)})
-
-
-def test_frames_that_do_not_fit_on_the_disk_are_an_error(demo, monkeypatch):
-    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1000}))
-    with pytest.raises(CatstreamError, match="TMPDIR"):
-        annotate(demo[0], {0: demo[1][0]})

@@ -156,19 +156,20 @@ def test_the_frames_before_one_that_cannot_be_decoded_are_annotated(walk, until,
     (images / "0006.png").write_bytes(b"no image")
     with Annotation(images, {}) as annotation, Session(annotation, 1, lambda: None, lambda: None) as session:
         until(lambda: session.decoded)
+        session.draw("anna", 4, Box(20, 20, 30, 30))
+        until(lambda: session.problem and session.decoded)
         assert len(annotation.frames) == 5
         assert str(session.problem).startswith("5 frames could be read: ")
         assert "0006.png" in str(session.problem)
-        session.draw("anna", 4, Box(20, 20, 30, 30))
         until(lambda: len(session.tracks.get("anna", [])) == 5)
 
 
-def test_a_session_that_ends_while_it_decodes_is_not_decoded(demo):
+def test_a_session_that_ends_while_it_reads_is_not_decoded(demo):
     with Annotation(demo[0], {}) as annotation:
         session = Session(annotation, 1, lambda: None, lambda: None)
         session._closed = True
         with session:
             pass
         assert (session.decoded, session.problem) == (False, None)
-        with pytest.raises(VideoError, match="not decoded yet"):
+        with pytest.raises(VideoError, match="not read yet"):
             session.finish()

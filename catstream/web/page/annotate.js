@@ -397,7 +397,7 @@ class AnnotatePage {
     const { state, ended, silent } = this;
     if (ended) return ["ended", "page ended"];
     if (silent || !state) return ["silent", silent ? "page stopped" : "connecting"];
-    if (!state.decoded) return ["bootstrapping", `decoding: ${many(state.frames, "frame")}`];
+    if (!state.decoded) return ["bootstrapping", `reading the video: ${many(state.frames, "frame")}`];
     if (!state.remaining) return ["present", "all boxes saved"];
     return ["bootstrapping", `tracking: ${many(state.remaining, "frame")} left`];
   }

@@ -1,0 +1,181 @@
+"""A video file as packets and as decoded frames, in the order of the file."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from catstream.base.settings import RunSettings
+from catstream.errors import VideoError
+from catstream.video.frames import RATE, Frame, UprightConverter, ffmpeg_reason, open_video, video_stream
+from catstream.video.images import EXPECTED, of_one_size
+from catstream.video.times import FrameClock
+
+if TYPE_CHECKING:
+    from av import Packet, VideoFrame
+
+#: Number of errors of the container without a packet between them after which a file is treated as ended.
+_MAX_FAILURES = 3
+
+#: A Matroska file whose pictures end this much (in seconds) before the end that its header states may be truncated.
+_TRUNCATED_SECONDS = 1.0
+
+#: The frames of a larger file (in bytes) are estimated from its duration instead of being counted.
+_MAX_COUNTED_BYTES = 1 << 30
+
+
+class VideoFile:
+    """A video file that is read once. `damaged` is the number of skipped packets, `scaled` the number of frames that
+    had another size than the first one, `truncated` the seconds that its header states after the last frame."""
+
+    images: Sequence[Path] = ()
+
+    def __init__(self, path: Path, settings: RunSettings) -> None:
+        import av  # imported here because it takes 0.1 s and folders do not need it
+
+        self.path, self.settings, self.damaged, self.scaled, self.truncated = path, settings, 0, 0, 0
+        try:
+            self.container = open_video(str(path.absolute()), settings.hwaccel)
+        except (av.FFmpegError, OSError) as error:
+            raise VideoError(f"{str(path)!r} is not a video that can be read ({error.strerror}): {EXPECTED}") from None
+        self.stream = video_stream(self.container)
+        # FFmpeg opens any text file as a video of its text (format "tty").
+        if self.stream is None or self.container.format.name == "tty":
+            self.container.close()
+            raise VideoError(f"there is no video in {str(path)!r}: {EXPECTED}")
+        self.stream.thread_type = "NONE"  # the processes of the pipeline already use the cores
+        # A stream without a container, as raw H.264, has no time stamps, but may state its rate.
+        # An AVI has the times of decoding only, which the demuxer gives to pictures that are in another order.
+        self.is_avi = self.container.format.name == "avi"
+        self.has_times = not av.format.Flags(self.container.format.flags) & av.format.Flags.no_timestamps
+        self.pixel_aspect = self.stream.sample_aspect_ratio or Fraction(1)
+        self.rate = float((self.has_times and self.stream.average_rate) or self.stream.guessed_rate or RATE)
+
+    def count(self) -> int | None:
+        """Return the number of frames: index entries that hold pictures, or else packets."""
+        video = VideoFile(self.path, self.settings)
+        with video.container:
+            index, stated = video.stream.index_entries, video.stream.frames
+            if 0 < stated <= len(index):
+                # Entries without data repeat the frame before; those that are discarded are before a cut.
+                return sum(entry.size > 0 and not entry.is_discard for entry in index) or None
+            if self.path.stat().st_size > _MAX_COUNTED_BYTES:
+                return stated or round((video.container.duration or 0) / 1e6 * self.rate) or None
+            return sum(not isinstance(packet, str) for packet in video.packets()) - 1 or None
+
+    def frames(self, wanted: range, start: int) -> Generator[Frame]:
+        """Yield the frames with these numbers, from the one at index `start` on."""
+        shape, upright, rest = None, UprightConverter(), wanted[start:]
+        with self.container:
+            for number, (time, frame) in enumerate(self.timed(self.decoded(self.packets()), wanted.stop)):
+                if number in rest or (number in wanted and shape is None):
+                    image = upright(frame)
+                    if shape is None:
+                        shape = image.shape
+                        if shape[0] != frame.height:  # it was turned
+                            self.pixel_aspect = 1 / self.pixel_aspect
+                    scaled = of_one_size(image, shape, self.settings.resize, self.path, number)
+                    self.scaled += scaled is not image
+                    if number in rest:
+                        yield Frame(wanted.index(number), time, scaled)
+
+    def timed(self, frames: Iterable[VideoFrame], stop: int) -> Iterator[tuple[float, VideoFrame]]:
+        """Yield the decoded frames before number `stop`, each with its time in seconds."""
+        clock = FrameClock(self.rate, self.stream.time_base if self.has_times else None)
+        end = 0.0
+        for number, frame in enumerate(frames):
+            end = max(end, frame.time or 0.0)
+            yield clock.time(number, None if self.is_avi else frame.pts, frame.dts), frame
+            if number + 1 >= stop:  # damage after the part must not be an error
+                return
+        self.set_end(end)
+
+    def set_end(self, seconds: float) -> None:
+        """Compare the time of the last frame with the end that the header states."""
+        if (missing := self._stated_end() - seconds) > _TRUNCATED_SECONDS:
+            self.truncated = round(missing)
+
+    def _stated_end(self) -> float:
+        """The time of the end that the header of a Matroska file states in seconds, else 0.
+
+        FFmpeg ends without an error where such a file is truncated. It does not for others, or estimates their
+        durations from the available data.
+        """
+        if "matroska" not in self.container.format.name:
+            return 0.0
+        if tag := re.fullmatch(r"(\d+):(\d+):([\d.]+)", self.stream.metadata.get("DURATION", "")):  # without the sound
+            hours, minutes, seconds = map(float, tag.groups())
+            return 3600 * hours + 60 * minutes + seconds
+        return (self.container.duration or 0) / 1e6
+
+    def decoded(
+        self, packets: Iterable[Packet[Any] | str | None], is_before: Callable[[VideoFrame], bool] = lambda _: False
+    ) -> Iterator[VideoFrame]:
+        """Yield what FFmpeg decodes. At an error, raise VideoError, or continue at the next keyframe.
+
+        is_before : whether to drop a frame, damaged or not
+        """
+        import av
+
+        decoder, skip, good = self.stream.codec_context, self.settings.skip_damaged, 0
+        waits_for_key = is_spoilt = False  # of the packets after an error, and of the frames after a damaged one
+        for packet in packets:
+            if waits_for_key and isinstance(packet, av.Packet) and not packet.is_keyframe:
+                self.damaged += 1
+                continue
+            frames: list[VideoFrame] = []
+            problem = packet if isinstance(packet, str) else ""
+            try:
+                frames = [] if problem else decoder.decode(packet)
+            except av.FFmpegError as error:
+                problem = ffmpeg_reason(error)
+            waits_for_key = bool(problem)
+            if problem and skip:
+                self.damaged += 1
+                with contextlib.suppress(av.FFmpegError):  # the decoder still holds frames before it
+                    frames = decoder.decode(None)
+                decoder.flush_buffers()
+            for frame in frames:
+                if is_before(frame):
+                    continue
+                is_spoilt = frame.is_corrupt or (is_spoilt and not frame.key_frame)
+                if is_spoilt and not skip:
+                    problem = "the picture cannot be decoded"
+                    break
+                if is_spoilt:
+                    self.damaged += 1
+                else:
+                    yield frame
+                    good += 1
+            if problem and not skip:
+                raise VideoError(
+                    f"{str(self.path)!r} is damaged at frame {good} ({problem}): "
+                    "--skip-damaged (run.skip_damaged=true) continues at the next keyframe"
+                )
+
+    def packets(self) -> Iterator[Packet[Any] | str | None]:
+        """Yield the packets that hold data, the reason of each error of the container, and None at the end."""
+        import av
+
+        packets, failures = self.container.demux(self.stream), 0
+        while failures < _MAX_FAILURES:
+            try:
+                packet = next(packets, None)
+            except av.FFmpegError as error:
+                packets = self.container.demux(self.stream)  # continues at the current position
+                if not isinstance(error, av.BlockingIOError):  # that asks to try again
+                    failures += 1
+                    yield ffmpeg_reason(error)
+                continue
+            if packet is None:
+                break
+            if packet.size:
+                failures = 0
+                # MPEG-TS counts again from 0 where files were joined. This is no damage; what the decoder lacks is.
+                packet.is_corrupt = False
+                yield packet
+        yield None

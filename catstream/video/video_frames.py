@@ -1,0 +1,403 @@
+"""The images of a video by number: those that `open_source` returns in order.
+
+A frame is decoded from the last keyframe before it, so that neither the memory nor the disk holds the whole video. The
+order of the frames follows from the packets alone in the containers and codecs of which that is certain; other files
+are decoded once, without keeping the images.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from array import array
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain, islice
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from catstream.base.arrays import Float64, UInt8
+from catstream.base.settings import RunSettings
+from catstream.base.text import counted
+from catstream.errors import VideoError
+from catstream.video.frames import UprightConverter
+from catstream.video.images import of_one_size
+from catstream.video.source import ALL_FRAMES, FileSource, Images, counters_of, open_source
+from catstream.video.times import FrameClock
+from catstream.video.video_file import VideoFile
+
+if TYPE_CHECKING:
+    from av import Packet, VideoFrame
+
+#: Called with the number of frames that are numbered, and of all; None if that is unknown.
+Progress = Callable[[int, int | None], object]
+
+#: Containers and codecs in which each packet holds one frame, and frames are in the order of their time stamps.
+_CONTAINERS = ("mov", "matroska")
+_CODECS = ("h264", "hevc", "av1", "vp9", "mjpeg", "prores", "dnxhd", "ffv1")
+_VERIFIED = 8  #: frames that are decoded to verify this
+
+#: Decoders that can skip each frame to which no other one refers.
+_SKIPPABLE = ("h264", "mpeg2video", "mpeg4")
+
+_CACHE_BYTES = 64 << 20  #: of decoded frames, in the pixel format of the video
+_NO_STAMP = -(1 << 63)
+_ATTEMPTS = 5  #: seeks to earlier and earlier keyframes, and packets after each, until one is known
+_INTERVAL = 256  #: packets between two calls of a `Progress`
+
+
+@dataclass(frozen=True)
+class _Index:
+    """The frames of a video file in order, and its packets in theirs.
+
+    times      float64 (frames,), seconds
+    packets    int (frames,), number of the packet of each frame; -1 if the decoder does not state it
+    positions  int (packets,), place in the file in bytes
+    stamps     int (packets,), time stamps of presentation in ticks
+    sizes      int (packets,), bytes
+    keys       int, numbers of the packets that are keyframes
+    """
+
+    times: Float64
+    packets: np.ndarray
+    positions: np.ndarray
+    stamps: np.ndarray
+    sizes: np.ndarray
+    keys: np.ndarray
+
+    @cached_property
+    def is_unique(self) -> bool:
+        """Whether the number of its packet tells each frame."""
+        return bool((self.packets >= 0).all()) and len(np.unique(self.packets)) == len(self.packets)
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """The number of the frame of each packet, -1 without one."""
+        numbers = np.full(len(self.sizes), -1)
+        numbers[self.packets] = np.arange(len(self.packets))
+        return numbers
+
+    @cached_property
+    def starts(self) -> list[tuple[int, int]]:
+        """First frame and packet of each part that can be decoded alone: keyframes which follow all frames before."""
+        starts = [(0, 0)]
+        for key in self.keys if self.is_unique else ():
+            if (number := self.numbers[key]) > starts[-1][0]:
+                starts.append((int(number), int(key)))
+        return starts
+
+    def find(self, packet: Packet[Any]) -> int | None:
+        """The number of a packet that is read after a seek; None if it is not certain."""
+        position, stamp, size = _identity(packet)
+        found = np.flatnonzero((self.positions == position) & (self.stamps == stamp) & (self.sizes == size))
+        return int(found[0]) if len(found) == 1 else None
+
+
+def _identity(packet: Packet[Any]) -> tuple[int, int, int]:
+    position, stamp = (_NO_STAMP if value is None else value for value in (packet.pos, packet.pts))
+    return position, stamp, packet.size
+
+
+class _Packets:
+    """Collects the columns of an index while the packets of a file are read."""
+
+    def __init__(self) -> None:
+        self.identities = array("q"), array("q"), array("q")
+        self.keys, self.discarded = array("b"), array("b")
+        self.damages = array("q")  # numbers of the packets at which damage was noticed, once for each lost frame
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def append(self, packet: Packet[Any]) -> None:
+        for column, value in zip(self.identities, _identity(packet), strict=True):
+            column.append(value)
+        self.keys.append(packet.is_keyframe)
+        self.discarded.append(packet.is_discard)
+
+    def index(self, times: array[float], packets: np.ndarray | array[int]) -> _Index:
+        positions, stamps, sizes = map(np.array, self.identities)
+        keys = np.flatnonzero(np.array(self.keys))
+        # Around damage, which is noticed late, the picture of a keyframe may depend on earlier ones.
+        noticed = np.searchsorted(np.array(self.damages), [0, *keys, len(self), len(self)])
+        keys = keys[noticed[:-3] == noticed[3:]]
+        return _Index(np.array(times), np.array(packets), positions, stamps, sizes, keys)
+
+
+class VideoFrames:
+    """The images of a video by number, uint8 (h, w, 3) in BGR: those of `open_source`, in any order.
+
+    Reading forwards decodes each frame once. Reading backwards decodes a group of pictures once if it fits into the
+    cache, otherwise once for each part that does. Several threads may read. A pickled copy opens the file anew.
+
+    Parameters
+    ----------
+    text, part, settings : as of `open_source`, but not a live source
+
+    Attributes
+    ----------
+    name, rate, size, counters : as of a `Source`
+    times : float64, seconds of the frames that are numbered so far; before `scan`, of the first one
+    is_exact : whether all frames were decoded; if not, an image may raise VideoError, because its file is damaged
+    """
+
+    def __init__(self, text: str | Path, part: slice = ALL_FRAMES, settings: RunSettings | None = None) -> None:
+        self._settings, self._part = settings or RunSettings(), part
+        with open_source(text, part=part, settings=self._settings) as source:
+            assert isinstance(source, FileSource)
+            first = next(source)
+            self._source = source.reader if isinstance(source.reader, Images) else source.reader.path
+        self.name, self.rate, self.size, self.counters = source.name, source.rate, source.size, source.counters
+        self.times, self.is_exact = np.array([first.time]), False
+        self._first: UInt8 | None = first.image
+        self._index: _Index | None = None
+        self._lock = threading.Lock()
+        self._reader: _Reader | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_lock": None, "_reader": None, "_first": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _lock=threading.Lock())
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __getitem__(self, number: int) -> UInt8:
+        """Return an image; VideoError if it cannot be decoded, and is not `is_exact`."""
+        width, height = self.size
+        with self._lock:
+            if isinstance(self._source, Images):
+                return self._source.image(range(self._source.count())[self._part][number], (height, width, 3))
+            if self._index is None:
+                assert self._first is not None
+                return self._first
+            if self._reader is None:
+                self._reader = _Reader(self._source, self._settings, self._index, (height, width, 3), self.is_exact)
+            return self._reader.image(range(len(self._index.packets))[self._part][number])
+
+    def size_of(self, number: int) -> tuple[int, int]:  # noqa: ARG002  # of first frames, each has its own
+        """Width and height of a frame in pixels."""
+        return self.size
+
+    def close(self) -> None:
+        with self._lock:
+            self._reader = None
+
+    def scan(self, progress: Progress = lambda *_: None, *, exact: bool = False) -> None:
+        """Number the frames: from the packets if that is certain, else, or if `exact`, by decoding all.
+
+        VideoError if a frame cannot be decoded; those before it are numbered.
+        """
+        try:
+            if isinstance(self._source, Images):
+                self._scan_images(self._source, progress, exact=exact)
+            elif exact or self._settings.skip_damaged or not self._scan_packets(self._source, progress):
+                self._decode_all(self._source, progress)
+        except VideoError as error:
+            raise VideoError(f"{counted(len(self), 'frame')} could be read: {error}") from None
+
+    def _scan_images(self, images: Images, progress: Progress, *, exact: bool) -> None:
+        numbers = range(images.count())[self._part]
+        times = array("d") if exact else [number / images.rate for number in numbers]
+        try:
+            for frame in images.frames(range(sys.maxsize)[self._part], 0) if exact else ():
+                times.append(frame.time)
+                progress(len(times), len(numbers))
+        finally:
+            self.times, self.is_exact, self.counters = np.array(times), exact, counters_of(images)
+
+    def _scan_packets(self, path: Path, progress: Progress) -> bool:
+        """Number the frames by the time stamps of the packets; return False if that is not certain."""
+        video, packets = VideoFile(path, self._settings), _Packets()
+        containers, codec = video.container.format.name.split(","), video.stream.codec_context.codec.canonical_name
+        with video.container:
+            if codec not in _CODECS or not set(containers) & set(_CONTAINERS):
+                return False
+            for packet in video.packets():
+                if isinstance(packet, str):
+                    return False
+                if packet is not None:
+                    packets.append(packet)
+                    if len(packets) % _INTERVAL == 0:
+                        progress(len(packets), None)
+            time_base = video.stream.time_base
+            video.set_end(float(max(packets.identities[1]) * time_base))
+        _, stamps, _ = map(np.array, packets.identities)
+        shown, keys = np.array(packets.discarded) == 0, np.array(packets.keys) == 1
+        ordered = np.flatnonzero(shown)[stamps[shown].argsort(kind="stable")]
+        # A frame is between the keyframes around its own: time stamps do not begin again, and none leads the first one.
+        limits, group = stamps[keys], keys.cumsum() - 1
+        low, high = np.r_[limits[:1], limits[:-1]], np.r_[limits[1:], sys.maxsize]
+        if not (keys[:1].all() and (np.diff(stamps[ordered]) > 0).all() and stamps.min() != _NO_STAMP):
+            return False
+        if not ((low[group] <= stamps) & (stamps < high[group]))[shown].all():
+            return False
+        clock = FrameClock(video.rate, time_base)
+        times = array("d", [clock.time(number, stamp, None) for number, stamp in enumerate(stamps[ordered].tolist())])
+        self._publish(packets.index(times, ordered), counters_of(video))
+        with suppress(VideoError):
+            self[min(_VERIFIED, len(self) - 1)]
+            return True
+        return False
+
+    def _decode_all(self, path: Path, progress: Progress) -> None:
+        """Number the frames that FFmpeg decodes: a frame has the time stamp of its packet, which is its number here."""
+        video, packets, stop = VideoFile(path, self._settings), _Packets(), range(sys.maxsize)[self._part].stop
+        times, packet_numbers, upright = array("d"), array("q"), UprightConverter()
+        total = video.count()
+        total = total and len(range(total)[self._part])
+
+        def numbered() -> Iterator[Packet[Any] | str | None]:
+            for packet in video.packets():
+                if packet is not None and not isinstance(packet, str):
+                    packets.append(packet)
+                    packet.pts = len(packets) - 1
+                yield packet
+                packets.damages.extend([len(packets)] * (video.damaged - len(packets.damages)))
+
+        def decoded() -> Iterator[VideoFrame]:
+            for frame in video.decoded(numbered()):
+                number = -1 if frame.pts is None else frame.pts
+                packet_numbers.append(number)
+                stamp = packets.identities[1][number]
+                frame.pts = None if number < 0 or stamp == _NO_STAMP else stamp
+                yield frame
+
+        def publish(*, exact: bool = False) -> None:
+            self._publish(packets.index(times, packet_numbers[: len(times)]), counters_of(video), exact=exact)
+
+        first: tuple[int, int] | None = None
+        with video.container:
+            try:
+                for time, frame in video.timed(decoded(), stop):
+                    first = first or (frame.width, frame.height)
+                    if (frame.width, frame.height) != first:
+                        width, height = self.size
+                        of_one_size(upright(frame), (height, width, 3), self._settings.resize, path, len(times))
+                        video.scaled += 1
+                    times.append(time)
+                    if len(times) % _INTERVAL == 0 and len(times) > 1.5 * len(self):
+                        publish()
+                    progress(len(times), total)
+            finally:
+                publish(exact=True)
+
+    def _publish(self, index: _Index, counters: dict[str, float], *, exact: bool = False) -> None:
+        with self._lock:
+            self._index, self._reader, self.is_exact, self.counters = index, None, exact, counters
+            self.times = index.times[self._part]
+
+
+class _Reader:
+    """Decodes the frames of a file by their number in it, with a cache; it is not thread-safe."""
+
+    def __init__(
+        self, path: Path, settings: RunSettings, index: _Index, shape: tuple[int, ...], is_exact: bool
+    ) -> None:
+        self._path, self._settings, self._index, self._shape, self._is_exact = path, settings, index, shape, is_exact
+        self._upright, self._video = UprightConverter(), VideoFile(path, settings)
+        pixels = self._video.stream.codec_context.format
+        bits = (pixels and pixels.padded_bits_per_pixel) or 24
+        self._capacity = max(2, 8 * _CACHE_BYTES // (shape[0] * shape[1] * bits))
+        self._cache: dict[int, VideoFrame] = {}
+        self._run: Iterator[tuple[int, VideoFrame]] = iter(())
+        self._next = 0  # number of the frame that follows in the run
+
+    def image(self, number: int) -> UInt8:
+        if number not in self._cache:
+            self._decode(number)
+        image = self._upright(self._cache[number])
+        return of_one_size(image, self._shape, self._settings.resize, self._path, number)
+
+    def _decode(self, number: int) -> None:
+        """Put a frame into the cache, and as many before it as it holds, unless it follows in the run."""
+        starts = self._index.starts
+        place = bisect_right(starts, number, key=itemgetter(0)) - 1
+        if starts[place][0] <= self._next <= number and self._advance(number):
+            return
+        begin, problem = max(starts[place][0], number - self._capacity + 1), None
+        # A decoder may need more than one keyframe before its pictures are complete.
+        for attempt in dict.fromkeys(max(0, place - back) for back in (0, 1, 2, place if self._is_exact else 0)):
+            self._run, self._next = self._frames(starts[attempt][1], begin), begin
+            try:
+                if self._advance(number):
+                    return
+            except VideoError as error:
+                problem = error
+        raise problem or VideoError(f"frame {number} of {str(self._path)!r} cannot be decoded")
+
+    def _advance(self, number: int) -> bool:
+        """Read the run until it has returned a frame; return False if one is missing."""
+        for current, frame in self._run:
+            if current != self._next:
+                return False
+            while len(self._cache) >= self._capacity:
+                del self._cache[next(iter(self._cache))]  # the oldest one
+            self._cache[current] = frame
+            self._next += 1
+            if current == number:
+                return True
+        return False
+
+    def _frames(self, first: int, begin: int) -> Iterator[tuple[int, VideoFrame]]:
+        """Decode from packet `first` on; yield the frames from number `begin` on, with their numbers.
+
+        The time stamp of a packet, which its frame inherits, is replaced by its number. Frames before `begin` are not
+        decoded if no other one refers to them.
+        """
+        index = self._index
+        start, packets = self._seek(first)
+        context = self._video.stream.codec_context
+        context.flush_buffers()
+        skips = context.codec.name in _SKIPPABLE and index.is_unique and not self._settings.skip_damaged
+
+        def numbered() -> Iterator[Packet[Any] | str | None]:
+            number = start
+            for packet in packets:
+                if packet is not None and not isinstance(packet, str):
+                    if number >= first:
+                        if skips:
+                            context.skip_frame = "NONREF" if 0 <= index.numbers[number] < begin else "DEFAULT"
+                        packet.pts = number
+                        yield packet
+                    number += 1
+                    if number == len(index.sizes):
+                        break
+                elif number > first:
+                    yield packet
+            yield None
+
+        if index.is_unique:
+            for frame in self._video.decoded(numbered(), lambda frame: bool(index.numbers[frame.pts] < begin)):
+                yield int(index.numbers[frame.pts]), frame
+        else:
+            for number, frame in enumerate(self._video.decoded(numbered())):
+                if number >= begin:
+                    yield number, frame
+
+    def _seek(self, first: int) -> tuple[int, Iterator[Packet[Any] | str | None]]:
+        """Return the number of a packet at or before number `first`, and an iterator of the packets from it on.
+
+        Where a container seeks to is known by the packets that it then has. If that fails, the file is opened again.
+        """
+        import av
+
+        before = int(np.searchsorted(self._index.keys, first, "right")) if first else 0
+        for key in self._index.keys[:before][::-1][:_ATTEMPTS]:
+            with suppress(av.FFmpegError):
+                self._video.container.seek(int(self._index.stamps[key]), stream=self._video.stream)
+                packets = self._video.packets()
+                for packet in islice(packets, _ATTEMPTS):
+                    number = None if packet is None or isinstance(packet, str) else self._index.find(packet)
+                    if number is not None and number <= first:
+                        return number, chain([packet], packets)
+        self._video.container.close()
+        self._video = VideoFile(self._path, self._settings)
+        return 0, self._video.packets()
