@@ -71,7 +71,7 @@ class Status(msgspec.Struct):
                 f"{trees['leaves']:.0f} leaves, {trees['nodes']:.0f} nodes, level {trees['level']:.0f}, {size}",
             )
         reports, now = self.processes.values(), time.time()
-        yield "rejected", counted(int(sum(report.counters.get("rejected", 0) for report in reports)), "message")
+        yield "rejected", f"{sum(report.counters.get('rejected', 0) for report in reports):.0f} messages or connections"
         yield "reports", ", ".join(f"{report.process} {max(0.0, now - report.time):.1f} s ago" for report in reports)
         if trouble := [f"{report.process}: {report.trouble}" for report in reports if report.trouble]:
             yield "trouble", "; ".join(trouble)
@@ -91,8 +91,8 @@ def status(address: Address, as_json: bool, wait: float) -> None:
     the command can be the health check of a container.
 
     "learning" is the backlog: messages that the compressor has not received or
-    not stored; "rejected" counts invalid messages; "reports" is the age of the
-    last health report of each process.
+    not stored; "rejected" counts invalid messages and refused connections;
+    "reports" is the age of the last health report of each process.
 
     \b
     EXAMPLES

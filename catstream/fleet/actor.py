@@ -213,8 +213,6 @@ class Stream:
         before = set(facts["objects"]) if facts else set(boxes)
         begin, search = sorted(boxes.keys() - before), sorted(models.keys() - before)
         forget = sorted(before - boxes.keys() - models.keys())
-        if not (begin or search or forget):  # a peer that connects for nothing counts as rejected
-            return
         with control(Address(pipeline.endpoint, keys=pipeline.settings.run.keys)) as controlled:
             for name in begin:
                 controlled.set_box(boxes[name], name)

@@ -50,7 +50,7 @@ _HELP = {
     "damaged": "Frames of a file that could not be decoded.",
     "scaled": "Frames with another size than the first one.",
     "truncated": "Seconds that are missing at the end of the file.",
-    "rejected": "Invalid messages that were dropped.",
+    "rejected": "Invalid messages that were dropped, and connections that were refused.",
     "model_version": "Version of the newest model; the trainer numbers models from 1.",
     "objects": "Number of objects.",
     "time": "Time of the newest tracked frame in seconds since the start of the source, or of the run if it is live.",

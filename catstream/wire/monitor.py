@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import struct
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ class Event(Enum):
     DISCONNECTED = "a connection ended"
     DENIED = "the handshake failed: the key was denied (ZAP status 400)"
     OTHER_MECHANISM = "the handshake failed: one side has keys, the other has none"
+    LEFT = "the other end closed the connection during the handshake"
     FAILED = "the handshake failed for another reason"
 
 
@@ -31,7 +33,11 @@ _EVENTS = {
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Event.FAILED,
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: Event.FAILED,
 }
-_MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_FAILURES = {
+    errno.EPIPE: Event.LEFT,
+    errno.ECONNRESET: Event.LEFT,
+    0x11000002: Event.OTHER_MECHANISM,  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+}
 
 
 class Monitor:
@@ -60,7 +66,7 @@ class Monitor:
             report, _ = self._events.recv_multipart()  # and the address of the other end
             kind, value = struct.unpack("=Hi", report)
             event = _EVENTS[kind]
-            yield Event.OTHER_MECHANISM if event is Event.FAILED and value == _MECHANISM_MISMATCH else event
+            yield _FAILURES.get(value, event) if event is Event.FAILED else event
 
     def close(self) -> None:
         self._events.close()

@@ -266,12 +266,15 @@ class ChannelSocket(Generic[Message]):
         """A connection ended."""
 
     def _handshake_failed(self, event: Event) -> None:
-        """Count a peer that failed, unless the ZAP handler has counted it; as a client, raise an error if denied."""
+        """Count a peer that failed, unless the ZAP handler has counted it; as a client, raise an error if denied.
+
+        Without keys, a peer that left is not counted. With keys, it may be one without keys, which detects that first.
+        """
         endpoint, keys = self._endpoint, self._endpoint.keys
         if self._listens:
-            if event is not Event.DENIED:
-                other = "does not speak ZeroMQ" if keys is None else "lacks the pipeline's keys"
-                reject(self.channel.name, "handshake", f"a peer has failed the handshake: it has ended, or it {other}")
+            if event is not (Event.LEFT if keys is None else Event.DENIED):
+                why = "does not speak ZeroMQ, or has keys" if keys is None else "has left, or lacks the pipeline's keys"
+                reject(self.channel.name, "handshake", f"a peer has failed the handshake: it {why}")
         elif event is Event.DENIED:
             raise ServiceError(
                 f"{endpoint} rejects the key in {keys and keys.folder}: it is not allowed, or lacks the role "

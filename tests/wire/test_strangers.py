@@ -1,5 +1,6 @@
 """What a stranger sends on any channel is counted by what is wrong with it, and dropped: nothing is trusted."""
 
+import socket
 from contextlib import closing
 
 import msgpack
@@ -103,6 +104,23 @@ def test_messages_to_a_publisher_are_counted_and_do_not_affect_its_subscribers(
             lambda: (publisher.send(said), heard.extend(reader.receive_all())),
         )
     assert {type(message) for message in heard} == {type(said)}
+
+
+@pytest.mark.parametrize("sent", [b"", b"\xff" + bytes(8) + b"\x7f"], ids=["nothing", "a part of the greeting"])
+def test_a_client_that_leaves_during_its_handshake_is_not_counted(sent, endpoint, message_of, until):
+    before, heard = rejected(), []
+    address = endpoint.address(CHANNELS["tracks"]).partition("://")[2]
+    if endpoint.folder is None:
+        host, _, port = address.partition(":")
+        address = host, int(port)
+    with Publisher(CHANNELS["tracks"], endpoint) as publisher:
+        for _ in range(20):
+            with socket.socket(socket.AF_UNIX if endpoint.folder else socket.AF_INET) as leaving:
+                leaving.connect(address)
+                leaving.sendall(sent)
+        with Subscriber(CHANNELS["tracks"], endpoint) as reader:
+            until(lambda: heard, lambda: (publisher.send(message_of("tracks")), heard.extend(reader.receive_all(0.01))))
+        assert rejected() == before
 
 
 def test_a_message_above_the_size_limit_closes_its_connection_unread(endpoint, stranger, until):
