@@ -18,7 +18,7 @@ from catstream.messages.kinds import FleetStatus, Listing, Question, StreamStatu
 from catstream.wire.channels import REGISTRY
 from catstream.wire.commands import Requester
 from catstream.wire.discovery import fleets
-from catstream.wire.endpoint import Endpoint
+from catstream.wire.endpoint import Endpoint, resolved
 from catstream.wire.keys import Keys
 
 #: Port at which the registry of a cluster listens by default.
@@ -97,6 +97,9 @@ class Registry(AbstractContextManager["Registry"]):
 
 def _remote(fleet: str, keys: Keys | None) -> tuple[str, Endpoint]:
     """Address and endpoint of a registry."""
+    host, _, _ = fleet.rpartition(":")
+    if not resolved(host):
+        raise ServiceError(f"the host {host!r} of the fleet is unknown: check its address")
     if keys is None and not fleet.startswith(("127.", "[::1]:", "localhost:")):
         raise ServiceError(
             f"the fleet at {fleet} requires authentication: make keys on its head (catstream keys allow FOLDER/keys "

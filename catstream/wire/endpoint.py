@@ -104,7 +104,7 @@ class Endpoint:
         address = self.address(channel, sender)
         protocol, _, rest = address.partition("://")
         host, _, port = rest.rpartition(":")
-        if protocol == "ipc" or not (numbers := _resolved(host)):
+        if protocol == "ipc" or not (numbers := resolved(host)):
             return address  # ZeroMQ reports the error
         number = numbers.get(socket.AF_INET) or f"[{numbers[socket.AF_INET6]}]"
         return f"tcp://{number}:{port}"
@@ -112,7 +112,7 @@ class Endpoint:
     @property
     def is_ipv6(self) -> bool:
         """True if the host has addresses of IPv6 only; ZeroMQ would not look for them."""
-        return self.folder is None and [*_resolved(self.host)] == [socket.AF_INET6]
+        return self.folder is None and [*resolved(self.host)] == [socket.AF_INET6]
 
     def is_in_use(self, channel: Channel[object], sender: str | None = None) -> bool:
         """Return True if a process listens at a channel's Unix socket; ZeroMQ would replace it without an error."""
@@ -152,7 +152,7 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
         return None
 
 
-def _resolved(host: str) -> dict[int, str]:
+def resolved(host: str) -> dict[int, str]:
     """One address of a host for each address family; empty if the host is unknown."""
     try:
         addresses = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_STREAM)

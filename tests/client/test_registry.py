@@ -1,7 +1,9 @@
 """The registry of a fleet: its state arrives whole, and only clients with a key of the fleet get an answer."""
 
+import socket
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
@@ -71,6 +73,12 @@ def test_without_a_fleet_the_error_says_how_to_get_one(managing):
         Registry()
     with managing(SITE), pytest.raises(ServiceError, match=r"no fleet 'yard' of yours is running, only site"):
         Registry("yard")
+
+
+def test_an_unknown_host_is_named_before_keys_are_asked_for(monkeypatch):
+    monkeypatch.setattr(socket, "getaddrinfo", Mock(side_effect=socket.gaierror))
+    with pytest.raises(ServiceError, match="the host 'haed' of the fleet is unknown"):
+        Address.parse("fleet://haed:5690/cam-7").resolve()
 
 
 def test_a_stranger_without_a_key_of_the_fleet_gets_no_answer(keys, folder, tcp, managing):
