@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,7 +26,7 @@ from catstream.processes.shared import SharedMemory
 from catstream.wire.channels import HEALTH
 from catstream.wire.discovery import private_folder
 from catstream.wire.endpoint import Endpoint
-from catstream.wire.newest import Publisher
+from catstream.wire.newest import Publisher, Subscriber
 from catstream.wire.rejects import rejected
 
 #: Exit code after an error that would occur again, such as an invalid setting: the process is not restarted.
@@ -40,6 +41,7 @@ STOPPED_EARLY = 4
 TURN_SECONDS = 0.02  #: the longest wait in a turn of a detector; from one look at the processes of a run to the next
 MESSAGE_SECONDS = 0.1  #: the longest wait of compressor and trainer for a message
 HEALTH_SECONDS = 1.0  #: between two health reports of a process
+_MISSING_SECONDS = 2.0  # without a health report, after which another process that was not started is named
 
 #: Of the compressor and the trainer of a live source: the next frame does not wait for either of them. With 10, a busy
 #: machine starves the compressor, until frames wait for it. A file is tracked as fast as all three processes allow.
@@ -124,6 +126,8 @@ def run(
         name_process(f"{name}:{Path(source).name}" if source else name, f"catstream {name} {source}")
         process = Process(name, job, memory)
         try:
+            if parent is None:
+                threading.Thread(target=_name_missing, args=(name, process.endpoint), daemon=True).start()
             service.main(process)
         finally:
             process.close()
@@ -136,3 +140,15 @@ def run(
     if process.ending.failed:
         return SOURCE_FAILED
     return 0 if process.ending.ended or parent is None else STOPPED_EARLY
+
+
+def _name_missing(name: str, endpoint: Endpoint) -> None:
+    """Log which other processes of a pipeline that is started by hand have sent no health report."""
+    missing, deadline = {*HEALTH.senders} - {name}, time.monotonic() + _MISSING_SECONDS
+    with Subscriber(HEALTH, endpoint) as reports:
+        while missing and (seconds := deadline - time.monotonic()) > 0:
+            if (report := reports.receive(seconds)) is not None:
+                missing.discard(report.process)
+    if missing:
+        scripts = " and ".join(f"services/{other}.py" for other in sorted(missing))
+        _log.warning("waiting for %s at %s: start %s there", " and ".join(sorted(missing)), endpoint, scripts)
