@@ -98,7 +98,8 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
 
     Each track is written when it arrives. The pipeline does not wait; missed
     tracks are counted. For complete files use `catstream track --output` or
-    `--write`. If another run starts at the same endpoint, the command ends.
+    `--write`. If another run starts at the same endpoint, the command ends. An
+    existing file is renamed, as tracks-20261128T133015.csv by its last change.
 
     {table}
 
@@ -118,7 +119,7 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
     except SettingsError as error:
         raise click.UsageError(str(error)) from None
     files = RunFiles(Origin(options=options), None, [*dict.fromkeys(places)])
-    files.check(overwrite=overwrite, earlier=[])
+    files.check(overwrite=True, earlier=[])
     written, not_written, reason, run = 0, 0, "", ""
     newest: dict[str, int] = {}  # frame of the last track of each object
     address = address.with_endpoint()
@@ -127,7 +128,9 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
             wait_for_pipeline(address, wait)
             origin = Origin(_head(address), address, options, attached=True)
             check_zones(options.zone, origin.head.size)
-            outputs = stack.enter_context(replace(files, origin=origin).opened(address.endpoint))
+            files = replace(files, origin=origin)
+            opened = files.opened(address.endpoint) if overwrite else files.continued(address.endpoint, resume=False)
+            outputs = stack.enter_context(opened)
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in with_silence_warnings(tracks, outputs.idle):
                 run = run or tracks.run

@@ -112,6 +112,18 @@ def test_sigterm_ends_a_sink_within_ten_seconds_while_deliveries_are_pending(cat
     assert [json.loads(line)["event"] for line in lines] == ["found", "ended"]
 
 
+def test_a_sink_that_starts_again_keeps_the_file_of_its_last_start(catstream, endpoint, tmp_path, until):
+    file = tmp_path / "tracks.ndjson"
+    file.write_text("of the last start\n")
+    with Publisher(HEALTH, endpoint, "detector") as health:
+        sink = catstream("sink", file, "--endpoint", endpoint)
+        until(lambda: len(list(tmp_path.glob("*.ndjson"))) == 2, lambda: health.send(Health("detector", time.time())))
+        sink.terminate()
+        sink.communicate(timeout=150)
+    old, new = sorted(tmp_path.glob("*.ndjson"))
+    assert (old.read_text(), new, new.read_text().count("\n")) == ("of the last start\n", file, 1)
+
+
 def test_without_a_pipeline_no_file_is_left(fail, tmp_path):
     error = fail("sink", tmp_path / "tracks.csv", "--endpoint", tmp_path, "--wait", 1)
     assert "is a pipeline running there?" in error
