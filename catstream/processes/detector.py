@@ -84,6 +84,7 @@ class DetectorLoop:
         self.models = Models(self.detectors, stack.enter_context(Subscriber(MODELS, process.endpoint)))
         self.beginnings = Beginnings(process, self.detectors, self.commands, self.outputs.previews)
         self._source: Source | None = None
+        self._is_lost = False  # whether a live source was lost in the last turn
         self._skipped = 0  # frames that were skipped because the run was paused or waited for a box
         self._tracks = Tracks(0, {})  # the last ones
 
@@ -95,7 +96,9 @@ class DetectorLoop:
 
     def _serve(self) -> None:
         self.outputs.serve_late_joiners()
-        self.process.beat(self._counters, self._object_counters, now=self.commands.execute())
+        changes = self.commands.execute()
+        was_lost, self._is_lost = self._is_lost, bool(self._source_counters().get("lost_seconds"))
+        self.process.beat(self._counters, self._object_counters, now=changes or self._is_lost != was_lost)
 
     def _receive_models(self, seconds: float) -> None:
         self.models.receive(seconds, keep=not self.commands.apply)
@@ -147,7 +150,7 @@ class DetectorLoop:
     def _idle(self) -> bool:
         """One turn while a live source provides no frame; returns whether to stop waiting."""
         self.turn()
-        if self._source_counters().get("lost_seconds"):
+        if self._is_lost:
             self.commands.reject_boxes("the source is lost, so there is no frame for a box: try again once it is back")
         return bool(self.process.ending.reason)
 

@@ -94,8 +94,8 @@ class EventStream:
             self._next_look = now + _REPORT_SECONDS
             with suppress(SilenceError):  # no further report has arrived
                 for report in self._reports or ():
-                    if report.process == "detector":
-                        events += self.events.update_source(report.source, report.counters.get("lost_seconds", 0.0))
+                    if (lost := report.counters.get("lost_seconds")) is not None:
+                        events += self.events.update_source(report.source, lost)
         self._waiting += [(event, now + _PICTURE_SECONDS) for event in events]
         with suppress(SilenceError):  # no further picture has arrived
             for preview in self._previews or ():

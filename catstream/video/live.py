@@ -91,7 +91,7 @@ class LiveSource(Source):
         self._problem = ""  # why the source is lost; empty while it is connected
         self._log_times: dict[str, float] = {}  # of the last log line with each reason
         self._is_logged = False  # whether this loss was logged
-        self._last_frame_time = monotonic()
+        self._last_frame_time, self._has_frame = monotonic(), False
         self._closed = False
         self._was_open = idle is not None  # without `idle`, a first failure is an error, not a loss
         self._thread = threading.Thread(target=self._read, name=f"reader of {self.name}", daemon=True)
@@ -103,12 +103,14 @@ class LiveSource(Source):
     @property
     def counters(self) -> dict[str, float]:
         """`skipped`: frames that were replaced by a newer one before they were returned; `reconnects`: successful
-        reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected."""
+        reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected, and none before the
+        first frame or failure: after a restart of the detector, it is not known whether the source is still lost."""
         silent = monotonic() - self._last_frame_time
         # FFmpeg has no timeout for a device that hangs, so a long silence also counts as a loss.
         limits = self._settings.open_timeout_seconds, self._settings.read_timeout_seconds, _POLL_SECONDS
         lost = silent if self._problem or silent > sum(limits) else 0.0
-        return {"skipped": self.skipped, "reconnects": self.reconnects, "lost_seconds": lost}
+        counters: dict[str, float] = {"skipped": self.skipped, "reconnects": self.reconnects}
+        return counters | {"lost_seconds": lost} if lost or self._has_frame else counters
 
     def __next__(self) -> Frame:
         if self._first is not None:
@@ -288,8 +290,8 @@ class LiveSource(Source):
                 if self._is_logged:
                     _log.warning("reconnected to source %s after %.1f s", self.name, moment - self._last_frame_time)
             self.skipped += self._newest is not None
-            self._newest, self._last_frame_time, self._problem, self._was_open = (moment, decoded), moment, "", True
-            self._is_logged = False
+            self._newest, self._last_frame_time, self._problem = (moment, decoded), moment, ""
+            self._has_frame, self._was_open, self._is_logged = True, True, False
             self._condition.notify()
 
     def _report_loss(self, problem: str) -> None:

@@ -109,6 +109,19 @@ def test_a_camera_that_disconnects_is_reconnected_and_another_size_is_scaled(cam
     assert {frame.image.shape for frame in frames} == {(96, 128, 3)}, "the size of the first frame"
 
 
+def test_whether_a_source_is_lost_is_known_from_its_first_frame_or_failure_on(camera, until):
+    cam = camera(numbered)
+    cam.sends.clear()
+    with open_source(cam.url, idle=lambda: False) as source:
+        assert "lost_seconds" not in source.counters
+        cam.sends.set()
+        next(source)
+        assert source.counters["lost_seconds"] == 0
+    cam.leave()
+    with open_source(cam.url, idle=lambda: False) as source:
+        until(lambda: source.counters.get("lost_seconds", 0) > 0)
+
+
 def test_a_camera_that_sends_no_frames_is_reconnected(camera, caplog, until):
     cam = camera(numbered)
     with open_source(cam.url, read_timeout_seconds=0.5) as source:
