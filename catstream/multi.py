@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import MappingProxyType
 
 import numpy as np
@@ -21,7 +22,7 @@ from catstream.base.threads import one_thread
 from catstream.compression.compressor import Compressor
 from catstream.compression.forest import Forest
 from catstream.detection.objects import Detectors
-from catstream.errors import BoxError, FrameError, ObjectError
+from catstream.errors import BoxError, CatstreamError, FrameError, ObjectError
 from catstream.features.pyramid import Pyramid
 from catstream.jobs.saved_model import SavedModel
 from catstream.messages.kinds import Features, Track, Tracks
@@ -59,6 +60,7 @@ class MultiTracker:
         self.settings = Settings().replace(settings)
         motion_em.prepare()  # before the first frame: a later one would wait for it
         self._tracks: dict[str, Track] | None = None
+        self._is_busy = False
 
     def __repr__(self) -> str:
         if self._tracks is None:
@@ -106,7 +108,7 @@ class MultiTracker:
             raise ObjectError("no object to track: pass a box for at least one name")
         check_count(len(boxes), self.settings.run.max_objects)
         detectors, forest, trainer = Detectors(self.settings), Forest(self.settings), Trainer(self.settings)
-        with one_thread():
+        with self._exclusive(), one_thread():
             pyramid = Pyramid(image)
             results = detectors.begin_all(boxes, pyramid, time)
             # After an error, the tracker is unchanged.
@@ -167,8 +169,8 @@ class MultiTracker:
                 f"this frame is {width}x{height} pixels, the first one {first_width}x{first_height}: "
                 "resize it, or call init to start again"
             )
-        self.detectors.seq = self.forest.seq  # repeats a frame whose update was interrupted, for example by Ctrl-C
-        with one_thread():
+        with self._exclusive(), one_thread():
+            self.detectors.seq = self.forest.seq  # repeats a frame whose update was interrupted, for example by Ctrl-C
             pyramid = Pyramid(image)
             results = self.detectors.begin_all(boxes, pyramid, time)
             for name, saved in models.items():
@@ -206,6 +208,17 @@ class MultiTracker:
         if name not in self.forest.compressors:
             raise ObjectError(f"there is no object {name!r}: the objects are {listed(self.forest.compressors)}")
         return SavedModel.of(self.forest.compressors[name], self.settings)
+
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        """A block of one thread at a time; CatstreamError if another thread is in it."""
+        if self._is_busy:
+            raise CatstreamError("another thread uses this tracker: use one tracker in each thread, or a lock")
+        self._is_busy = True
+        try:
+            yield
+        finally:
+            self._is_busy = False
 
     def _train(
         self, tracks: Tracks, features: Features, continued: Mapping[str, Compressor] = MappingProxyType({})

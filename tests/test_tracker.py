@@ -11,7 +11,7 @@ import pytest
 from catstream.base.box import Box
 from catstream.base.settings import PRESETS, Settings
 from catstream.compression.forest import Forest
-from catstream.errors import BoxError, FrameError, SettingsError
+from catstream.errors import BoxError, CatstreamError, FrameError, SettingsError
 from catstream.tracker import Tracker
 
 _SCM = {"training.bootstrap": "scm", "coreset.size": 36, "training.copies": 5}
@@ -115,6 +115,21 @@ def test_trackers_in_two_threads_give_the_same_tracks_as_alone(video, boxes_foun
         one, two = (pool.submit(follow, video, Settings(run={"seed": seed})) for seed in (0, 1))
     assert one.result()[0] == boxes_found
     assert two.result()[0] == follow(video, Settings(run={"seed": 1}))[0]
+
+
+def test_a_second_thread_in_a_tracker_is_an_error_and_changes_nothing(video, monkeypatch):
+    tracker, alone, take = started(video), started(video), Forest.take
+
+    def taking(*arguments):
+        with ThreadPoolExecutor(1) as pool, pytest.raises(CatstreamError, match="one tracker in each thread"):
+            pool.submit(tracker.update, video[0][2]).result()
+        return take(*arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Forest, "take", taking)
+        tracker.update(video[0][1])
+    alone.update(video[0][1])
+    assert tracker.update(video[0][2]) == alone.update(video[0][2])
 
 
 def test_a_frame_whose_update_was_interrupted_counts_as_not_seen(video, monkeypatch):
