@@ -120,7 +120,8 @@ def object_of(command: Command, desired: DesiredState) -> str:
     if command.object or not names or UNNAMED in names:
         return check_name(command.object)
     if len(names) > 1:
-        raise ObjectError(f"ambiguous object: this run tracks {listed(names)}; pass a name")
+        option = " (--object NAME)" if command.verb == "save" else ""
+        raise ObjectError(f"ambiguous object: this run tracks {listed(names)}; pass a name{option}")
     return next(iter(names))
 
 
