@@ -278,6 +278,9 @@ class _Run:
         """Run to the end, and print a summary, also of a run that an error ends."""
         pipeline, files = self.pipeline, self.files
         if self.is_resumed:
+            has_models = all(file.exists() for file in pipeline.results.models.values())
+            if has_models and files.is_complete(pipeline.frames):
+                return Outcome(False, 0, [], [], [], self.folder, is_resumed=True, has_run=True)
             skip_damaged = pipeline.settings.run.skip_damaged
             pipeline.first_frame, pipeline.first_time = files.position(skip_damaged=skip_damaged)
         progress, interrupted = RunProgress(pipeline), False

@@ -47,6 +47,7 @@ from catstream.sinks.destinations import (
     open_sink,
 )
 from catstream.sinks.remote import Warnings
+from catstream.video.source import open_source
 from catstream.wire.codec import decode_json
 
 _STATES: dict[str, State] = {state: state for state in get_args(State)}
@@ -452,6 +453,20 @@ class RunFiles:
     def missing(self) -> list[str]:
         """Return the files that do not exist, as another program has removed them."""
         return [place for place in self.places if is_file(place) and not Path(place).exists()]
+
+    def is_complete(self, frames: int | None) -> bool:
+        """Return whether all destinations, at least one, are files that have this number of frames, None if unknown."""
+        for place in self.places:
+            count = None
+            if is_log(Path(place)):
+                last, _ = Log(Path(place), skip_damaged=True).last_whole_frame()
+                count = None if last is None else last.number + 1
+            elif is_file(place):
+                with suppress(VideoError), open_source(place) as video:
+                    count = video.frames
+            if count is None or count != frames:
+                return False
+        return bool(self.places)
 
     def make_folder(self) -> None:
         """Make the folder of the results, in which the run may also write other files."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shlex
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from catstream.jobs.job import Job
 from catstream.jobs.saved_model import SavedModel
 from catstream.jobs.state import CHECKPOINTS
 from catstream.pipeline import Pipeline
+from catstream.video.source import open_source
 
 UNITS = Path(__file__).parents[2] / "services"
 UNIT = UNITS / "catstream@.service"
@@ -137,15 +139,19 @@ def test_settings_that_are_given_again_change_and_all_others_stay(video, said, s
 
 def test_a_complete_run_gets_no_further_rows_but_the_files_that_it_lacks(video, succeed, tmp_path):
     (source, box), kept, out = video, tmp_path / "kept", tmp_path / "out"
-    succeed("track", source, "--box", box, "--end", 6, "--output", out, "--state", kept)
-    before = (out / "demo.ndjson").read_bytes()
+    succeed("track", source, "--box", box, "--end", 6, "--output", out, "--video", "--state", kept)
+    before, written = (out / "demo.ndjson").read_bytes(), [file.stat().st_mtime_ns for file in out.iterdir()]
     output, errors = succeed("track", "--resume", kept)
     assert not output
+    assert [file.stat().st_mtime_ns for file in out.iterdir()] == written
     assert f"no frames remained to track, the run in {kept} is complete: to track the source again" in errors
     (out / "demo.csv").unlink()
+    os.truncate(out / "demo.mp4", 9999)
     succeed("track", "--resume", kept, "--start", 0, "--end", 6)  # the same frames
     assert frames(out) == list(range(6))
     assert (out / "demo.ndjson").read_bytes() == before
+    with open_source(out / "demo.mp4") as annotated:
+        assert annotated.frames == 6
 
 
 def test_a_run_that_was_killed_continues_by_the_line_of_the_service_that_began_it(
