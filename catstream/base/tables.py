@@ -74,18 +74,15 @@ class Columns:
     def __init__(self, path: Path, lines: Iterable[str], required: Sequence[str]) -> None:
         """Read the names from the first line that has any; VideoError if a required one is missing."""
         self.names, self.separator, self.start = list[str](), ",", 0
-        for line in lines:
-            self.start += 1
+        for self.start, line in enumerate(lines, 1):
             self.separator = max(",;\t", key=line.count)
             self.names = [name.lower() for name in self._split(line)]
             if any(self.names) and not line.startswith("sep="):  # by which Excel is told the separator
                 break
-        else:
-            self.names = []
-        if self.names and (missing := [column for column in required if column not in self.names]):
+        if missing := [column for column in required if self.start and column not in self.names]:
+            names = ",".join(required)
             raise VideoError(
-                f"{path} lacks the column {listed(missing)}: its first line has to name the columns "
-                f"{','.join(required)}"
+                f"{path} lacks the column {listed(missing)}: its first line has to name the columns {names}"
             )
 
     def row(self, line: str, *, whole: bool = False) -> Row | None:
@@ -107,15 +104,13 @@ class Columns:
 
 def read_table(path: Path, required: Sequence[str], parse: Callable[[Row], _Value]) -> list[_Value]:
     """Parse the rows of a table; VideoError, with the line, if it cannot be read or `parse` raises a ValueError."""
-    values, number = [], 0
+    values, number = [], 1
     try:
         data = path.read_bytes()
         is_wide = data.startswith((BOM_UTF16_LE, BOM_UTF16_BE))  # "Unicode text" of Excel
         lines = io.StringIO(data.decode("utf-16" if is_wide else "utf-8-sig"), newline=None)
         columns = Columns(path, lines, required)
-        number = columns.start
-        for line in lines:
-            number += 1
+        for number, line in enumerate(lines, columns.start + 1):  # noqa: B007
             if (row := columns.row(line)) is not None:
                 values.append(parse(row))
     except (OSError, UnicodeDecodeError) as error:

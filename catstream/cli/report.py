@@ -16,9 +16,9 @@ from catstream.errors import VideoError
 @click.argument("log", type=PATH)
 @click.argument("page", type=PATH, required=False)
 @click.option("--skip-damaged", is_flag=True, help="Continue after a damaged line of a log.")
-@click.option("--scale", metavar="0.05mm", help="Size of a pixel and its unit; by default, lengths are in pixels.")
+@click.option("--scale", default="1px", show_default=True, metavar="0.05mm", help="Size of a pixel, and its unit.")
 @with_overwrite
-def report(log: Path, page: Path | None, skip_damaged: bool, scale: str | None, overwrite: bool) -> None:
+def report(log: Path, page: Path | None, skip_damaged: bool, scale: str, overwrite: bool) -> None:
     """Write an HTML page about the tracks of a run.
 
     LOG is an .ndjson, .sqlite or .csv file, or a folder, for example that of
@@ -36,15 +36,14 @@ def report(log: Path, page: Path | None, skip_damaged: bool, scale: str | None, 
     """
     with INTERRUPTS.leaving():
         from catstream.base.files import check_file
-        from catstream.reports.tracks import PIXELS, Scale, Section, write_report
+        from catstream.reports.tracks import Scale, Section, write_report
         from catstream.sinks.track_log import logs_of
 
-    logs = logs_of(log)
+    logs, size = logs_of(log), Scale.parse(scale)
     page = page or (log / "report.html" if log.is_dir() else log.with_suffix(".html"))
     table = page.with_name(f"{page.stem}-objects.csv")
     for file in (page, table):
         check_file(file, overwrite=overwrite, kind=VideoError)
-    size = PIXELS if scale is None else Scale.parse(scale)
     sections = []
     with line_of(messages()) as progress:
         task = progress.add_task("reading", total=len(logs))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,22 +33,6 @@ _SPEED_SECONDS = 0.25  #: of which a speed is the mean, at least
 _GAP_SECONDS = 1.0  #: without a frame, from which the source was lost, if it is also five intervals
 
 
-class _Bar(NamedTuple):
-    """Consecutive frames of one state in a timeline: place and width in percent, and the text of its tooltip."""
-
-    state: str
-    left: float
-    width: float
-    text: str
-
-
-class _Picture(NamedTuple):
-    """A frame to look at, a JPEG file."""
-
-    jpeg: bytes
-    text: str
-
-
 class Scale(NamedTuple):
     """Size of a pixel in a unit of length."""
 
@@ -63,19 +46,16 @@ class Scale(NamedTuple):
         >>> Scale.parse("0.05mm")
         Scale(size=0.05, unit='mm')
         """
-        parts = re.fullmatch(r"([\d.]+(?:e-?\d+)?)\s*([^\W\d]+)", text)
-        with suppress(ValueError):
-            if parts is not None and 0 < (size := float(parts[1])) < np.inf:
-                return cls(size, parts[2])
-        raise VideoError(f"expected the size of a pixel with its unit, for example 0.05mm, got {text!r}")
+        parts = re.fullmatch(r"(\d*\.?\d+(?:e-?\d+)?)\s*([^\W\d]+)", text)
+        if parts is None or not 0 < (size := float(parts[1])) < math.inf:
+            raise VideoError(f"expected the size of a pixel with its unit, for example 0.05mm, got {text!r}")
+        return cls(size, parts[2])
 
     def format(self, value: float, per: str = "") -> str:
         """Format a length or a speed, rounded to a pixel."""
         digits = max(0, -math.floor(math.log10(self.size)))
         return "-" if math.isnan(value) else f"{value:.{digits}f} {self.unit}{per}"
 
-
-PIXELS = Scale(1, "px")
 
 #: Columns of the table of objects: those of `_Object.row`.
 _COLUMNS = ("frames", "present", "doubtful", "absent", "checked", "seconds", "distance", "mean_speed", "maximum_speed")
@@ -120,19 +100,20 @@ class _Object:
         distance, tracked = np.nansum(self.steps), np.diff(self.times)[~np.isnan(self.steps)].sum()
         shares = [float(np.mean(self.states == state)) for state in ("present", "doubtful", "absent")]
         seconds = (self.ends - self.times)[self.states != "absent"].sum()
-        width = max(_SPEED_SECONDS, 2 * self.interval)
-        speeds = self.speeds(np.arange(self.times[0], self.ends[-1] + width, width))
-        fastest = np.nanmax(speeds, initial=0) if tracked else np.nan
-        return [len(self.states), *shares, self._checked, seconds, distance, distance / (tracked or np.nan), fastest]
+        mean = fastest = distance / (tracked or np.nan)
+        if (window := max(1, round(_SPEED_SECONDS / self.interval))) < len(self.steps):
+            sums = (np.convolve(values, np.ones(window), "valid") for values in (self.steps, np.diff(self.times)))
+            fastest = np.fmax.reduce(np.divide(*sums), initial=mean)
+        return [len(self.states), *shares, self._checked, seconds, distance, mean, fastest]
 
-    def lane(self, start: float, end: float) -> list[_Bar]:
-        """Its bars in a timeline between two times in seconds."""
+    def lane(self, start: float, end: float) -> list[tuple[str, float, float, str]]:
+        """Its bars in a timeline between two times in seconds: state, left side and width in percent, and tooltip."""
         bars, scale = [], 100 / (end - start)
         for state, frames in self.runs():
             first, last = self.times[frames.start], self.ends[frames.stop - 1]
             numbers = f"frames {self.frames[frames.start]} to {self.frames[frames.stop - 1]}"
             text = f"{state}, {clock(first)} to {clock(last)}, {numbers}"
-            bars.append(_Bar(state, scale * (first - start), scale * (last - first), text))
+            bars.append((state, scale * (first - start), scale * (last - first), text))
         return bars
 
     def speeds(self, edges: Float64) -> Float64:
@@ -151,7 +132,7 @@ class Section:
     Raises VideoError if the log cannot be read, or contains no track.
     """
 
-    def __init__(self, path: Path, *, skip_damaged: bool = False, scale: Scale = PIXELS) -> None:
+    def __init__(self, path: Path, *, skip_damaged: bool, scale: Scale) -> None:
         self._log = Log(path, skip_damaged=skip_damaged)
         self.name, self._head, self.unit = path.stem, self._log.head() or Head(), scale.unit
         tracks: dict[tuple[str, int], list[Track]] = {}
@@ -175,14 +156,15 @@ class Section:
         self.rows = [[label, *_texts(row, scale)] for label, row in self.figures.items()]
         self.lanes = {label: item.lane(self.start, self.end) for label, item in self._objects.items()}
         self.speeds, self.top_speed = self._speeds()
-        self.pictures, self.problem = list[_Picture](), ""
+        self.pictures, self.problem = list[tuple[bytes, str]](), ""
 
     def add_pictures(self) -> None:
         """Read the frames to look at from the source; note a problem if it cannot be read."""
         if not self._head.source or is_live(self._head.source):
             self.problem = "the log names no video"
         elif frames := self._frames_to_look_at():
-            logged = {frame.tracks[0].source_frame: frame.tracks for frame in self._log}
+            numbered = ((frame.tracks[0].source_frame, frame.tracks) for frame in self._log)
+            logged = {number: tracks for number, tracks in numbered if number in frames}
             first, rate = min(frames), self._head.rate or RATE
             # A run skips damaged frames and scales others, or ends at the first: in any case these are its frames.
             settings = RunSettings(image_rate=rate, skip_damaged=True, resize=True)
@@ -194,7 +176,7 @@ class Section:
                             tracks = [replace(t, object=self._labels[t.object, t.began]) for t in logged[number]]
                             image = draw(frame.image, tracks, self._palette)
                             text = f"frame {number}, {clock(frame.time)}: {frames[number]}"
-                            self.pictures.append(_Picture(jpeg(image, side=_SIDE), text))
+                            self.pictures.append((jpeg(image, side=_SIDE), text))
             except VideoError as error:
                 self.problem = str(error)
 
