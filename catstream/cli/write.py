@@ -17,7 +17,7 @@ from catstream.base.names import split_name
 from catstream.base.text import counted, listed
 from catstream.cli.attach import wait_for_pipeline, with_address, with_silence_warnings, with_wait
 from catstream.cli.common import INTERRUPTS
-from catstream.cli.options import Command, with_overwrite
+from catstream.cli.options import Command
 from catstream.client.address import Address
 from catstream.client.attach import REPORT_SECONDS, subscribe
 from catstream.errors import SettingsError, SilenceError
@@ -88,12 +88,11 @@ def _head(address: Address) -> Head:
 
 @click.command()
 @click.argument("places", nargs=-1, required=True, metavar="DEST...")
-@with_overwrite
 @_with_options
 @with_address
 @with_wait
 @with_table(SINKS)
-def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], address: Address, wait: float) -> None:
+def sink(places: tuple[str, ...], values: dict[str, Any], address: Address, wait: float) -> None:
     """Write the tracks of a running pipeline to each DEST, until it ends or Ctrl-C.
 
     Each track is written when it arrives. The pipeline does not wait; missed
@@ -128,9 +127,7 @@ def sink(places: tuple[str, ...], overwrite: bool, values: dict[str, Any], addre
             wait_for_pipeline(address, wait)
             origin = Origin(_head(address), address, options, attached=True)
             check_zones(options.zone, origin.head.size)
-            files = replace(files, origin=origin)
-            opened = files.opened(address.endpoint) if overwrite else files.continued(address.endpoint, resume=False)
-            outputs = stack.enter_context(opened)
+            outputs = stack.enter_context(replace(files, origin=origin).continued(address.endpoint, resume=False))
             status = stack.enter_context(Console(stderr=True).status("waiting for a track"))
             for track in with_silence_warnings(tracks, outputs.idle):
                 run = run or tracks.run

@@ -35,7 +35,7 @@ from catstream.messages.storage import Metadata
 from catstream.pipeline import Pipeline
 from catstream.sinks.destinations import Origin, TrackedFrame
 from catstream.sinks.events import check_zones
-from catstream.sinks.track_log import RunFiles, is_log
+from catstream.sinks.track_log import OpenFiles, RunFiles, is_log
 from catstream.wire.discovery import free_ports, private_folder
 from catstream.wire.keys import Client, ensure, public_key, synchronise
 
@@ -159,7 +159,7 @@ class Stream:
             stack.callback(storing.join)
             stack.callback(over.set)
             for tracks in pipeline.by_frame(_TRACKS_SECONDS):
-                self._take(pipeline, tracks, "" if outputs is None else outputs.trouble)
+                self._take(pipeline, tracks, outputs)
                 if tracks and files.places:
                     if outputs is None:
                         outputs = files.continued(pipeline.endpoint, resume=resume)
@@ -227,10 +227,10 @@ class Stream:
                     SavedModel.from_bytes(model.files["model"], f"the model of {name!r} in the store"), name
                 )
 
-    def _take(self, pipeline: Pipeline, tracks: dict[str, Track], problem: str) -> None:
-        """Take the tracks of a frame, none if none has arrived for a while, and a problem of the destinations."""
+    def _take(self, pipeline: Pipeline, tracks: dict[str, Track], outputs: OpenFiles | None) -> None:
+        """Take the tracks of a frame, none if none has arrived for a while, and the problems of the destinations."""
         troubles = [f"{process}: {trouble}" for process, trouble in pipeline.trouble.items()]
-        troubles += [problem] * bool(problem)
+        troubles += [outputs.trouble] if outputs is not None and outputs.trouble else []
         if pipeline.lost_seconds:
             troubles.append(f"its source has been lost for {pipeline.lost_seconds:.0f} s")
         with self._lock:
@@ -243,7 +243,8 @@ class Stream:
             state: StreamState = pipeline.holding or ("running" if self._has_tracked else "starting")
             skipped = int(pipeline.health.get("detector", {}).get("skipped", 0))
             present = status.present if state == "running" else {}
-            self._status = replace(status, state=state, skipped=skipped, present=present)
+            missed = outputs.missed if outputs is not None else 0
+            self._status = replace(status, state=state, skipped=skipped, missed=missed, present=present)
             self._pipeline_trouble = "; ".join(troubles)
 
     def _keep_storing(self, claim: Claim, over: threading.Event) -> None:

@@ -522,6 +522,7 @@ class StreamStatus:
     live            whether the source is live: lost frames are not repeated, and their numbers are used again
     frame           number of the newest tracked frame
     skipped         frames of a live source that were skipped because the pipeline was too slow
+    missed          frames or events that its destinations lack, since its pipeline was started
     models          version of the newest model of each object
     present         whether each object is present in that frame; empty if no frames are tracked
     stored_seconds  seconds since the store had the newest state, None without one
@@ -538,6 +539,7 @@ class StreamStatus:
     live: bool = False
     frame: int = 0
     skipped: int = 0
+    missed: int = 0
     models: dict[str, int] = field(default_factory=dict)
     present: dict[str, bool] = field(default_factory=dict)
     stored_seconds: float | None = None

@@ -150,5 +150,4 @@ def _name_missing(name: str, endpoint: Endpoint) -> None:
             if (report := reports.receive(seconds)) is not None:
                 missing.discard(report.process)
     if missing:
-        scripts = " and ".join(f"services/{other}.py" for other in sorted(missing))
-        _log.warning("waiting for %s at %s: start %s there", " and ".join(sorted(missing)), endpoint, scripts)
+        _log.warning("waiting at %s for services/%s.py", endpoint, ".py and services/".join(sorted(missing)))

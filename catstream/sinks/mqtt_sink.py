@@ -51,7 +51,7 @@ class _Link(Enum):
 class MqttSink:
     """Publishes from the thread of paho-mqtt; if `QUEUED` messages wait there, further ones are missed.
 
-    missed  messages that the broker has not acknowledged, once it is closed
+    missed  messages that were dropped; once it is closed, all that the broker has not acknowledged
     """
 
     def __init__(self, place: str, origin: Origin) -> None:

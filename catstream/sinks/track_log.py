@@ -506,7 +506,7 @@ class RunFiles:
         for place in map(Path, filter(is_file, self.places)):
             with writing(place, VideoError):
                 place.parent.mkdir(parents=True, exist_ok=True)
-                if place.exists() and not (resume and self._log() is not None):
+                if place.is_file() and not (resume and self._log() is not None):
                     place.rename(_with_time(place, place.stat().st_mtime))
         self.check(overwrite=True, earlier=[])
         return self.opened(endpoint, resume=resume)
@@ -522,7 +522,6 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
 
     If the run `continues`, as a live source does, a frame that cannot be written is counted, and the next one is tried.
 
-    missed   frames that at least one destination lacks
     trouble  why the newest frame could not be written; empty if it was
     """
 
@@ -532,7 +531,12 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
         self._sinks, self._stack, self._continues = sinks, stack, continues
         self._rotation = rotation if continues else None
         self._warnings = Warnings("results")
-        self.missed, self.trouble = 0, ""
+        self._missed, self.trouble = 0, ""
+
+    @property
+    def missed(self) -> int:
+        """Frames that could not be written everywhere, and messages that a destination on the network has missed."""
+        return self._missed + sum(getattr(sink, "missed", 0) for sink in self._sinks)
 
     def write(self, frame: TrackedFrame) -> None:
         """Write a frame everywhere."""
@@ -547,7 +551,7 @@ class OpenFiles(AbstractContextManager["OpenFiles"]):
                     raise
                 problem = str(error)
                 self._warnings.failed(f"{problem}; tracking continues, and missing frames are counted")
-        self.missed += bool(problem)
+        self._missed += bool(problem)
         self.trouble = problem
         if not problem:
             self._warnings.working()

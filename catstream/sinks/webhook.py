@@ -36,7 +36,7 @@ _AGAIN = {0, 408, 425, 429, *range(500, 600)}  # answers after which it is; 0 fo
 class Webhook:
     """Posts the events from a thread of its own; if `QUEUED` of them wait, further ones are missed.
 
-    missed  events that were not delivered, once it is closed
+    missed  events that were dropped, because too many waited; once it is closed, all that were not delivered
     """
 
     def __init__(self, place: str, origin: Origin) -> None:
@@ -89,6 +89,8 @@ class Webhook:
             self._count += 1
             if self._bodies.qsize() < QUEUED:
                 self._bodies.put(self._events.to_json(event, picture))
+            else:
+                self.missed += 1
 
     def _deliver_all(self) -> None:
         """Deliver in order, until all has arrived or the sink is closed."""

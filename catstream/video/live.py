@@ -103,8 +103,8 @@ class LiveSource(Source):
     @property
     def counters(self) -> dict[str, float]:
         """`skipped`: frames that were replaced by a newer one before they were returned; `reconnects`: successful
-        reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected, and none before the
-        first frame or failure: after a restart of the detector, it is not known whether the source is still lost."""
+        reconnections; `lost_seconds`: seconds since the source was lost, 0 while it is connected. It is absent before
+        the first frame or failure: a detector that was restarted does not know it yet."""
         silent = monotonic() - self._last_frame_time
         # FFmpeg has no timeout for a device that hangs, so a long silence also counts as a loss.
         limits = self._settings.open_timeout_seconds, self._settings.read_timeout_seconds, _POLL_SECONDS

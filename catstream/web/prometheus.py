@@ -28,7 +28,7 @@ Sample = tuple[str, float, dict[str, str]]
 
 #: Counters of the processes, streams and nodes that only count up.
 _COUNT_UP = {"sent", "processed", "stored", "skipped", "reconnects", "damaged", "scaled", "rejected", "frames", "rows"}
-_COUNT_UP |= {"leaves", "trained", *(f"{tree}_leaves" for tree in TREES)}
+_COUNT_UP |= {"leaves", "trained", "missed", *(f"{tree}_leaves" for tree in TREES)}
 
 #: Counters of the detector without a metric: they are constant, or in `state`, `paused` and `source_lost_seconds`.
 _OMITTED = {"paused", "waiting", "ended", "lost_seconds", "zero_time", "width", "height", "start", "stride"}
@@ -70,6 +70,7 @@ _HELP = {
     "stream_state": "1 for the present state of the stream.",
     "stream_live": "1 if the source is live.",
     "stream_frame": "Number of the newest tracked frame.",
+    "stream_missed": "Frames and events that destinations of the stream lack, since its pipeline was started.",
     "stream_stored_seconds": "Seconds since the store had the newest state of the stream.",
     "stream_trouble": "1 if there is a problem with the stream.",
     "node_state": "1 for the present state of the node.",

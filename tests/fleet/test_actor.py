@@ -13,6 +13,7 @@ from catstream.fleet import actor as module
 from catstream.fleet.actor import Stream
 from catstream.fleet.spec import StreamSpec
 from catstream.fleet.store import Claim, Store
+from catstream.sinks import webhook
 from catstream.video.live_demo import first_box
 from catstream.video.source import open_source
 from catstream.wire import discovery
@@ -81,6 +82,13 @@ def test_a_live_stream_uses_no_frame_number_of_its_log_again(store, until, tmp_p
         until(lambda: stream.report()[0].frame > last + 5)
     frames = frames_of(tmp_path / "gate.ndjson")
     assert frames == sorted(set(frames))
+
+
+def test_a_stream_counts_what_its_destinations_miss(store, until, monkeypatch):
+    monkeypatch.setattr(webhook, "QUEUED", 0)
+    spec = StreamSpec("gate", LIVE, {"": first_box(LIVE)}, write=("http://127.0.0.1:1/hook",))
+    with started(spec, store) as stream:
+        until(lambda: stream.report()[0].missed == 1)
 
 
 def test_a_stream_runs_to_its_end_and_is_not_run_again(spec, store, until):

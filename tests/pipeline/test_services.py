@@ -50,8 +50,7 @@ def test_processes_started_manually_in_any_order_complete_a_run(video, folder, t
 def test_a_process_that_was_started_alone_names_the_missing_ones(video, folder, service):
     detector = service("detector", "--set", f"run.endpoint={folder}", video[0], "--box", video[1][0])
     line = next(line for line in detector.stderr if "waiting" in line)
-    others = "services/compressor.py and services/trainer.py"
-    assert line == f"detector: waiting for compressor and trainer at {folder}: start {others} there\n"
+    assert line == f"detector: waiting at {folder} for services/compressor.py and services/trainer.py\n"
 
 
 PROGRAM = """

@@ -62,6 +62,7 @@ def test_each_metric_has_a_type_and_help_of_its_own(feed, facts, fleet):
         *(f"catstream_detector_{name}" for name in names),
         "catstream_compressor_frames",
         "catstream_stream_skipped",
+        "catstream_stream_missed",
     }
     assert {name for name, family in families.items() if family.type == "counter"} == counts
     assert [name for name, family in families.items() if family.type == "histogram"] == [
