@@ -2,7 +2,7 @@
 
 /                the page
 /events          the state of the session as server-sent events, at most ten per second
-/frames/N.jpg    the picture of a frame
+/frames/N.jpg    the picture of a frame, scaled down if it is large; /frames/N.jpg?full has all pixels
 /frames/N        its size, and what the passes say about the objects in it
 /edit            POST a change: the fields of `Edit`
 """
@@ -58,7 +58,8 @@ class AnnotationSite:
         self._closed = True
 
     def _picture(self, request: Request) -> Response:
-        return Response(jpeg(self._session.image(self._number(request)), _SIDE, 90), media_type="image/jpeg")
+        image, is_full = self._session.image(self._number(request)), "full" in request.query_params
+        return Response(jpeg(image, None if is_full else _SIDE, 95 if is_full else 90), media_type="image/jpeg")
 
     def _frame(self, request: Request) -> Response:
         """The size of a frame, the box of each object in it, and the proposals if it is unchecked."""

@@ -1,7 +1,7 @@
 // What a person does on the page of catstream annotate, by mouse and keys; says what was seen, a line each.
 //   node annotate.mjs URL CHROMIUM PROFILE BOXES WIDTH HEIGHT, with the boxes in the first and the last frame as JSON
 
-import { axe, drawOn, errorsOf, patience, touchOn, violationsOf, withBrowser } from "./browser.mjs";
+import { axe, drag, drawOn, errorsOf, patience, placeIn, touchOn, violationsOf, withBrowser } from "./browser.mjs";
 
 const [url, executablePath, profile, boxes, ...size] = process.argv.slice(2);
 const [first, last] = JSON.parse(boxes);
@@ -97,6 +97,27 @@ await withBrowser(executablePath, profile, async (browser) => {
   await keys("Delete", "Escape");
   await page.locator("#timelines svg").first().click();
   await page.waitForFunction(() => /anna in frame 1[12]: checked/.test(document.querySelector("#check").textContent), null, patience); // the middle
+  // Zoom: an edge is dragged, arrows move the box by a pixel, and leaving the frame saves it.
+  const box = () => page.evaluate(() => { const { x, y, width, height } = document.querySelector("#stage rect.thick").attributes; return [x, y, width, height].map(({ value }) => Number(value)); });
+  const zoomed = () => page.locator("#whole").innerText();
+  await keys("Home");
+  await says("#check", "anna in frame 0: your box");
+  const before = await box(), whole = await zoomed();
+  await page.mouse.move(...await placeIn(page, size.map(Number), before.slice(0, 2)));
+  await page.mouse.wheel(0, -400);
+  await keys("+");
+  console.log("zoomed", await zoomed() !== whole);
+  await drag(page, size.map(Number), [before[0] + before[2], before[1] + before[3] / 2], [before[0] + before[2] + 7, before[1]]);
+  await page.waitForFunction((wide) => Number(document.querySelector("#stage rect.thick")?.getAttribute("width")) === wide, before[2] + 7, patience);
+  await keys("d", "ArrowLeft", "Shift+ArrowDown", "Control+ArrowRight", "ArrowRight", "ArrowRight", "0");
+  console.log("whole", await zoomed() === whole);
+  await keys("End", "Home");
+  await page.waitForFunction((right) => Number(document.querySelector("#stage rect.thick")?.getAttribute("x")) === right, before[0] + 1, patience);
+  const after = await box();
+  console.log("changed", JSON.stringify(after.map((side, place) => side - before[place])));
+  await keys("u", "u");
+  await page.waitForFunction((wide) => Number(document.querySelector("#stage rect.thick")?.getAttribute("width")) === wide, before[2], patience);
+
   const fingers = await touchOn(page, browser);
   await fingers("touchStart", [0.3, 0.3]);
   await fingers("touchMove", [0.4, 0.4]);

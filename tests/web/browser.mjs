@@ -33,17 +33,24 @@ export function placeOf(page, selector) {
   return page.evaluate((each) => document.querySelector(each).getBoundingClientRect().toJSON(), selector);
 }
 
-/** Draw a box, in pixels of a frame of this size, by mouse in the picture of the page. */
-export async function drawOn(page, [width, height], [x, y, w, h]) {
+/** The place in the window of a place in a frame of this size, which the page shows; also if it is zoomed. */
+export async function placeIn(page, [width, height], [x, y]) {
   const view = await placeOf(page, "#picture");
   const scale = Math.min(view.width / width, view.height / height);
-  const [left, top] = [view.x + (view.width - width * scale) / 2, view.y + (view.height - height * scale) / 2];
-  await page.mouse.move(left + x * scale, top + y * scale);
+  return [view.x + (view.width - width * scale) / 2 + x * scale, view.y + (view.height - height * scale) / 2 + y * scale];
+}
+
+/** Drag with the mouse from a place in the frame to another. */
+export async function drag(page, size, [left, top], [right, bottom]) {
+  await page.mouse.move(...await placeIn(page, size, [left, top]));
   await page.mouse.down();
-  await page.mouse.move(left + (x + w / 2) * scale, top + (y + h / 2) * scale);
-  await page.mouse.move(left + (x + w) * scale, top + (y + h) * scale);
+  await page.mouse.move(...await placeIn(page, size, [(left + right) / 2, (top + bottom) / 2]));
+  await page.mouse.move(...await placeIn(page, size, [right, bottom]));
   await page.mouse.up();
 }
+
+/** Draw a box, in pixels of a frame of this size, by mouse in the picture of the page. */
+export const drawOn = (page, size, [x, y, w, h]) => drag(page, size, [x, y], [x + w, y + h]);
 
 /** A function that sends a touch event at places in the picture, which are shares of its width and height. */
 export async function touchOn(page, browser) {

@@ -2,13 +2,13 @@
 // That of `catstream batch --ask` is the same, with the first frame of each video, and nothing to check.
 
 import { $, add, Items, make, many, post, write } from "./dom.js";
-import { Stage } from "./stage.js";
+import { FrameStage } from "./frame.js";
 
 const JUMP = 25; // frames of a page key
 const WAYS = { "1 forwards": "#74c0fc", "2 backwards": "#f783ac" }; // names and colours of the proposals; no object has a blank in its name
 const CHECKS = { keyframe: "your box", hidden: "hidden, estimated", checked: "checked", unchecked: "may be wrong" };
 const KEYS = { n: "next", enter: "next", b: "back", u: "undo", 1: "first", 2: "second", d: "draw", a: "absent", o: "new",
-  delete: "delete", backspace: "delete", "?": "help" };
+  delete: "delete", backspace: "delete", "+": "closer", "=": "closer", "-": "farther", 0: "whole", "?": "help" };
 
 /** The name of a key in `KEYS`: by its label, else by its place, as on a keyboard with other letters. */
 function nameOf({ key, code }) {
@@ -16,80 +16,22 @@ function nameOf({ key, code }) {
   return label in KEYS ? label : code.replace(/^(Key|Digit|Numpad)/, "").toLowerCase();
 }
 
-/** The picture of a frame; a box is saved as soon as it is drawn. */
-class FrameStage extends Stage {
-  url({ frame }) {
-    return `frames/${frame}.jpg`;
-  }
-
-  constructor(...all) {
-    super(...all);
-    this.fingers = new Map(); // on the picture: the first one draws, two zoom
-    for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, ({ pointerId }) => this.fingers.delete(pointerId));
-  }
-
-  press(event) {
-    if (event.pointerType === "touch") this.fingers.set(event.pointerId, event);
-    if (this.fingers.size < 2) return super.press(event);
-    if (this.fingers.has(this.pointer)) this.abort({ pointerId: this.pointer });
-  }
-
-  end() {
-    this.changed = false;
-    super.end();
-  }
-
-  /** Change the box with a key; false if the key does not. */
-  key(event) {
-    const { box } = this, by = event.shiftKey ? 10 : 1;
-    const arrows = { ArrowLeft: [-by, 0], ArrowRight: [by, 0], ArrowUp: [0, -by], ArrowDown: [0, by] };
-    const [x, y] = arrows[event.key] ?? [0, 0];
-    if (event.key === "Escape") this.cancel();
-    else if (event.key === "Enter") this.save();
-    else if (!box || !(event.key in arrows)) return false;
-    else if (event.ctrlKey || event.metaKey) this.change(box.x, box.y, Math.max(1, box.w + x), Math.max(1, box.h + y));
-    else this.change(box.x + x, box.y + y, box.w, box.h);
-    return true;
-  }
-
-  change(...box) {
-    this.changed = true;
-    this.set(...box);
-  }
-
-  release(event) {
-    if (event.pointerId !== this.pointer) return;
-    super.release(event);
-    if (this.box !== this.before.box) this.save();
-    else if (!this.before.drawing) this.cancel();
-  }
-
-  /** Save the box if a key has changed it, and end the drawing. */
-  leave() {
-    return this.changed ? this.save() : this.cancel();
-  }
-
-  /** Save the box, if there is one, and end the drawing. */
-  save() {
-    const { box } = this;
-    this.cancel();
-    return box && this.actions.follow([box.x, box.y, box.w, box.h]);
-  }
-}
-
 class AnnotatePage {
   constructor() {
     Object.assign(this, { state: null, frame: 0, chosen: null, boxes: {}, visited: [], edits: [], sent: Promise.resolve(), silent: false, ended: "" });
-    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {} });
+    this.stage = new FrameStage($("#stage"), this, { hold: () => ({ frame: this.frame }), follow: (box) => this.set(box, this.stage.picture.frame), changed: () => {},
+      zoomed: (scale) => write($("#whole span"), `${Math.round(100 * scale)} %`) });
     this.rows = new Items($("#timelines"), { make: (name) => this.makeRow(name), fill: (row, one) => this.fillRow(row, one) });
     const actions = { next: () => this.next(), back: () => this.visited.length && this.go(...this.visited.pop()), undo: () => this.undo(),
       first: () => this.take("1 forwards"), second: () => this.take("2 backwards"), draw: () => this.draw(), absent: () => this.set(null),
-      delete: () => this.delete(this.frame), forget: () => this.delete(null), new: () => { this.stage.leave(); this.choose(null); }, help: () => $("#keys").showModal(), done: () => this.done() };
+      delete: () => this.delete(this.frame), forget: () => this.delete(null), new: () => { this.stage.leave(); this.choose(null); }, help: () => $("#keys").showModal(),
+      closer: () => this.stage.zoomBy(1.5), farther: () => this.stage.zoomBy(1 / 1.5), whole: () => this.stage.zoomBy(0), done: () => this.done() };
     for (const [id, act] of Object.entries(actions)) $(`#${id}`).onclick = act;
     $("#slider").oninput = () => this.go(Number($("#slider").value));
     $("#name").onchange = () => this.rename();
     $("#naming").onsubmit = (event) => { event.preventDefault(); $("#name").blur(); };
     addEventListener("keydown", (event) => this.key(event));
+    addEventListener("keyup", ({ code }) => { if (code === "Space") this.stage.grabs = false; });
     addEventListener("pagehide", () => this.commit());
     addEventListener("click", ({ detail, target }) => detail && target.closest("button")?.blur()); // Enter means next again
     new ResizeObserver(() => this.stage.draw()).observe($("#stage"));
@@ -115,6 +57,10 @@ class AnnotatePage {
   }
 
   // The interface of the objects that a stage shows.
+  get focus() {
+    return Object.values(this.proposals).find(Boolean) ?? this.boxes[this.chosen]?.box;
+  }
+
   get single() {
     return false;
   }
@@ -169,8 +115,10 @@ class AnnotatePage {
       if (!answer) continue;
       const { size: [width, height], objects } = answer;
       this.boxes = objects;
-      if (this.stage.picture?.frame !== frame) await this.stage.show({ frame, width, height, boxes: {} });
+      const shown = this.stage.picture?.frame === frame;
+      if (!shown) await this.stage.show({ frame, width, height, boxes: {} });
       this.showBoxes();
+      if (!shown && this.stage.picture) this.stage.reveal();
       this.show();
     }
     this.loading = false;
@@ -247,7 +195,10 @@ class AnnotatePage {
     const { chosen, typed } = this, object = chosen ?? typed;
     if (!this.shows(frame)) return null;
     if (chosen === null && this.get(object)) return this.refuse(`There is an object ${object} already: use another name`);
+    if (this.get(object)) this.boxes[object] = { box, checked: "keyframe", proposals: [null, null] }; // until the answer
+    this.showBoxes();
     const answer = await this.send("draw", { object, frame, box: box && box.map((side) => Math.round(side * 10) / 10) });
+    if (!answer) this.load();
     if (answer && this.chosen === null && this.typed === object) this.choose(object);
     if (answer && this.state.videos.length) this.choose(this.missing(frame, this.chosen));
     return answer;
@@ -313,11 +264,13 @@ class AnnotatePage {
   key(event) {
     const { key, code, target, ctrlKey, metaKey, shiftKey } = event, modified = ctrlKey || metaKey, name = nameOf(event);
     const steps = { ArrowLeft: -1, ArrowRight: 1, PageUp: -JUMP, PageDown: JUMP, Home: -Infinity, End: Infinity };
-    if (event.isComposing || event.altKey || $("#keys").open || this.stage.pointer !== null) return;
+    if (event.isComposing || event.altKey || $("#keys").open) return;
+    if (this.stage.pointer !== null) return key === "Escape" && this.stage.abort(this.stage);
     if (key === "Enter" && modified) return $("#done").click();
     if (target.id === "name") return;
     if (this.stage.drawing && this.stage.key(event)) return event.preventDefault();
-    if (modified && !shiftKey && (key === "z" || (code === "KeyZ" && key > "\x7f"))) this.undo();
+    if (code === "Space" && target.tagName !== "BUTTON") this.stage.grabs = true;
+    else if (modified && !shiftKey && (key === "z" || (code === "KeyZ" && key > "\x7f"))) this.undo();
     else if (modified) return;
     else if (key in steps) this.go(this.frame + steps[key]);
     else if (name in KEYS && (key !== "Enter" || target.tagName !== "BUTTON")) event.repeat || $(`#${name === "delete" && shiftKey ? "forget" : KEYS[name]}`).click();

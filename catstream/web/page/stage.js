@@ -18,6 +18,7 @@ export class Stage {
     this.boxes = element.querySelector("svg"); // over the image, in pixels of the frame
     this.picture = this.box = this.start = this.still = this.pointer = null;
     this.drawing = this.loading = false;
+    this.smallest = SMALLEST;
     this.turn = 0; // number of pipelines shown before
     element.addEventListener("pointerdown", (event) => this.press(event));
     element.addEventListener("pointermove", (event) => this.drag(event));
@@ -110,12 +111,16 @@ export class Stage {
 
   drag(event) {
     if (event.pointerId !== this.pointer || !this.start || this.asking) return;
-    const [across, down] = this.start.screen;
-    this.start.moved ||= Math.hypot(event.clientX - across, event.clientY - down) >= STILL;
-    if (!this.start.moved) return;
+    if (!this.isMoved(event)) return;
     this.begin();
     const { x, y } = this.place(event);
     this.set(Math.min(x, this.start.x), Math.min(y, this.start.y), Math.abs(x - this.start.x), Math.abs(y - this.start.y));
+  }
+
+  /** True once a pointer has moved so far that it is no click. */
+  isMoved({ clientX, clientY }) {
+    const [across, down] = this.start.screen;
+    return (this.start.moved ||= Math.hypot(clientX - across, clientY - down) >= STILL);
   }
 
   release(event) {
@@ -124,7 +129,7 @@ export class Stage {
     this.pointer = this.start = null;
     if (!place) return;
     if (!this.drawing) this.choose(place);
-    else if (!this.box || this.box.w < SMALLEST || this.box.h < SMALLEST) {
+    else if (!this.box || this.box.w < this.smallest || this.box.h < this.smallest) {
       this.box = this.before.box;
       this.tell();
     }
@@ -190,11 +195,16 @@ export class Stage {
     this.draw();
   }
 
+  /** The part of the frame that the stage shows. */
+  get view() {
+    return [0, 0, this.picture.width, this.picture.height];
+  }
+
   /** Draw the box of each object with its name, and the box of the user, over a darker picture. */
   draw() {
     if (!this.picture) return;
     const { width, height } = this.picture;
-    this.boxes.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    this.boxes.setAttribute("viewBox", this.view.join(" "));
     this.boxes.replaceChildren();
     const { x, y, w, h } = this.box ?? { x: 0, y: 0, w: 0, h: 0 };
     if (this.drawing) this.boxes.append(make("path", { class: "shade", d: `M0 0H${width}V${height}H0ZM${x} ${y}v${h}h${w}v${-h}Z` }));
